@@ -1,0 +1,1 @@
+"""Typed settings (`params`), the presets beside them, and how the two become one `Config` (`load`)."""

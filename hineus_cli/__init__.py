@@ -1,0 +1,1 @@
+"""What the user touches: commands, console, progress. No science."""

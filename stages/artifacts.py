@@ -1,0 +1,279 @@
+"""Every file of a workspace: its name, where it lies in its stage's folder, how it is saved and loaded.
+
+Nobody else spells a path. Each function takes the folder of the stage that owns the file.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from stages.geometry.cameras import PinholeCameras, PosedScene
+from stages.geometry.similarity import Similarity
+
+# ---------------------------------------------------------------- ingest: images/, masks/, images.json
+IMAGES = "images"
+MASKS = "masks"
+IMAGE_RECORDS = "images.json"
+
+
+@dataclass(frozen=True)
+class ImageRecord:
+    """One photo that was taken in.
+
+    Attributes:
+        name: relative posix path under `images/`; the source's own path when the file could be kept as it is.
+        source: path of the photo relative to the photo folder.
+        width, height: upright size in pixels.
+        focal_px: focal length prior in pixels, or None.
+        camera: photos with the same value share one camera's intrinsics.
+        blur: variance of the Laplacian of the grey image at <= 1 megapixel; low is blurred.
+        has_mask: whether `masks/<name>.png` exists.
+        sha256: hash of the source file.
+    """
+
+    name: str
+    source: str
+    width: int
+    height: int
+    focal_px: float | None
+    camera: str
+    blur: float
+    has_mask: bool
+    sha256: str
+
+
+@dataclass(frozen=True)
+class SkippedImage:
+    """A file that was left out, and why, in words."""
+
+    source: str
+    reason: str
+
+
+@dataclass(frozen=True)
+class ImageSet:
+    """All that ingest found: photos kept (sorted by name) and files left out."""
+
+    images: tuple[ImageRecord, ...]
+    skipped: tuple[SkippedImage, ...] = field(default=())
+
+
+def image_path(folder: Path, name: str) -> Path:
+    """A stage's image `name` (ingest: upright photo, undistort: pinhole image)."""
+    return folder / IMAGES / name
+
+
+def mask_path(folder: Path, name: str) -> Path:
+    """The mask of image `name`: 8-bit PNG, 255 on the object, same size as the image. May not exist."""
+    return folder / MASKS / f"{name}.png"
+
+
+def save_image_set(folder: Path, image_set: ImageSet) -> None:
+    write_json(folder / IMAGE_RECORDS, asdict(image_set))
+
+
+def load_image_set(folder: Path) -> ImageSet:
+    data = read_json(folder / IMAGE_RECORDS)
+    return ImageSet(
+        tuple(ImageRecord(**record) for record in data["images"]),
+        tuple(SkippedImage(**record) for record in data["skipped"]),
+    )
+
+
+# ---------------------------------------------------------------- sfm: model/, registration.json
+MODEL = "model"
+REGISTRATION = "registration.json"
+
+
+def model_path(folder: Path) -> Path:
+    """Folder with the COLMAP model (cameras.bin, images.bin, points3D.bin)."""
+    return folder / MODEL
+
+
+def save_registration(folder: Path, registration: dict[str, Any]) -> None:
+    """{"registered": [names], "unregistered": [{"name", "reason"}], "mean_reprojection_error_px",
+    "num_points", "mapper", "matcher"}"""
+    write_json(folder / REGISTRATION, registration)
+
+
+def load_registration(folder: Path) -> dict[str, Any]:
+    return read_json(folder / REGISTRATION)
+
+
+# ---------------------------------------------------------------- undistort: images/, masks/, scene.json, points.npz
+SCENE = "scene.json"
+POINTS = "points.npz"
+
+
+def save_scene(folder: Path, scene: PosedScene) -> None:
+    cameras, similarity = scene.cameras, scene.world_from_scene
+    write_json(
+        folder / SCENE,
+        {
+            "kind": scene.kind,
+            "up": scene.up.tolist(),
+            "world_from_scene": {
+                "scale": similarity.scale,
+                "rotation": similarity.rotation.tolist(),
+                "translation": similarity.translation.tolist(),
+            },
+            "cameras": [
+                {
+                    "name": name,
+                    "size": cameras.sizes[i].tolist(),
+                    "intrinsics": cameras.intrinsics[i].tolist(),
+                    "cam_from_scene": cameras.cam_from_scene[i].tolist(),
+                }
+                for i, name in enumerate(cameras.names)
+            ],
+        },
+    )
+    np.savez(
+        folder / POINTS,
+        points=scene.points.astype(np.float32),
+        point_errors=scene.point_errors.astype(np.float32),
+        observations=scene.observations.astype(np.int32),
+    )
+
+
+def load_scene(folder: Path) -> PosedScene:
+    data = read_json(folder / SCENE)
+    with np.load(folder / POINTS) as points:
+        sparse = {key: points[key] for key in ("points", "point_errors", "observations")}
+    records = data["cameras"]
+    similarity = data["world_from_scene"]
+    return PosedScene(
+        cameras=PinholeCameras(
+            names=tuple(record["name"] for record in records),
+            sizes=np.array([record["size"] for record in records], dtype=np.int64),
+            intrinsics=np.array([record["intrinsics"] for record in records]),
+            cam_from_scene=np.array([record["cam_from_scene"] for record in records]),
+        ),
+        world_from_scene=Similarity(
+            similarity["scale"], np.array(similarity["rotation"]), np.array(similarity["translation"])
+        ),
+        up=np.array(data["up"]),
+        kind=data["kind"],
+        **sparse,
+    )
+
+
+# ---------------------------------------------------------------- train: field.pt, metrics.jsonl, previews/
+FIELD = "field.pt"
+METRICS = "metrics.jsonl"
+PREVIEWS = "previews"
+CHECKPOINT = "checkpoint.pt"  # in the stage's scratch folder
+
+
+def field_path(folder: Path) -> Path:
+    """The trained field, see `stages.neural.field.TrainedField`."""
+    return folder / FIELD
+
+
+def metrics_path(folder: Path) -> Path:
+    """JSON lines, one object a logged step."""
+    return folder / METRICS
+
+
+def preview_path(folder: Path, step: int) -> Path:
+    return folder / PREVIEWS / f"{step:07d}.png"
+
+
+def checkpoint_path(scratch: Path) -> Path:
+    return scratch / CHECKPOINT
+
+
+# ---------------------------------------------------------------- extract, cleanup: mesh.ply
+MESH = "mesh.ply"
+
+
+def save_mesh(folder: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
+    """Write mesh.ply (binary): vertices [V, 3] in the scene frame, faces [F, 3]."""
+    import trimesh
+
+    trimesh.Trimesh(vertices, faces, process=False).export(folder / MESH)
+
+
+def load_mesh(folder: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices [V, 3] float32 in the scene frame and faces [F, 3] int32."""
+    import trimesh
+
+    mesh = trimesh.load(folder / MESH, process=False)
+    return np.asarray(mesh.vertices, dtype=np.float32), np.asarray(mesh.faces, dtype=np.int32)
+
+
+# ---------------------------------------------------------------- atlas: atlas.npz
+ATLAS = "atlas.npz"
+
+
+@dataclass(frozen=True)
+class AtlasMesh:
+    """A mesh whose vertices are split along the seams of its UV charts.
+
+    Attributes:
+        vertices: [V, 3] float32, scene frame.
+        normals: [V, 3] float32 unit normals, smooth across seams.
+        uvs: [V, 2] float32 in [0, 1], origin at the BOTTOM-left of the texture (OBJ's convention).
+        faces: [F, 3] int32.
+    """
+
+    vertices: np.ndarray
+    normals: np.ndarray
+    uvs: np.ndarray
+    faces: np.ndarray
+
+
+def save_atlas(folder: Path, atlas: AtlasMesh) -> None:
+    np.savez(folder / ATLAS, **asdict(atlas))
+
+
+def load_atlas(folder: Path) -> AtlasMesh:
+    with np.load(folder / ATLAS) as data:
+        return AtlasMesh(data["vertices"], data["normals"], data["uvs"], data["faces"])
+
+
+# ---------------------------------------------------------------- bake: base_color.png, provenance.png
+BASE_COLOR = "base_color.png"
+PROVENANCE = "provenance.png"
+
+
+def base_color_path(folder: Path) -> Path:
+    """8-bit sRGB texture; row 0 is v = 1."""
+    return folder / BASE_COLOR
+
+
+def provenance_path(folder: Path) -> Path:
+    """8-bit grey, one value a texel, see `stages.meshing.baking.Provenance`."""
+    return folder / PROVENANCE
+
+
+# ---------------------------------------------------------------- export: model.glb, model.obj, model.ply
+def glb_path(folder: Path) -> Path:
+    return folder / "model.glb"
+
+
+def obj_path(folder: Path) -> Path:
+    return folder / "model.obj"
+
+
+def ply_path(folder: Path) -> Path:
+    return folder / "model.ply"
+
+
+# ---------------------------------------------------------------- report: report.html
+def report_path(folder: Path) -> Path:
+    return folder / "report.html"
+
+
+# ---------------------------------------------------------------- JSON
+def write_json(path: Path, data: Any) -> None:
+    path.write_text(json.dumps(data, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def read_json(path: Path) -> Any:
+    return json.loads(path.read_text(encoding="utf-8"))

@@ -1,0 +1,1 @@
+"""Cameras, similarities and the normalised frame. Pure NumPy."""

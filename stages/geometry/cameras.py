@@ -1,0 +1,87 @@
+"""Pinhole cameras and posed scenes.
+
+The one camera convention of the project: OpenCV axes (x right, y down, z forward), pixel centres at .5 (the
+top-left corner of the image is (0, 0)), matrices named target_from_source. "scene" is the normalised frame: the
+region of interest is the unit sphere.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from stages.geometry.similarity import Similarity
+
+
+@dataclass(frozen=True)
+class PinholeCameras:
+    """N pinhole cameras without distortion.
+
+    Attributes:
+        names: N image names, relative posix paths.
+        sizes: [N, 2] int, width and height in pixels.
+        intrinsics: [N, 3, 3] float64, pixels.
+        cam_from_scene: [N, 3, 4] float64, rotation and translation.
+    """
+
+    names: tuple[str, ...]
+    sizes: np.ndarray
+    intrinsics: np.ndarray
+    cam_from_scene: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    @property
+    def centers(self) -> np.ndarray:
+        """[N, 3] projection centres in the scene frame."""
+        rotation, translation = self.cam_from_scene[:, :, :3], self.cam_from_scene[:, :, 3]
+        return -np.einsum("nji,nj->ni", rotation, translation)
+
+    @property
+    def forward(self) -> np.ndarray:
+        """[N, 3] unit viewing directions in the scene frame."""
+        return self.cam_from_scene[:, 2, :3]
+
+    def project(self, index: int, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Pixel coordinates [P, 2] and depths [P] of scene points [P, 3] in one camera. Depth <= 0 is behind it."""
+        in_cam = points @ self.cam_from_scene[index, :, :3].T + self.cam_from_scene[index, :, 3]
+        depth = in_cam[:, 2]
+        safe = np.where(np.abs(depth) < 1e-12, 1e-12, depth)
+        pixels = in_cam[:, :2] / safe[:, None]
+        K = self.intrinsics[index]
+        return np.stack([K[0, 0] * pixels[:, 0] + K[0, 1] * pixels[:, 1] + K[0, 2],
+                         K[1, 1] * pixels[:, 1] + K[1, 2]], 1), depth
+
+    def rays(self, index: int, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Origins and unit directions [P, 3] in the scene frame of rays through pixel positions [P, 2]."""
+        K, rotation = self.intrinsics[index], self.cam_from_scene[index, :, :3]
+        y = (pixels[:, 1] - K[1, 2]) / K[1, 1]
+        x = (pixels[:, 0] - K[0, 2] - K[0, 1] * y) / K[0, 0]
+        directions = np.stack([x, y, np.ones_like(x)], 1) @ rotation
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        return np.broadcast_to(self.centers[index], directions.shape).copy(), directions
+
+
+@dataclass(frozen=True)
+class PosedScene:
+    """What training and everything after it knows of the capture.
+
+    Attributes:
+        cameras: the registered, undistorted images.
+        world_from_scene: similarity from the normalised frame to the SfM (or imported) world frame.
+        points: [P, 3] float32 sparse points in the scene frame.
+        point_errors: [P] float32 mean reprojection error in pixels.
+        observations: [M, 2] int32 rows (image index, point index): which image saw which point.
+        up: [3] unit vector, the estimated up direction in the scene frame.
+        kind: "object" (cameras around one thing) or "forward" (forward-facing or aerial).
+    """
+
+    cameras: PinholeCameras
+    world_from_scene: Similarity
+    points: np.ndarray
+    point_errors: np.ndarray
+    observations: np.ndarray
+    up: np.ndarray
+    kind: str = "object"

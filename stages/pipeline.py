@@ -1,0 +1,28 @@
+"""The pipeline: an ordered tuple of stages. Read it as the table of contents."""
+
+from __future__ import annotations
+
+from stages.atlas import ATLAS
+from stages.bake import BAKE
+from stages.cleanup import CLEANUP
+from stages.engine.stage import Stage
+from stages.export import EXPORT
+from stages.extract import EXTRACT
+from stages.ingest import INGEST
+from stages.report import REPORT
+from stages.sfm import SFM
+from stages.train import TRAIN
+from stages.undistort import UNDISTORT
+
+PIPELINE: tuple[Stage, ...] = (
+    INGEST,  # photos -> upright images
+    SFM,  # images -> camera poses
+    UNDISTORT,  # poses -> pinhole images in a normalised frame
+    TRAIN,  # posed images -> neural signed distance field
+    EXTRACT,  # field -> mesh
+    CLEANUP,  # mesh -> clean, light mesh
+    ATLAS,  # clean mesh -> UV charts
+    BAKE,  # charts + photos -> texture
+    EXPORT,  # textured mesh -> GLB, OBJ, PLY
+    REPORT,  # everything -> one HTML page
+)
