@@ -220,12 +220,14 @@ class AtlasMesh:
         normals: [V, 3] float32 unit normals, smooth across seams.
         uvs: [V, 2] float32 in [0, 1], origin at the BOTTOM-left of the texture (OBJ's convention).
         faces: [F, 3] int32.
+        texture_size: side in pixels of the texture the charts were packed for.
     """
 
     vertices: np.ndarray
     normals: np.ndarray
     uvs: np.ndarray
     faces: np.ndarray
+    texture_size: int = 2048
 
 
 def save_atlas(folder: Path, atlas: AtlasMesh) -> None:
@@ -234,7 +236,9 @@ def save_atlas(folder: Path, atlas: AtlasMesh) -> None:
 
 def load_atlas(folder: Path) -> AtlasMesh:
     with np.load(folder / ATLAS) as data:
-        return AtlasMesh(data["vertices"], data["normals"], data["uvs"], data["faces"])
+        return AtlasMesh(
+            data["vertices"], data["normals"], data["uvs"], data["faces"], int(data["texture_size"])
+        )
 
 
 # ---------------------------------------------------------------- bake: base_color.png, provenance.png
