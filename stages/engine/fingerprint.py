@@ -1,0 +1,223 @@
+"""What a stage's result depends on, hashed; and, when that has changed, the change in words."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from stages.errors import InputError
+
+CHUNK_BYTES = 1 << 20
+
+# A file written within this time before it was hashed may change again without its mtime changing (coarse
+# file system clocks), so such a hash is not remembered as good.
+RACY_NS = 2_000_000_000
+
+MAX_NAMED = 3  # changed files named one by one; past it they are counted
+
+FileDigests = dict[str, str]
+"""Relative posix path -> sha256 of the contents."""
+
+
+@dataclass(frozen=True)
+class Identity:
+    """All that a stage's result depends on.
+
+    Device, worker count, verbosity and absolute paths are absent on purpose: they never change a result.
+
+    Attributes:
+        stage: the stage's name.
+        version: the stage's version.
+        params: the stage's settings, as JSON-able values.
+        inputs: needed stage -> digest of its published outputs.
+        sources: outside path ("photos") -> its files' digests, None where it was not given.
+    """
+
+    stage: str
+    version: int
+    params: Mapping[str, Any]
+    inputs: Mapping[str, str] = field(default_factory=dict)
+    sources: Mapping[str, FileDigests | None] = field(default_factory=dict)
+
+    @property
+    def parts(self) -> dict[str, Any]:
+        """The fingerprint's ingredients, one digest each."""
+        return {
+            "stage": self.stage,
+            "version": self.version,
+            "params": digest(dict(self.params)),
+            "inputs": dict(self.inputs),
+            "sources": {
+                name: None if files is None else digest(files) for name, files in self.sources.items()
+            },
+        }
+
+    @property
+    def fingerprint(self) -> str:
+        return digest(self.parts)
+
+    def changes_since(self, before: Identity, section: str) -> list[str]:
+        """What differs from `before`, in words: version, settings (of config section `section`), sources, inputs."""
+        changes = []
+        if before.version != self.version:
+            changes.append(f"stage version {before.version} -> {self.version}")
+        changes += _setting_changes(flatten(before.params, section), flatten(self.params, section))
+        for name in sorted({*before.sources, *self.sources}):
+            changes += _source_changes(name, before.sources.get(name), self.sources.get(name))
+        for name in sorted({*before.inputs, *self.inputs}):
+            if before.inputs.get(name) != self.inputs.get(name):
+                changes.append(f"input stage {name} changed")
+        return changes
+
+
+def _setting_changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
+    changes = []
+    for key in sorted({*before, *now}):
+        if key not in before:
+            changes.append(f"parameter {key} is new ({_shown(now[key])})")
+        elif key not in now:
+            changes.append(f"parameter {key} is gone")
+        elif before[key] != now[key]:
+            changes.append(f"parameter {key} changed {_shown(before[key])} -> {_shown(now[key])}")
+    return changes
+
+
+def _source_changes(name: str, before: FileDigests | None, now: FileDigests | None) -> list[str]:
+    if before == now:
+        return []
+    if before is None or now is None:
+        return [f"{name} are now given" if before is None else f"{name} are no longer given"]
+    noun = name.removesuffix("s")
+    groups = {
+        "changed": [path for path in now if path in before and before[path] != now[path]],
+        "added": [path for path in now if path not in before],
+        "removed": [path for path in before if path not in now],
+    }
+    changes = []
+    for verb, paths in groups.items():
+        paths.sort()
+        if len(paths) > MAX_NAMED:
+            changes.append(f"{len(paths)} {name} {verb} ({', '.join(paths[:MAX_NAMED])}, ...)")
+        else:
+            changes += [f"{noun} {path} {verb}" for path in paths]
+    return changes
+
+
+def _shown(value: Any) -> str:
+    return value if isinstance(value, str) else json.dumps(value)
+
+
+def flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested mappings as one level with dotted keys."""
+    flat: dict[str, Any] = {}
+    for key, value in values.items():
+        dotted = f"{prefix}.{key}" if prefix else str(key)
+        if isinstance(value, Mapping) and value:
+            flat.update(flatten(value, dotted))
+        else:
+            flat[dotted] = value
+    return flat
+
+
+def digest(value: Any) -> str:
+    """sha256 of a JSON-able value; the order of mapping keys does not matter."""
+    text = json.dumps(value, sort_keys=True, separators=(",", ":"), ensure_ascii=True)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def file_sha256(path: Path) -> str:
+    sha = hashlib.sha256()
+    with path.open("rb") as file:
+        while chunk := file.read(CHUNK_BYTES):
+            sha.update(chunk)
+    return sha.hexdigest()
+
+
+def walk_files(folder: Path) -> Iterator[Path]:
+    """All files below `folder` in sorted order, hidden ones (".DS_Store") and hidden folders left out."""
+    for parent, folders, files in os.walk(folder):
+        folders[:] = sorted(name for name in folders if not name.startswith("."))
+        for name in sorted(files):
+            if not name.startswith("."):
+                yield Path(parent) / name
+
+
+class SourceDigests:
+    """Content digests of the outside paths, quick the second time.
+
+    A file whose size and mtime are those of the last hashing is not read again. `cache` is the JSON file that
+    remembers them; None keeps nothing.
+    """
+
+    def __init__(self, sources: Mapping[str, Path | None], cache: Path | None = None) -> None:
+        self.sources = dict(sources)
+        self._cache_path = cache
+        self._cache: dict[str, list[Any]] = _read_cache(cache)
+        self._changed = False
+        self._files: dict[str, FileDigests | None] = {}
+
+    def available(self, name: str) -> bool:
+        """False where the path was given but is not there (any more)."""
+        path = self.sources.get(name)
+        return path is None or path.exists()
+
+    def files(self, name: str) -> FileDigests | None:
+        """Digest of each file of source `name`, None where it was not given.
+
+        Raises:
+            InputError: the path or one of its files cannot be read.
+        """
+        if name not in self._files:
+            path = self.sources.get(name)
+            try:
+                self._files[name] = None if path is None else self._digest_tree(path)
+            except OSError as error:
+                raise InputError(
+                    f"The {name} at {path} cannot be read: {error.strerror or error} ({error.filename}).",
+                    "Check that the path exists and that you may read it.",
+                ) from error
+        return self._files[name]
+
+    def _digest_tree(self, path: Path) -> FileDigests:
+        if path.is_dir():
+            return {file.relative_to(path).as_posix(): self._digest_file(file) for file in walk_files(path)}
+        return {path.name: self._digest_file(path)}
+
+    def _digest_file(self, path: Path) -> str:
+        stat = path.stat()
+        key = str(path.absolute())
+        size, mtime_ns, sha = self._cache.get(key, (None, None, None))
+        if (size, mtime_ns) == (stat.st_size, stat.st_mtime_ns):
+            return sha
+        started_ns = time.time_ns()
+        sha = file_sha256(path)
+        if stat.st_mtime_ns < started_ns - RACY_NS:
+            self._cache[key] = [stat.st_size, stat.st_mtime_ns, sha]
+            self._changed = True
+        return sha
+
+    def save(self) -> None:
+        """Write the cache, if it learnt anything."""
+        if self._cache_path is None or not self._changed:
+            return
+        self._cache_path.parent.mkdir(parents=True, exist_ok=True)
+        temporary = self._cache_path.with_suffix(".tmp")
+        temporary.write_text(json.dumps(self._cache), encoding="utf-8")
+        temporary.replace(self._cache_path)
+        self._changed = False
+
+
+def _read_cache(path: Path | None) -> dict[str, list[Any]]:
+    # A cache that cannot be read is only slow, never wrong.
+    try:
+        cache = json.loads(path.read_text(encoding="utf-8")) if path else {}
+    except (OSError, ValueError):
+        return {}
+    valid = isinstance(cache, dict) and all(isinstance(row, list) and len(row) == 3 for row in cache.values())
+    return cache if valid else {}

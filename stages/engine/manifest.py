@@ -1,0 +1,199 @@
+"""The manifest: the last file a stage's folder gets, so a folder without a valid one was never published."""
+
+from __future__ import annotations
+
+import json
+import platform
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from datetime import datetime, timezone
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from stages.engine.fingerprint import Identity, digest, file_sha256
+
+MANIFEST = "manifest.json"
+
+RECORDED_PACKAGES = (
+    "hineus",
+    "numpy",
+    "torch",
+    "pycolmap",
+    "open3d",
+    "pymeshlab",
+    "trimesh",
+    "opencv-python-headless",
+)
+
+
+class ManifestDamaged(ValueError):  # noqa: N818 - it names the state of the file
+    """The file is there but is not a manifest that was written whole."""
+
+
+@dataclass(frozen=True)
+class OutputFile:
+    """One published file: its size in bytes and the sha256 of its contents."""
+
+    size: int
+    sha256: str
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """What was published, from what, and at what cost.
+
+    Attributes:
+        identity: all the result depends on; its fingerprint decides whether it is still good.
+        outputs: relative posix path -> size and hash.
+        numbers: what the stage returned.
+        wall_s, cpu_s: seconds; cpu_s is user + system, of this process and the children it waited for.
+        peak_rss: bytes, the highest sum over the process and its children while the stage ran.
+        versions: Python, platform and library versions.
+        created: UTC time of publication, ISO 8601.
+    """
+
+    identity: Identity
+    outputs: Mapping[str, OutputFile]
+    numbers: Mapping[str, Any] = field(default_factory=dict)
+    wall_s: float = 0.0
+    cpu_s: float = 0.0
+    peak_rss: int = 0
+    versions: Mapping[str, str] = field(default_factory=dict)
+    created: str = ""
+
+    @property
+    def outputs_digest(self) -> str:
+        """One hash of all outputs: what the stages after this one depend on."""
+        return digest({path: file.sha256 for path, file in self.outputs.items()})
+
+    @property
+    def size(self) -> int:
+        """Bytes of all outputs."""
+        return sum(file.size for file in self.outputs.values())
+
+    def to_json(self) -> str:
+        identity = self.identity
+        data = {
+            "stage": identity.stage,
+            "version": identity.version,
+            "fingerprint": identity.fingerprint,
+            "parts": identity.parts,
+            "params": jsonable(identity.params),
+            "inputs": dict(identity.inputs),
+            "sources": dict(identity.sources),
+            "outputs": {path: asdict(file) for path, file in self.outputs.items()},
+            "outputs_digest": self.outputs_digest,
+            "numbers": jsonable(self.numbers),
+            "wall_s": round(self.wall_s, 3),
+            "cpu_s": round(self.cpu_s, 3),
+            "peak_rss": int(self.peak_rss),
+            "versions": dict(self.versions),
+            "created": self.created,
+        }
+        return json.dumps(data, indent=1, allow_nan=False) + "\n"
+
+    @staticmethod
+    def from_json(text: str) -> Manifest:
+        """Raises ManifestDamaged where the text is not one, or does not agree with its own hashes."""
+        try:
+            data = json.loads(text)
+            manifest = Manifest(
+                identity=Identity(
+                    data["stage"], data["version"], data["params"], data["inputs"], data["sources"]
+                ),
+                outputs={path: OutputFile(**file) for path, file in data["outputs"].items()},
+                numbers=data["numbers"],
+                wall_s=data["wall_s"],
+                cpu_s=data["cpu_s"],
+                peak_rss=data["peak_rss"],
+                versions=data["versions"],
+                created=data["created"],
+            )
+            sound = (
+                manifest.identity.fingerprint == data["fingerprint"]
+                and manifest.outputs_digest == data["outputs_digest"]
+            )
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            raise ManifestDamaged(f"not a manifest: {error}") from error
+        if not sound:
+            raise ManifestDamaged("its hashes do not agree with its contents")
+        return manifest
+
+
+def load_manifest(folder: Path) -> Manifest | None:
+    """The manifest of a stage's folder, None where there is none.
+
+    Raises:
+        ManifestDamaged: there is one, but not a whole one.
+    """
+    try:
+        text = (folder / MANIFEST).read_text(encoding="utf-8")
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+    except (OSError, UnicodeDecodeError) as error:
+        raise ManifestDamaged(str(error)) from error
+    return Manifest.from_json(text)
+
+
+def output_problem(folder: Path, manifest: Manifest, hashes: bool = False) -> str | None:
+    """The first output that is missing or not as published, in words; None where all are there.
+
+    Args:
+        folder: the published folder.
+        manifest: its manifest.
+        hashes: read and hash every file, too; sizes alone catch truncation, not a flipped bit.
+    """
+    for path, expected in manifest.outputs.items():
+        file = folder / path
+        if not file.is_file():
+            return f"output {path} missing"
+        size = file.stat().st_size
+        if size != expected.size:
+            return f"output {path} damaged ({size} bytes, published with {expected.size})"
+        if hashes and file_sha256(file) != expected.sha256:
+            return f"output {path} damaged (contents changed)"
+    return None
+
+
+def describe_outputs(folder: Path) -> dict[str, OutputFile]:
+    """Size and hash of every file below `folder`, the manifest left out."""
+    return {
+        path.relative_to(folder).as_posix(): OutputFile(path.stat().st_size, file_sha256(path))
+        for path in sorted(folder.rglob("*"))
+        if path.is_file() and path != folder / MANIFEST
+    }
+
+
+def current_versions() -> dict[str, str]:
+    """Versions worth knowing when two machines give two results."""
+    versions = {"python": platform.python_version(), "platform": platform.platform()}
+    for package in RECORDED_PACKAGES:
+        try:
+            versions[package] = metadata.version(package)
+        except metadata.PackageNotFoundError:
+            versions[package] = "absent"
+    return versions
+
+
+def now() -> str:
+    """UTC, ISO 8601, to the second."""
+    return datetime.now(timezone.utc).isoformat(timespec="seconds")
+
+
+def jsonable(value: Any) -> Any:
+    """`value` with numpy scalars, paths and tuples turned into JSON's types; NaN and infinity become None.
+
+    A stage's numbers go through it, so a stray NaN cannot cost a finished result.
+    """
+    if isinstance(value, Mapping):
+        return {str(key): jsonable(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [jsonable(item) for item in value]
+    if hasattr(value, "tolist"):
+        return jsonable(value.tolist())
+    if isinstance(value, float):
+        return value if value - value == 0 else None
+    if value is None or isinstance(value, (bool, int, str)):
+        return value
+    return str(value)

@@ -1,0 +1,251 @@
+"""Runs a pipeline on a workspace: what is fresh is skipped, what is not is run and published, each with its reason."""
+
+from __future__ import annotations
+
+import difflib
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal, Protocol
+
+from pydantic import BaseModel
+
+from stages.engine.fingerprint import Identity, SourceDigests
+from stages.engine.manifest import Manifest, current_versions, describe_outputs, jsonable, now
+from stages.engine.stage import Stage, StageContext
+from stages.engine.status import StageStatus, stage_status
+from stages.engine.system import requirement_error
+from stages.engine.workspace import Workspace, disk_full_error, is_disk_full, storage_errors
+from stages.errors import ConfigError, HineusError, InputError
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class StageOutcome:
+    """What became of one stage.
+
+    Attributes:
+        name: of the stage.
+        action: "ran", or "skipped" because it was fresh.
+        reason: why it ran, or why it did not, in words.
+        numbers: what the stage returned (when it was made, if it was skipped now).
+        wall_s, cpu_s: seconds it took to make.
+        peak_rss: bytes, the highest while it was made.
+    """
+
+    name: str
+    action: Literal["ran", "skipped"]
+    reason: str
+    numbers: Mapping[str, Any] = field(default_factory=dict)
+    wall_s: float = 0.0
+    cpu_s: float = 0.0
+    peak_rss: int = 0
+
+
+class Listener(Protocol):
+    """Told what the runner does. The console draws it."""
+
+    def stage_started(self, stage: Stage, reason: str) -> None: ...
+
+    def stage_progress(self, stage: Stage, done: float, total: float, note: str) -> None: ...
+
+    def stage_finished(self, stage: Stage, outcome: StageOutcome) -> None: ...
+
+
+class Silent:
+    """The listener that ignores everything."""
+
+    def stage_started(self, stage: Stage, reason: str) -> None:
+        """Ignored."""
+
+    def stage_progress(self, stage: Stage, done: float, total: float, note: str) -> None:
+        """Ignored."""
+
+    def stage_finished(self, stage: Stage, outcome: StageOutcome) -> None:
+        """Ignored."""
+
+
+def run_pipeline(
+    pipeline: Sequence[Stage],
+    workspace: Workspace,
+    config: BaseModel,
+    sources: Mapping[str, Path | None],
+    device: str = "cpu",
+    workers: int = 1,
+    from_stage: str | None = None,
+    until: str | None = None,
+    force: Sequence[str] = (),
+    listener: Listener | None = None,
+    preset: str | None = None,
+) -> list[StageOutcome]:
+    """Bring the workspace up to date, stage by stage.
+
+    Args:
+        pipeline: stages in order; each needs only earlier ones.
+        workspace: held (locked) for the whole run.
+        config: all settings.
+        sources: name -> outside path, None where not given.
+        device: "cpu" or "cuda".
+        workers: CPU threads a stage may use.
+        from_stage: this stage and those after it run even if fresh; those before it only if they need to.
+        until: the last stage to bring up to date.
+        force: stages that run even if fresh.
+        listener: told what happens.
+        preset: name to remember with the settings.
+
+    Returns:
+        One outcome per stage up to `until`.
+
+    Raises:
+        HineusError: a child by what the user can do. What earlier stages published stays.
+    """
+    listener = listener or Silent()
+    selected, forced = _select(pipeline, from_stage, until, force)
+    outcomes = []
+    with workspace.lock():
+        workspace.remember(sources, preset, config.model_dump(mode="json"))
+        digests = SourceDigests(sources, workspace.digest_cache)
+        statuses: dict[str, StageStatus] = {}
+        for stage in selected:
+            workspace.recover(stage.name)
+            status = stage_status(stage, workspace, config, digests, statuses)
+            with storage_errors(workspace.root, "keeping the photos' digests"):
+                digests.save()
+            if status.state == "fresh" and stage.name not in forced:
+                outcome = _skipped(status)
+            else:
+                reason = forced[stage.name] if status.state == "fresh" else status.reason
+                listener.stage_started(stage, reason)
+                manifest = _run_stage(stage, workspace, config, digests, status, device, workers, listener)
+                outcome = _outcome("ran", reason, stage.name, manifest)
+                status = StageStatus(stage.name, "fresh", (), manifest, manifest.identity)
+            statuses[stage.name] = status
+            log.debug("%s %s: %s", stage.name, outcome.action, outcome.reason)
+            listener.stage_finished(stage, outcome)
+            outcomes.append(outcome)
+    return outcomes
+
+
+def _select(
+    pipeline: Sequence[Stage], from_stage: str | None, until: str | None, force: Sequence[str]
+) -> tuple[Sequence[Stage], dict[str, str]]:
+    """The stages up to `until`, and for each that must run even if fresh, the reason."""
+    names = [stage.name for stage in pipeline]
+    for option, name in [("--from", from_stage), ("--until", until), *(("--force", name) for name in force)]:
+        if name is not None and name not in names:
+            near = difflib.get_close_matches(name, names, 1)
+            guess = f"Did you mean `{option} {near[0]}`? " if near else ""
+            raise ConfigError(
+                f"There is no stage '{name}' ({option}).", f"{guess}The stages are {', '.join(names)}."
+            )
+    last = names.index(until) if until else len(names) - 1
+    first = names.index(from_stage) if from_stage else len(names)
+    late = [
+        (option, name) for option, name in [("--from", from_stage), *(("--force", n) for n in force)] if name
+    ]
+    for option, name in late:
+        if names.index(name) > last:
+            raise ConfigError(
+                f"{option} {name} comes after --until {until}, so it would never run.", "Drop one of the two."
+            )
+    forced = {name: f"asked for by --from {from_stage}" for name in names[first : last + 1]}
+    forced |= {name: f"asked for by --force {name}" for name in force}
+    return pipeline[: last + 1], forced
+
+
+def _run_stage(
+    stage: Stage,
+    workspace: Workspace,
+    config: BaseModel,
+    digests: SourceDigests,
+    status: StageStatus,
+    device: str,
+    workers: int,
+    listener: Listener,
+) -> Manifest:
+    from stages.engine.resources import ResourceMeter
+
+    identity = status.identity
+    if identity is None:
+        raise ValueError(f"stage {stage.name} was asked to run before the stages it needs: {status.reason}")
+    given = {name: path for name in stage.sources if (path := digests.sources.get(name)) is not None}
+    for name, path in given.items():
+        if not digests.available(name):
+            raise InputError(
+                f"Stage {stage.name} must run ({status.reason}), but its {name} are not at {path} any more.",
+                f"Bring them back, or name the new place: `hineus run PHOTOS --workspace {workspace.root}`.",
+            )
+
+    def progress(done: float, total: float, note: str = "") -> None:
+        listener.stage_progress(stage, done, total, note)
+
+    out, scratch = workspace.begin(stage.name, identity.fingerprint)
+    context = StageContext(
+        inputs={name: workspace.stage_folder(name) for name in stage.needs},
+        sources=given,
+        out=out,
+        scratch=scratch,
+        params=stage.settings(config),
+        device=device,
+        workers=workers,
+        progress=progress,
+    )
+    with ResourceMeter() as meter:
+        numbers = _call(stage, context, workspace, status)
+    manifest = _describe(identity, out, numbers, meter, workspace)
+    workspace.publish(stage.name, manifest)
+    return manifest
+
+
+def _call(
+    stage: Stage, context: StageContext, workspace: Workspace, status: StageStatus
+) -> Mapping[str, Any]:
+    """Run the stage; tell of a full disk, a missing library or exhausted memory in the user's terms."""
+    try:
+        return stage.run(context) or {}
+    except HineusError:
+        workspace.discard(stage.name)
+        raise
+    except Exception as error:
+        log.debug("stage %s failed", stage.name, exc_info=True)
+        # Asked before the discard, which frees space.
+        full = is_disk_full(error, workspace.root)
+        written = sum(path.stat().st_size for path in context.out.rglob("*") if path.is_file())
+        workspace.discard(stage.name)
+        if full:
+            # The last publication is the best guess at how much this one needs.
+            needed = max(status.manifest.size - written if status.manifest else 0, written, 1)
+            raise disk_full_error(workspace.root, f"running '{stage.name}'", needed) from error
+        if wanted := requirement_error(error, stage.name):
+            raise wanted from error
+        raise
+
+
+def _describe(
+    identity: Identity, out: Path, numbers: Mapping[str, Any], meter: Any, workspace: Workspace
+) -> Manifest:
+    with storage_errors(workspace.root, f"reading back '{identity.stage}'"):
+        outputs = describe_outputs(out)
+    return Manifest(
+        identity=identity,
+        outputs=outputs,
+        numbers=jsonable(numbers),
+        wall_s=meter.wall_s,
+        cpu_s=meter.cpu_s,
+        peak_rss=meter.peak_rss,
+        versions=current_versions(),
+        created=now(),
+    )
+
+
+def _skipped(status: StageStatus) -> StageOutcome:
+    assert status.manifest is not None  # a fresh stage has one
+    return _outcome("skipped", status.reason, status.name, status.manifest)
+
+
+def _outcome(action: Literal["ran", "skipped"], reason: str, name: str, manifest: Manifest) -> StageOutcome:
+    return StageOutcome(
+        name, action, reason, manifest.numbers, manifest.wall_s, manifest.cpu_s, manifest.peak_rss
+    )

@@ -1,0 +1,423 @@
+"""The workspace: one folder for each published stage, a record of what it was made from, and a lock.
+
+    <root>/workspace.json         format, photos, masks, preset
+    <root>/config.yaml            the resolved settings of the last run; `--config` takes it back
+    <root>/hineus.log
+    <root>/<stage>/               published: outputs and manifest.json
+    <root>/.work/<stage>/out      what a running stage writes; becomes <root>/<stage> by renaming
+    <root>/.work/<stage>/old      the publication that is being replaced, for an instant
+    <root>/.work/<stage>/scratch  survives a kill; emptied on publication or when the fingerprint changes
+
+Publishing: outputs to disk, manifest to disk, old folder moved aside, `out` renamed into place, old folder removed.
+`recover` completes whichever of these steps a crash cut off.
+"""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import json
+import os
+import shutil
+import socket
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from stages.engine.manifest import (
+    MANIFEST,
+    Manifest,
+    ManifestDamaged,
+    jsonable,
+    load_manifest,
+    now,
+    output_problem,
+)
+from stages.errors import WorkspaceError
+
+FORMAT = 1
+
+DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
+NOT_WRITABLE = (errno.EROFS, errno.EACCES, errno.EPERM)
+LOCKS_UNSUPPORTED = (errno.ENOLCK, errno.ENOTSUP, errno.ENOSYS)
+
+NEARLY_FULL_BYTES = (
+    1 << 20
+)  # libraries hide "disk full" in errors of their own; less free than this gives it away
+
+
+@dataclass(frozen=True)
+class Record:
+    """workspace.json: what this workspace was made from.
+
+    Attributes:
+        format: of the workspace's layout, see FORMAT.
+        sources: outside path's name ("photos", "masks") -> absolute path, or None where it was not given.
+        preset: name of the preset the settings started from, if that is known.
+        hineus: version of the program that wrote it.
+        created: UTC time, ISO 8601.
+    """
+
+    format: int = FORMAT
+    sources: Mapping[str, str | None] = field(default_factory=dict)
+    preset: str | None = None
+    hineus: str = ""
+    created: str = ""
+
+
+class Workspace:
+    """A folder that holds one reconstruction. Make one with `Workspace.open`."""
+
+    def __init__(self, root: Path, record: Record) -> None:
+        self.root = root
+        self.record = record
+        self._lock_depth = 0
+
+    @staticmethod
+    def open(root: Path, create: bool = False) -> Workspace:
+        """Open the workspace at `root`; with `create`, an absent or empty folder becomes one (on the first lock).
+
+        Raises:
+            WorkspaceError: there is no workspace, it is of a newer version, it cannot be read, or the folder holds
+                something else, which stages would overwrite.
+        """
+        root = Path(root).absolute()
+        path = root / "workspace.json"
+        try:
+            text = path.read_text(encoding="utf-8")
+        except (FileNotFoundError, NotADirectoryError):
+            return _new_workspace(root, create)
+        except OSError as error:
+            raise WorkspaceError(
+                f"The workspace {root} cannot be read: {error.strerror}.",
+                "Check who owns the folder with `ls -ld`.",
+            ) from error
+        return Workspace(root, _parse_record(text, path))
+
+    # ------------------------------------------------------------ where things lie
+    def stage_folder(self, stage: str) -> Path:
+        """Where the stage's published outputs lie."""
+        return self.root / stage
+
+    def work_folder(self, stage: str) -> Path:
+        return self.root / ".work" / stage
+
+    @property
+    def config_path(self) -> Path:
+        return self.root / "config.yaml"
+
+    @property
+    def log_path(self) -> Path:
+        return self.root / "hineus.log"
+
+    @property
+    def digest_cache(self) -> Path:
+        return self.root / ".work" / "source_digests.json"
+
+    # ------------------------------------------------------------ lock
+    @contextmanager
+    def lock(self) -> Iterator[None]:
+        """Hold the workspace alone; nests within one object. The kernel frees the lock however the process ends.
+
+        Raises:
+            WorkspaceError: another process holds it, or the folder cannot be written.
+        """
+        if self._lock_depth:
+            self._lock_depth += 1
+            try:
+                yield
+            finally:
+                self._lock_depth -= 1
+            return
+        with storage_errors(self.root, "opening the workspace"):
+            self.root.mkdir(parents=True, exist_ok=True)
+            descriptor = os.open(self.root / ".lock", os.O_RDWR | os.O_CREAT, 0o644)
+        try:
+            self._take(descriptor)
+            self._lock_depth = 1
+            yield
+        finally:
+            self._lock_depth = 0
+            os.close(descriptor)
+
+    def _take(self, descriptor: int) -> None:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise _busy_error(self.root, os.pread(descriptor, 4096, 0)) from None
+        except OSError as error:
+            # Some network file systems have no locks. Working without one is better than not working.
+            if error.errno not in LOCKS_UNSUPPORTED:
+                raise
+        holder = {"pid": os.getpid(), "host": socket.gethostname(), "since": now()}
+        with storage_errors(self.root, "opening the workspace"):
+            os.ftruncate(descriptor, 0)
+            os.pwrite(descriptor, json.dumps(holder).encode(), 0)
+
+    # ------------------------------------------------------------ record and settings
+    def remember(
+        self, sources: Mapping[str, Path | None], preset: str | None, config: Mapping[str, Any]
+    ) -> None:
+        """Keep what this run is made from: workspace.json and config.yaml."""
+        import yaml
+
+        self.record = Record(
+            sources={name: None if path is None else str(path) for name, path in sources.items()},
+            preset=preset,
+            hineus=_hineus_version(),
+            created=self.record.created or now(),
+        )
+        header = (
+            f"# The settings of the last run (preset: {preset or 'none'}). Use them again with --config.\n"
+        )
+        with storage_errors(self.root, "keeping the settings"):
+            _write(self.root / "workspace.json", json.dumps(asdict(self.record), indent=1) + "\n")
+            _write(self.config_path, header + yaml.safe_dump(jsonable(config), sort_keys=False))
+
+    # ------------------------------------------------------------ stages
+    def published(self, stage: str) -> Manifest | None:
+        """The stage's manifest, None where it was never published.
+
+        Raises:
+            ManifestDamaged: it was, but its manifest is damaged.
+        """
+        return load_manifest(self.stage_folder(stage))
+
+    def recover(self, stage: str) -> None:
+        """Complete a publication that a crash cut off; needs the lock."""
+        work, final = self.work_folder(stage), self.stage_folder(stage)
+        out, old = work / "out", work / "old"
+        with storage_errors(self.root, f"recovering '{stage}'"):
+            if _is_whole(out):
+                _replace(out, final, old)
+            elif old.exists() and not final.exists():
+                old.rename(final)
+            _remove(old)
+
+    def begin(self, stage: str, fingerprint: str) -> tuple[Path, Path]:
+        """An empty `out` folder and the stage's scratch folder, emptied unless it belongs to this fingerprint."""
+        work = self.work_folder(stage)
+        out, scratch, owner = work / "out", work / "scratch", work / "scratch.json"
+        with storage_errors(self.root, f"starting '{stage}'"):
+            _remove(out)
+            if _scratch_owner(owner) != fingerprint:
+                _remove(scratch)
+            scratch.mkdir(parents=True, exist_ok=True)
+            _write(owner, json.dumps({"fingerprint": fingerprint}))
+            out.mkdir()
+        return out, scratch
+
+    def discard(self, stage: str) -> None:
+        """Throw away what a failed stage has written; its scratch folder and its last publication stay."""
+        shutil.rmtree(self.work_folder(stage) / "out", ignore_errors=True)
+
+    def publish(self, stage: str, manifest: Manifest) -> None:
+        """Make the stage's `out` folder the published one, at once and whole.
+
+        Raises:
+            WorkspaceError: the disk is full or not writable. What was published before is untouched.
+        """
+        work = self.work_folder(stage)
+        out, old = work / "out", work / "old"
+        text = manifest.to_json()
+        with storage_errors(self.root, f"publishing '{stage}'", needed=len(text)):
+            _sync_tree(out)
+            _write(out / MANIFEST, text)
+            _replace(out, self.stage_folder(stage), old)
+            _remove(old)
+            _remove(work / "scratch")
+
+
+# ---------------------------------------------------------------- errors of the storage below
+@contextmanager
+def storage_errors(root: Path, doing: str, needed: int | None = None) -> Iterator[None]:
+    """Tell of a full or unwritable disk in the user's terms.
+
+    Args:
+        root: the workspace.
+        doing: what was being done ("publishing 'sfm'").
+        needed: bytes that were to be written at least, if that is known.
+    """
+    try:
+        yield
+    except OSError as error:
+        if error.errno in DISK_FULL:
+            raise disk_full_error(root, doing, needed) from error
+        if error.errno in NOT_WRITABLE:
+            raise WorkspaceError(
+                f"The workspace {root} cannot be written while {doing}: {error.strerror} ({error.filename}).",
+                "Make the folder writable, or choose another one with `--workspace DIR`.",
+            ) from error
+        raise
+
+
+def disk_full_error(root: Path, doing: str, needed: int | None = None) -> WorkspaceError:
+    least = f"at least {show_bytes(needed)} more needed" if needed else "more is needed"
+    return WorkspaceError(
+        f"The disk is full while {doing}: {show_bytes(free_bytes(root))} free at {root}, {least}.",
+        "Nothing published is lost: free some space and run the same command again to go on.",
+    )
+
+
+def is_disk_full(error: BaseException, root: Path) -> bool:
+    """Whether a stage failed because the disk is full, also where a library hides it in an error of its own."""
+    if isinstance(error, OSError) and error.errno in DISK_FULL:
+        return True
+    return free_bytes(root) < NEARLY_FULL_BYTES
+
+
+def free_bytes(root: Path) -> int:
+    return shutil.disk_usage(root).free
+
+
+def show_bytes(count: float) -> str:
+    """A size for people: "312 MB"."""
+    for unit in ("B", "KB", "MB", "GB"):
+        if count < 1000:
+            return f"{count:.3g} {unit}"
+        count /= 1000
+    return f"{count:.3g} TB"
+
+
+def _busy_error(root: Path, holder: bytes) -> WorkspaceError:
+    try:
+        data = json.loads(holder)
+        pid, host, since = int(data["pid"]), str(data["host"]), str(data["since"])
+    except (ValueError, KeyError, TypeError):
+        return WorkspaceError(
+            f"The workspace {root} is in use by another process.",
+            "Wait for it to end, or work in another folder with `--workspace DIR`.",
+        )
+    here = host == socket.gethostname()
+    if here and not _is_running(pid):
+        return WorkspaceError(
+            f"The workspace {root} is held by a left-over child of process {pid}, which has ended.",
+            f"Find it with `fuser {root / '.lock'}` and end it, then try again.",
+        )
+    stop = f"`kill {pid}`" if here else f"`kill {pid}` on {host}"
+    return WorkspaceError(
+        f"The workspace {root} is in use by process {pid} on {host} since {since}.",
+        f"Wait for it to end, stop it with {stop}, or work in another folder with `--workspace DIR`.",
+    )
+
+
+def _is_running(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True
+    return True
+
+
+# ---------------------------------------------------------------- opening
+def _new_workspace(root: Path, create: bool) -> Workspace:
+    if root.exists() and not root.is_dir():
+        raise WorkspaceError(
+            f"{root} is a file, not a workspace folder.", "Choose another one with `--workspace DIR`."
+        )
+    if not create:
+        raise WorkspaceError(
+            f"There is no workspace at {root}.", f"Make one with `hineus run PHOTOS --workspace {root}`."
+        )
+    # A lock file or unfinished stages alone are what a first run leaves when it is killed at once.
+    strangers = [path.name for path in root.iterdir() if not _is_own(path.name)] if root.is_dir() else []
+    if strangers:
+        raise WorkspaceError(
+            f"{root} is no workspace, and it holds {len(strangers)} other files or folders "
+            f"({', '.join(sorted(strangers)[:3])}) that a run might overwrite.",
+            "Choose a new or empty folder with `--workspace DIR`.",
+        )
+    return Workspace(root, Record())
+
+
+def _is_own(name: str) -> bool:
+    return name in (".lock", ".work", "hineus.log", "config.yaml", "workspace.json.tmp", "config.yaml.tmp")
+
+
+def _parse_record(text: str, path: Path) -> Record:
+    try:
+        data = json.loads(text)
+        found = int(data["format"])
+        if found > FORMAT:
+            raise WorkspaceError(
+                f"The workspace {path.parent} has format {found} (made by hineus {data.get('hineus') or 'unknown'}); "
+                f"this is hineus {_hineus_version()}, which knows formats up to {FORMAT}.",
+                "Install the newer hineus with `pip install --upgrade hineus`, or use another `--workspace DIR`.",
+            )
+        sources = dict(data.get("sources", {}))
+        return Record(found, sources, data.get("preset"), data.get("hineus", ""), data.get("created", ""))
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise WorkspaceError(
+            f"{path} is damaged ({error}).",
+            f"Remove that file and run again with the photos: `rm {path}`. Finished stages are kept.",
+        ) from error
+
+
+def _hineus_version() -> str:
+    try:
+        return metadata.version("hineus")
+    except metadata.PackageNotFoundError:
+        return "unknown"
+
+
+# ---------------------------------------------------------------- files
+def _is_whole(out: Path) -> bool:
+    try:
+        manifest = load_manifest(out)
+    except ManifestDamaged:
+        return False
+    return manifest is not None and output_problem(out, manifest) is None
+
+
+def _replace(out: Path, final: Path, old: Path) -> None:
+    """Put `out` where `final` is; `final` waits in `old`. A folder cannot be renamed over a full one."""
+    _remove(old)
+    if final.exists():
+        final.rename(old)
+    out.rename(final)
+    _sync(final.parent)
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
+
+
+def _write(path: Path, text: str) -> None:
+    """Write a small file whole or not at all, and make sure it is on the disk."""
+    temporary = path.with_name(path.name + ".tmp")
+    with temporary.open("w", encoding="utf-8") as file:
+        file.write(text)
+        file.flush()
+        os.fsync(file.fileno())
+    temporary.replace(path)
+    _sync(path.parent)
+
+
+def _sync(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _sync_tree(folder: Path) -> None:
+    for parent, _, files in os.walk(folder, topdown=False):
+        for name in files:
+            _sync(Path(parent) / name)
+        _sync(Path(parent))
+
+
+def _scratch_owner(path: Path) -> str | None:
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))["fingerprint"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
