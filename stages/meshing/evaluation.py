@@ -1,0 +1,200 @@
+"""How far a mesh is from the known surface: accuracy, completeness and their mean. Arrays in, numbers out.
+
+The definition, used by the demo and by the benchmarks:
+
+- The known surface counts where some camera sees it (first hit of the rays through the pixels), so hidden inner
+  faces ask nothing of a method that works from photos.
+- The predicted mesh counts inside the known object's box, grown by `BOX_MARGIN`, and above `GROUND_MARGIN`, so the
+  table it may contain is not judged.
+- accuracy: mean distance from points sampled uniformly on the predicted surface to the known surface.
+- completeness: mean distance from the seen known surface to those points.
+
+All distances are in percent of the known object's largest extent.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+from stages.geometry.similarity import Similarity
+
+BOX_MARGIN = 0.04  # of the extent: a bulge just outside the object's box is still the method's fault
+GROUND_MARGIN = (
+    0.012  # of the extent, above the lowest point: where object and table meet is nobody's surface
+)
+SEEN_SPACING = (
+    0.004  # of the extent: the seen surface is thinned to one point a voxel, so near views do not outvote
+)
+SAMPLES = 400_000
+SCORE_THRESHOLDS = (0.005, 0.01)  # of the extent
+
+
+@dataclass(frozen=True)
+class SurfaceScore:
+    """Distances in percent of the known object's largest extent; F-scores in percent.
+
+    Attributes:
+        accuracy, completeness: means.
+        mean: of accuracy and completeness; the number to compare.
+        accuracy_median, completeness_median: the same with medians.
+        f_half_percent, f_one_percent: harmonic mean of the shares of points nearer than 0.5 % and 1 %.
+    """
+
+    accuracy: float
+    completeness: float
+    mean: float
+    accuracy_median: float
+    completeness_median: float
+    f_half_percent: float
+    f_one_percent: float
+
+    def as_dict(self) -> dict[str, float]:
+        """Rounded to a thousandth, for JSON and tables."""
+        return {name: round(value, 3) for name, value in asdict(self).items()}
+
+
+@dataclass(frozen=True)
+class KnownSurface:
+    """The true object and who looked at it.
+
+    Attributes:
+        vertices: [V, 3] in the truth's frame, z up.
+        faces: [F, 3] int.
+        intrinsics: [3, 3] pinhole intrinsics of all cameras, pixels.
+        size: width and height in pixels.
+        cam_from_world: [N, 4, 4] world-to-camera matrices, OpenCV axes.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    intrinsics: np.ndarray
+    size: tuple[int, int]
+    cam_from_world: np.ndarray
+
+    @property
+    def extent(self) -> float:
+        """The largest side of the bounding box."""
+        return float(np.ptp(self.vertices, axis=0).max())
+
+
+def align_points(source: np.ndarray, target: np.ndarray) -> Similarity:
+    """The similarity `target_from_source` with the least squared error between paired points [P, 3].
+
+    Source: Umeyama, "Least-squares estimation of transformation parameters between two point patterns", 1991.
+
+    Raises:
+        ValueError: fewer than 3 pairs, or all source points on one line.
+    """
+    if source.shape != target.shape or source.ndim != 2 or source.shape[1] != 3:
+        raise ValueError(f"paired points [P, 3] expected, got {source.shape} and {target.shape}")
+    if len(source) < 3:
+        raise ValueError(f"at least 3 pairs are needed to align, got {len(source)}")
+    source_mean, target_mean = source.mean(0), target.mean(0)
+    centered = source - source_mean
+    covariance = (target - target_mean).T @ centered / len(source)
+    left, singular, right = np.linalg.svd(covariance)
+    if singular[1] < 1e-12 * max(singular[0], 1e-300):
+        raise ValueError("the points lie on one line: the rotation about it cannot be found")
+    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(left) * np.linalg.det(right))])
+    rotation = (left * signs) @ right
+    scale = float((singular * signs).sum() / (centered**2).sum(1).mean())
+    return Similarity(scale, rotation, target_mean - scale * rotation @ source_mean)
+
+
+def seen_surface(known: KnownSurface) -> np.ndarray:
+    """Points [P, 3] of the known surface that at least one camera's pixel centre sees, evenly thinned."""
+    import open3d as o3d
+
+    scene = _raycaster(known.vertices, known.faces)
+    points = []
+    for cam_from_world in known.cam_from_world:
+        rays = o3d.t.geometry.RaycastingScene.create_rays_pinhole(
+            o3d.core.Tensor(known.intrinsics), o3d.core.Tensor(cam_from_world), *known.size
+        )
+        distance = scene.cast_rays(rays)["t_hit"].numpy()
+        hit = np.isfinite(distance)
+        chosen = rays.numpy()[hit]
+        points.append(chosen[:, :3] + distance[hit][:, None] * chosen[:, 3:])
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(np.concatenate(points)))
+    return np.asarray(cloud.voxel_down_sample(SEEN_SPACING * known.extent).points)
+
+
+def sample_surface(vertices: np.ndarray, faces: np.ndarray, count: int, seed: int = 0) -> np.ndarray:
+    """Points [count, 3], uniform by area, on a triangle mesh.
+
+    Raises:
+        ValueError: the mesh has no area.
+    """
+    corners = vertices[faces].astype(np.float64)
+    edge_b, edge_c = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    area = np.linalg.norm(np.cross(edge_b, edge_c), axis=1)
+    if not area.sum() > 0:
+        raise ValueError(f"a mesh with area is expected, got {len(faces)} faces with none")
+    rng = np.random.default_rng(seed)
+    chosen = rng.choice(len(faces), size=count, p=area / area.sum())
+    u, v = rng.random((2, count, 1))
+    flip = u + v > 1
+    u, v = np.where(flip, 1 - u, u), np.where(flip, 1 - v, v)
+    return corners[chosen, 0] + u * edge_b[chosen] + v * edge_c[chosen]
+
+
+def score_surface(
+    vertices: np.ndarray, faces: np.ndarray, known: KnownSurface, samples: int = SAMPLES
+) -> SurfaceScore:
+    """Compare a predicted mesh (vertices [V, 3], faces [F, 3], in the truth's frame) with the known surface.
+
+    Raises:
+        ValueError: no predicted surface lies inside the known object's box.
+    """
+    import open3d as o3d
+    from scipy.spatial import cKDTree
+
+    extent = known.extent
+    low, high = known.vertices.min(0), known.vertices.max(0)
+    ground = low[2] + GROUND_MARGIN * extent
+
+    # Only faces that reach into the box are sampled: the object is as densely covered as if it stood alone.
+    corners = vertices[faces]
+    margin = BOX_MARGIN * extent
+    near = np.all((corners.max(1) > low - margin) & (corners.min(1) < high + margin), axis=1)
+    if not near.any():
+        raise ValueError("no face of the mesh lies inside the known object's box: is it in the same frame?")
+    predicted = sample_surface(vertices, faces[near], samples)
+    inside = np.all((predicted > low - margin) & (predicted < high + margin), axis=1)
+    predicted = predicted[inside & (predicted[:, 2] > ground)]
+    if len(predicted) == 0:
+        raise ValueError("no surface of the mesh lies inside the known object's box, above the ground")
+    seen = seen_surface(known)
+    seen = seen[seen[:, 2] > ground]
+
+    scene = _raycaster(known.vertices, known.faces)
+    to_known = scene.compute_distance(o3d.core.Tensor(predicted.astype(np.float32))).numpy() / extent
+    to_predicted = cKDTree(predicted).query(seen, workers=-1)[0] / extent
+    f_scores = [_f_score(to_known, to_predicted, threshold) for threshold in SCORE_THRESHOLDS]
+    return SurfaceScore(
+        accuracy=100 * float(to_known.mean()),
+        completeness=100 * float(to_predicted.mean()),
+        mean=50 * float(to_known.mean() + to_predicted.mean()),
+        accuracy_median=100 * float(np.median(to_known)),
+        completeness_median=100 * float(np.median(to_predicted)),
+        f_half_percent=f_scores[0],
+        f_one_percent=f_scores[1],
+    )
+
+
+def _f_score(to_known: np.ndarray, to_predicted: np.ndarray, threshold: float) -> float:
+    precision, recall = (to_known < threshold).mean(), (to_predicted < threshold).mean()
+    return float(200 * precision * recall / max(precision + recall, 1e-9))
+
+
+def _raycaster(vertices: np.ndarray, faces: np.ndarray):
+    import open3d as o3d
+
+    scene = o3d.t.geometry.RaycastingScene()
+    scene.add_triangles(
+        o3d.core.Tensor(np.ascontiguousarray(vertices, np.float32)),
+        o3d.core.Tensor(np.ascontiguousarray(faces, np.uint32)),
+    )
+    return scene
