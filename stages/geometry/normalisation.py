@@ -1,0 +1,276 @@
+"""The normalised frame: which part of the world is the unit sphere, and which way is up.
+
+Everything works on cameras given in the world frame, as `PinholeCameras` whose "scene" is the world. The result
+is one `Similarity`; `into_scene` moves the cameras through it.
+
+Two kinds of capture:
+- "object": the cameras look at one place. The sphere is centred where their optical axes meet and is as large as
+  the views show whole; where silhouettes are known, it encloses their visual hull instead.
+- "forward": the optical axes are nearly parallel, or meet behind the cameras (a facade, a room, a survey flight).
+  The sphere encloses the sparse points, outliers aside.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from stages.geometry.cameras import PinholeCameras
+from stages.geometry.similarity import Similarity
+
+# Axes that spread less than this (root mean square angle to their mean) are "nearly parallel".
+MIN_AXIS_SPREAD_DEG = 8.0
+# The meeting point must lie in front of this part of the cameras ...
+MIN_IN_FRONT = 0.8
+# ... and the axes must pass it within this part of its distance (median): else they do not meet.
+MAX_MISS_RATIO = 0.5
+# The sphere of an object capture is the median of the largest spheres each camera sees whole, but no smaller than
+# this part of the distance to the cameras (close-ups see little whole).
+MIN_RADIUS_RATIO = 0.05
+# People fill the frame with the object, and its far ends stick out of the largest sphere the short side shows: on our
+# three synthetic captures that sphere was up to 4 % too small. Enlarged by this much.
+SEEN_WHOLE_MARGIN = 1.2
+# Free space around silhouettes' visual hull: 10 % of the radius.
+HULL_MARGIN = 1.1
+# A voxel belongs to the hull when it is inside the silhouette in this part of the views it projects into; less
+# than 1 because a mask or a pose may be wrong.
+HULL_AGREEMENT = 0.9
+HULL_CELLS = 48
+# Robust range of the sparse points of a forward capture, percent.
+FORWARD_PERCENTILES = (1.0, 99.0)
+FORWARD_MARGIN = 1.05
+IRLS_STEPS = 30
+TINY = 1e-12  # keeps divisions finite; far below any length that occurs
+
+
+@dataclass(frozen=True)
+class RegionOfInterest:
+    """The sphere that becomes the unit sphere.
+
+    Attributes:
+        center: [3] world frame.
+        radius: world units.
+        kind: "object" or "forward".
+        source: what the sphere was found from, in words.
+    """
+
+    center: np.ndarray
+    radius: float
+    kind: str
+    source: str
+
+
+# ---------------------------------------------------------------- where
+def meeting_point(origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Point closest to N lines in the sense of least summed distance (L1, by iteratively re-weighted squares).
+
+    Minimises sum_i |(I - d_i d_i^T)(p - o_i)|; L1 so that a few photos taken of something else do not count.
+
+    Args:
+        origins: [N, 3]. directions: [N, 3] unit.
+
+    Returns:
+        The point [3] and each line's distance to it [N].
+
+    Raises:
+        ValueError: fewer than two lines, or all of them parallel.
+    """
+    if len(origins) < 2:
+        raise ValueError(f"got {len(origins)} lines, expected at least 2")
+    projectors = np.eye(3) - directions[:, :, None] * directions[:, None, :]
+    if np.linalg.eigvalsh(projectors.mean(0))[0] < TINY:
+        raise ValueError("got parallel lines, expected lines that meet")
+    weights = np.ones(len(origins))
+    scale = np.linalg.norm(origins - origins.mean(0), axis=1).max() + TINY
+    for _ in range(IRLS_STEPS):
+        normal = np.einsum("n,nij->ij", weights, projectors)
+        point = np.linalg.solve(normal, np.einsum("n,nij,nj->i", weights, projectors, origins))
+        misses = np.linalg.norm(np.einsum("nij,nj->ni", projectors, point - origins), axis=1)
+        weights = 1.0 / np.maximum(misses, 1e-4 * scale)
+    return point, misses
+
+
+def axis_spread_deg(directions: np.ndarray) -> float:
+    """Root mean square angle in degrees between unit directions [N, 3] and their principal axis (sign ignored)."""
+    largest = np.linalg.eigvalsh(directions.T @ directions / len(directions))[-1]
+    return float(np.degrees(np.arcsin(np.sqrt(np.clip(1.0 - largest, 0.0, 1.0)))))
+
+
+def seen_whole_radii(cameras: PinholeCameras, center: np.ndarray) -> np.ndarray:
+    """[N] radius of the largest sphere about `center` [3] that each camera sees whole.
+
+    The least distance from the centre to the four side planes of the frustum; <= 0 where the centre itself is
+    out of view.
+    """
+    radii = np.empty(len(cameras))
+    for i in range(len(cameras)):
+        in_cam = cameras.cam_from_scene[i, :, :3] @ center + cameras.cam_from_scene[i, :, 3]
+        K, (width, height) = cameras.intrinsics[i], cameras.sizes[i]
+        left, right = -K[0, 2] / K[0, 0], (width - K[0, 2]) / K[0, 0]
+        top, bottom = -K[1, 2] / K[1, 1], (height - K[1, 2]) / K[1, 1]
+        # inward normals of the planes x = left * z and so on
+        planes = np.array([[1, 0, -left], [-1, 0, right], [0, 1, -top], [0, -1, bottom]])
+        radii[i] = (planes @ in_cam / np.linalg.norm(planes, axis=1)).min()
+        if in_cam[2] <= 0:
+            radii[i] = min(radii[i], 0.0)
+    return radii
+
+
+def visual_hull_sphere(
+    cameras: PinholeCameras, masks: Sequence[np.ndarray | None], center: np.ndarray, radius: float
+) -> tuple[np.ndarray, float] | None:
+    """Sphere about the visual hull of silhouettes, looked for in a cube about `center` with half side `radius`.
+
+    The cube is carved on a coarse grid, then once more on the hull's own box; without margin.
+
+    Args:
+        masks: one [H, W] bool (or 0/255) array per camera, of the camera's size, or None where there is none.
+
+    Returns:
+        Centre [3] and radius, or None where nothing is left after carving.
+    """
+    low, high = center - radius, center + radius
+    for _ in range(2):
+        cell = (high - low) / HULL_CELLS
+        axes = [low[k] + (np.arange(HULL_CELLS) + 0.5) * cell[k] for k in range(3)]
+        grid = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+        inside = _inside_silhouettes(cameras, masks, grid)
+        if not inside.any():
+            return None
+        kept = grid[inside]
+        low, high = kept.min(0) - cell, kept.max(0) + cell
+    hull_center = (kept.min(0) + kept.max(0)) / 2
+    # a cell's own half diagonal, because the grid holds centres of cells
+    hull_radius = np.linalg.norm(kept - hull_center, axis=1).max() + np.linalg.norm(cell) / 2
+    return hull_center, float(hull_radius)
+
+
+def _inside_silhouettes(
+    cameras: PinholeCameras, masks: Sequence[np.ndarray | None], points: np.ndarray
+) -> np.ndarray:
+    """[P] whether points [P, 3] lie inside the silhouettes of nearly all the views they project into."""
+    seen, inside = np.zeros(len(points)), np.zeros(len(points))
+    masked = [i for i, mask in enumerate(masks) if mask is not None]
+    for i in masked:
+        pixels, depth = cameras.project(i, points)
+        width, height = cameras.sizes[i]
+        u, v = np.floor(pixels[:, 0]), np.floor(pixels[:, 1])
+        visible = (depth > 0) & (u >= 0) & (v >= 0) & (u < width) & (v < height)
+        rows, columns = v[visible].astype(int), u[visible].astype(int)
+        seen += visible
+        inside[visible] += np.asarray(masks[i])[rows, columns] > 0
+    # a voxel most views do not see is no part of what they were pointed at
+    return (seen >= max(1.0, 0.5 * len(masked))) & (inside >= HULL_AGREEMENT * seen)
+
+
+def robust_sphere(
+    points: np.ndarray, percentiles: tuple[float, float] = FORWARD_PERCENTILES
+) -> tuple[np.ndarray, float]:
+    """Centre [3] and radius of a sphere about points [P, 3] with the extremes of each axis cut off."""
+    if len(points) == 0:
+        raise ValueError("got 0 points, expected at least 1")
+    low, high = np.percentile(points, percentiles, axis=0)
+    center = (low + high) / 2
+    kept = np.all((points >= low) & (points <= high), axis=1)
+    distances = np.linalg.norm(points[kept] - center, axis=1) if kept.any() else np.zeros(1)
+    return center, float(distances.max())
+
+
+def find_region(
+    cameras: PinholeCameras, points: np.ndarray, masks: Sequence[np.ndarray | None] | None = None
+) -> RegionOfInterest:
+    """The sphere the capture is about.
+
+    Args:
+        cameras: at least two, in the world frame.
+        points: [P, 3] sparse points in the world frame.
+        masks: one [H, W] silhouette per camera (or None for it), or None without masks.
+
+    Raises:
+        ValueError: fewer than two cameras, or no sphere of positive size can be found.
+    """
+    if len(cameras) < 2:
+        raise ValueError(f"got {len(cameras)} cameras, expected at least 2")
+    found = _object_sphere(cameras)
+    if found is not None:
+        center, radius = found
+        source = "the frusta of the cameras"
+        if masks is not None and any(mask is not None for mask in masks):
+            # The silhouettes may be larger than what every view shows whole: look in a cube twice as wide.
+            hull = visual_hull_sphere(cameras, masks, center, 2.0 * radius)
+            if hull is not None:
+                center, radius, source = hull[0], hull[1] * HULL_MARGIN, "the visual hull of the masks"
+        return RegionOfInterest(center, radius, "object", source)
+    if len(points) == 0:
+        raise ValueError("got 0 sparse points and optical axes that do not meet, expected either")
+    center, radius = robust_sphere(points)
+    if radius <= 0:
+        raise ValueError(f"got sparse points within a radius of {radius}, expected a positive one")
+    return RegionOfInterest(center, radius * FORWARD_MARGIN, "forward", "the sparse points")
+
+
+def _object_sphere(cameras: PinholeCameras) -> tuple[np.ndarray, float] | None:
+    """Where the optical axes meet and how much of it the views show whole; None where they do not meet."""
+    centers, forward = cameras.centers, cameras.forward
+    if axis_spread_deg(forward) < MIN_AXIS_SPREAD_DEG:
+        return None
+    point, misses = meeting_point(centers, forward)
+    depths = np.einsum("ni,ni->n", point - centers, forward)
+    in_front = depths > 0
+    if in_front.mean() < MIN_IN_FRONT or np.median(misses[in_front] / depths[in_front]) > MAX_MISS_RATIO:
+        return None
+    radius = SEEN_WHOLE_MARGIN * float(np.median(seen_whole_radii(cameras, point)))
+    return point, max(radius, MIN_RADIUS_RATIO * float(np.median(depths[in_front])))
+
+
+# ---------------------------------------------------------------- which way
+def estimate_up(cameras: PinholeCameras) -> np.ndarray:
+    """[3] unit up direction in the world frame, from how cameras are held.
+
+    People hold cameras level: image rows are horizontal, so up is perpendicular to all camera x axes whatever the
+    pitch. Where the x axes do not span a plane (photos from one side) it is the mean of the cameras' own up.
+    """
+    right, mean_up = cameras.cam_from_scene[:, 0, :3], -cameras.cam_from_scene[:, 1, :3].mean(0)
+    if np.linalg.norm(mean_up) < 1e-3:  # every direction equally often: a drone looking down in circles
+        mean_up = -cameras.forward.mean(0)
+    mean_up /= max(np.linalg.norm(mean_up), TINY)
+    weights = np.ones(len(right))
+    for _ in range(IRLS_STEPS):
+        spread, axes = np.linalg.eigh((weights[:, None] * right).T @ right / weights.sum())
+        up = axes[:, 0]
+        weights = 1.0 / np.maximum(np.abs(right @ up), 0.02)
+    if spread[1] < 0.05 or spread[1] < 4 * spread[0] or abs(up @ mean_up) < 0.5:
+        return mean_up
+    return up if up @ mean_up > 0 else -up
+
+
+def rotation_onto(source: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """[3, 3] smallest rotation that takes unit vector `source` to unit vector `target`."""
+    cross, cosine = np.cross(source, target), float(source @ target)
+    if cosine < -1 + 1e-9:  # opposite: half a turn about any axis perpendicular to it
+        axis = np.cross(source, np.eye(3)[np.argmin(np.abs(source))])
+        axis /= np.linalg.norm(axis)
+        return 2 * np.outer(axis, axis) - np.eye(3)
+    K = np.array([[0, -cross[2], cross[1]], [cross[2], 0, -cross[0]], [-cross[1], cross[0], 0]])
+    return np.eye(3) + K + K @ K / (1 + cosine)
+
+
+# ---------------------------------------------------------------- the frame
+def scene_frame(center: np.ndarray, radius: float, up: np.ndarray) -> Similarity:
+    """world_from_scene: the unit sphere to the sphere (center, radius), scene +z to `up`."""
+    if not radius > 0:
+        raise ValueError(f"got radius {radius}, expected a positive one")
+    return Similarity(
+        float(radius), rotation_onto(np.array([0.0, 0.0, 1.0]), up / np.linalg.norm(up)), center
+    )
+
+
+def into_scene(cameras: PinholeCameras, world_from_scene: Similarity) -> PinholeCameras:
+    """Cameras of the world frame, moved to the scene frame. The camera frames shrink with the scene."""
+    rotation, translation = cameras.cam_from_scene[:, :, :3], cameras.cam_from_scene[:, :, 3]
+    in_scene = np.empty_like(cameras.cam_from_scene)
+    in_scene[:, :, :3] = rotation @ world_from_scene.rotation
+    in_scene[:, :, 3] = (rotation @ world_from_scene.translation + translation) / world_from_scene.scale
+    return PinholeCameras(cameras.names, cameras.sizes, cameras.intrinsics, in_scene)
