@@ -1,1 +1,1 @@
-"""What runs stages: the stage record, the workspace on disk, fingerprints and the runner. It knows no stage."""
+"""What runs stages: stage record, workspace on disk, fingerprints, runner. It knows no stage."""

@@ -63,7 +63,7 @@ class Identity:
         return digest(self.parts)
 
     def changes_since(self, before: Identity, section: str) -> list[str]:
-        """What differs from `before`, in words: version, settings (of config section `section`), sources, inputs."""
+        """What differs from `before`, in words. `section` is the config section the settings belong to."""
         changes = []
         if before.version != self.version:
             changes.append(f"stage version {before.version} -> {self.version}")
@@ -192,9 +192,9 @@ class SourceDigests:
     def _digest_file(self, path: Path) -> str:
         stat = path.stat()
         key = str(path.absolute())
-        size, mtime_ns, sha = self._cache.get(key, (None, None, None))
-        if (size, mtime_ns) == (stat.st_size, stat.st_mtime_ns):
-            return sha
+        known = self._cache.get(key)
+        if known and known[:2] == [stat.st_size, stat.st_mtime_ns]:
+            return str(known[2])
         started_ns = time.time_ns()
         sha = file_sha256(path)
         if stat.st_mtime_ns < started_ns - RACY_NS:

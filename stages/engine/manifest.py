@@ -7,6 +7,7 @@ import platform
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from datetime import datetime, timezone
+from functools import lru_cache
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -165,6 +166,7 @@ def describe_outputs(folder: Path) -> dict[str, OutputFile]:
     }
 
 
+@lru_cache
 def current_versions() -> dict[str, str]:
     """Versions worth knowing when two machines give two results."""
     versions = {"python": platform.python_version(), "platform": platform.platform()}

@@ -45,8 +45,8 @@ class ResourceMeter:
         self._sample(1)
         self.wall_s = time.perf_counter() - self._started
         self.cpu_s = _cpu_seconds() - self._cpu
-        # The kernel keeps the exact peak of the whole life of the process. If it rose, it rose in here, perhaps
-        # between two samples.
+        # The kernel keeps the exact peak of the whole life of the process. If it rose, it rose in here,
+        # perhaps between two samples.
         own_peak = _own_peak_rss()
         if own_peak > self._own_peak:
             self.peak_rss = max(self.peak_rss, own_peak)

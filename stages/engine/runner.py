@@ -1,4 +1,4 @@
-"""Runs a pipeline on a workspace: what is fresh is skipped, what is not is run and published, each with its reason."""
+"""Runs a pipeline on a workspace: what is fresh is skipped, the rest is run and published, and says why."""
 
 from __future__ import annotations
 

@@ -52,7 +52,7 @@ class Stage:
 
     Attributes:
         name: folder name in the workspace and subcommand name.
-        version: raise it when the same inputs and settings would give another result; it enters the fingerprint.
+        version: raise it when the same inputs and settings would give another result; enters the fingerprint.
         needs: names of the earlier stages whose published folders `run` reads.
         params: name of the config section handed to `run`; all of it enters the fingerprint.
         run: does the work; returns the numbers a person wants to see (JSON-able). A failure raises.

@@ -7,7 +7,7 @@ import re
 
 from stages.errors import SystemRequirementError
 
-# Shared libraries that Open3D, PyMeshLab and pycolmap load at import -> the Debian/Ubuntu package that has them.
+# Shared libraries that Open3D, PyMeshLab and pycolmap load at import -> the Debian/Ubuntu package of each.
 SYSTEM_LIBRARIES = {
     "libGL.so.1": "libgl1",
     "libEGL.so.1": "libegl1",
@@ -38,7 +38,7 @@ def apt_line(libraries: list[str]) -> str:
 
 
 def requirement_error(error: BaseException, stage: str) -> SystemRequirementError | None:
-    """`error` in the user's terms, if it says that something is not installed; None if it says something else."""
+    """`error` in the user's terms, if it says that something is missing on this machine; None otherwise."""
     found = _MISSING_LIBRARY.search(str(error)) if isinstance(error, (ImportError, OSError)) else None
     if found:
         library = found[1]

@@ -8,8 +8,8 @@
     <root>/.work/<stage>/old      the publication that is being replaced, for an instant
     <root>/.work/<stage>/scratch  survives a kill; emptied on publication or when the fingerprint changes
 
-Publishing: outputs to disk, manifest to disk, old folder moved aside, `out` renamed into place, old folder removed.
-`recover` completes whichever of these steps a crash cut off.
+Publishing: outputs to disk, manifest to disk, old folder moved aside, `out` renamed into place, old folder
+removed. `recover` completes whichever of these steps a crash cut off.
 """
 
 from __future__ import annotations
@@ -78,11 +78,11 @@ class Workspace:
 
     @staticmethod
     def open(root: Path, create: bool = False) -> Workspace:
-        """Open the workspace at `root`; with `create`, an absent or empty folder becomes one (on the first lock).
+        """Open the workspace at `root`; with `create`, an absent or empty folder becomes one when locked.
 
         Raises:
-            WorkspaceError: there is no workspace, it is of a newer version, it cannot be read, or the folder holds
-                something else, which stages would overwrite.
+            WorkspaceError: there is no workspace, it is of a newer version, it cannot be read, or the folder
+                holds something else, which stages would overwrite.
         """
         root = Path(root).absolute()
         path = root / "workspace.json"
@@ -120,7 +120,7 @@ class Workspace:
     # ------------------------------------------------------------ lock
     @contextmanager
     def lock(self) -> Iterator[None]:
-        """Hold the workspace alone; nests within one object. The kernel frees the lock however the process ends.
+        """Hold the workspace alone; nests within one object. The kernel frees it however the process ends.
 
         Raises:
             WorkspaceError: another process holds it, or the folder cannot be written.
@@ -198,7 +198,7 @@ class Workspace:
             _remove(old)
 
     def begin(self, stage: str, fingerprint: str) -> tuple[Path, Path]:
-        """An empty `out` folder and the stage's scratch folder, emptied unless it belongs to this fingerprint."""
+        """An empty `out` folder, and the scratch folder, emptied unless it is of this fingerprint."""
         work = self.work_folder(stage)
         out, scratch, owner = work / "out", work / "scratch", work / "scratch.json"
         with storage_errors(self.root, f"starting '{stage}'"):
@@ -263,7 +263,7 @@ def disk_full_error(root: Path, doing: str, needed: int | None = None) -> Worksp
 
 
 def is_disk_full(error: BaseException, root: Path) -> bool:
-    """Whether a stage failed because the disk is full, also where a library hides it in an error of its own."""
+    """Whether a stage failed because the disk is full, also where a library hides that in its own error."""
     if isinstance(error, OSError) and error.errno in DISK_FULL:
         return True
     return free_bytes(root) < NEARLY_FULL_BYTES
@@ -324,8 +324,8 @@ def _new_workspace(root: Path, create: bool) -> Workspace:
         raise WorkspaceError(
             f"There is no workspace at {root}.", f"Make one with `hineus run PHOTOS --workspace {root}`."
         )
-    # A lock file or unfinished stages alone are what a first run leaves when it is killed at once.
-    strangers = [path.name for path in root.iterdir() if not _is_own(path.name)] if root.is_dir() else []
+    # What a first run leaves when it is killed at once, or a workspace whose record was removed, may go on.
+    strangers = [path.name for path in root.iterdir() if not _is_own(path)] if root.is_dir() else []
     if strangers:
         raise WorkspaceError(
             f"{root} is no workspace, and it holds {len(strangers)} other files or folders "
@@ -335,8 +335,9 @@ def _new_workspace(root: Path, create: bool) -> Workspace:
     return Workspace(root, Record())
 
 
-def _is_own(name: str) -> bool:
-    return name in (".lock", ".work", "hineus.log", "config.yaml", "workspace.json.tmp", "config.yaml.tmp")
+def _is_own(path: Path) -> bool:
+    names = (".lock", ".work", "hineus.log", "config.yaml", "workspace.json.tmp", "config.yaml.tmp")
+    return path.name in names or (path / MANIFEST).is_file()
 
 
 def _parse_record(text: str, path: Path) -> Record:
@@ -345,9 +346,9 @@ def _parse_record(text: str, path: Path) -> Record:
         found = int(data["format"])
         if found > FORMAT:
             raise WorkspaceError(
-                f"The workspace {path.parent} has format {found} (made by hineus {data.get('hineus') or 'unknown'}); "
+                f"The workspace {path.parent} has format {found}, made by hineus {data.get('hineus')}; "
                 f"this is hineus {_hineus_version()}, which knows formats up to {FORMAT}.",
-                "Install the newer hineus with `pip install --upgrade hineus`, or use another `--workspace DIR`.",
+                "Get the newer one with `pip install --upgrade hineus`, or use another `--workspace DIR`.",
             )
         sources = dict(data.get("sources", {}))
         return Record(found, sources, data.get("preset"), data.get("hineus", ""), data.get("created", ""))

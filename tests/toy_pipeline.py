@@ -1,0 +1,93 @@
+"""A pipeline of four tiny stages: the engine's test object.
+
+ingest reads the photos' first letters; sfm repeats them and can be told to die in the middle; undistort reduces
+that to one bit, so most changes end there; export writes the bit.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from configs.params import Config
+from stages.engine.runner import run_pipeline
+from stages.engine.stage import Stage, StageContext
+from stages.engine.workspace import Workspace
+
+
+def ingest(context: StageContext) -> dict[str, Any]:
+    photos = sorted(context.sources["photos"].iterdir())
+    text = "".join(path.read_text()[0] for path in photos)
+    (context.out / "letters.txt").write_text(text)
+    return {"photos": len(photos), "masked": "masks" in context.sources}
+
+
+def sfm(context: StageContext) -> dict[str, Any]:
+    """Counts to `max_features` / 100 in its scratch folder; kills itself where TOY_KILL_AT says so."""
+    counter = context.scratch / "count"
+    start = int(counter.read_text()) if counter.exists() else 0
+    end = context.params.max_features // 100
+    for count in range(start, end):
+        (context.scratch / "next").write_text(str(count + 1))
+        (context.scratch / "next").replace(counter)
+        context.progress(count + 1, end, "counting")
+        if os.environ.get("TOY_KILL_AT") == str(count + 1):
+            os.kill(os.getpid(), signal.SIGKILL)
+    time.sleep(float(os.environ.get("TOY_SLEEP", "0")))
+    (context.out / "model").mkdir()
+    (context.out / "model" / "poses.txt").write_text(
+        (context.inputs["ingest"] / "letters.txt").read_text() * end
+    )
+    return {"started_at": start, "ended_at": end}
+
+
+def undistort(context: StageContext) -> dict[str, Any]:
+    poses = (context.inputs["sfm"] / "model" / "poses.txt").read_text()
+    (context.out / "long.txt").write_text(str(len(poses) > 10))
+    return {}
+
+
+def export(context: StageContext) -> dict[str, Any]:
+    (context.out / "model.glb").write_text((context.inputs["undistort"] / "long.txt").read_text())
+    return {"nan": float("nan")}
+
+
+TOY: tuple[Stage, ...] = (
+    Stage("ingest", 1, (), "ingest", ingest, sources=("photos", "masks"), summary="photos to letters"),
+    Stage("sfm", 1, ("ingest",), "sfm", sfm, summary="letters to poses"),
+    Stage("undistort", 1, ("sfm",), "undistort", undistort, summary="poses to one bit"),
+    Stage("export", 1, ("undistort",), "export", export, summary="one bit to a file"),
+)
+
+
+def with_stage(name: str, **changes: Any) -> tuple[Stage, ...]:
+    """The toy pipeline with one stage changed."""
+    return tuple(replace(stage, **changes) if stage.name == name else stage for stage in TOY)
+
+
+def failing(
+    error: Callable[[], BaseException], after: str = "partial.txt"
+) -> Callable[[StageContext], dict[str, Any]]:
+    """A stage's run that writes a file and then raises."""
+
+    def run(context: StageContext) -> dict[str, Any]:
+        (context.out / after).write_text("half")
+        raise error()
+
+    return run
+
+
+def main() -> None:
+    """`python toy_pipeline.py WORKSPACE PHOTOS`: for tests that need a process to kill or to wait for."""
+    workspace, photos = map(Path, sys.argv[1:3])
+    run_pipeline(TOY, Workspace.open(workspace, create=True), Config(), {"photos": photos, "masks": None})
+
+
+if __name__ == "__main__":
+    main()
