@@ -1,0 +1,70 @@
+"""Brightness differences between photos: one gain per photo and channel."""
+
+from __future__ import annotations
+
+import numpy as np
+
+# Coded values outside this range are clipped or drowned in noise: they say nothing about a gain.
+DARKEST, BRIGHTEST = 8.0, 247.0
+# Residuals (natural log) larger than this are highlights and shadows, not gains.
+ROBUST_SCALE = 0.08
+# Pull of each gain to 1, as a part of the mean weight of a photo; it decides only for photos that share
+# nothing.
+REGULARISATION = 1e-3
+LIMIT = 3.0
+_ITERATIONS = 8
+
+
+def solve_gains(colors: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Gains g that make photos agree: minimise Σ_pi w_pi ρ(log(g_i c_pi) - m_p) over g and the points' own
+    colours m.
+
+    Per channel, by iteratively reweighted least squares (ρ: Geman-McClure) on the normal equations with m
+    eliminated, regularised to g = 1 and fixed to a geometric mean of 1.
+
+    Args:
+        colors: [P, N, 3] colour of point p in photo i, 0..255.
+        weights: [P, N] trust in it, 0 where the photo does not see the point.
+
+    Returns:
+        [N, 3] float64 gains within [1 / LIMIT, LIMIT]; all 1 when no two photos share a point.
+    """
+    if colors.shape != (*weights.shape, 3):
+        raise ValueError(f"expected colors of shape {(*weights.shape, 3)}, got {colors.shape}")
+    num_photos = weights.shape[1]
+    gains = np.ones((num_photos, 3))
+    for channel in range(3):
+        values = colors[:, :, channel]
+        base = np.where((values >= DARKEST) & (values <= BRIGHTEST), weights, 0.0).astype(np.float64)
+        # Each point counts once however large its weights, and only where photos can disagree.
+        shared = (base > 0).sum(1) >= 2
+        base = base[shared] / base[shared].sum(1, keepdims=True)
+        if not len(base):
+            continue
+        logs = np.log(np.maximum(values[shared], 1.0)).astype(np.float64)
+        log_gains = np.zeros(num_photos)
+        robust = base
+        scale = 4 * ROBUST_SCALE  # wide at first: gains not yet known look like outliers
+        for _ in range(_ITERATIONS):
+            total = np.maximum(robust.sum(1, keepdims=True), 1e-12)
+            mean = (robust * logs).sum(1, keepdims=True) / total
+            normal = np.diag(robust.sum(0)) - robust.T @ (robust / total)
+            normal += REGULARISATION * base.sum() / num_photos * np.eye(num_photos)
+            log_gains = np.linalg.solve(normal, -(robust * (logs - mean)).sum(0))
+            adjusted = logs + log_gains
+            center = _weighted_median(adjusted, base)
+            robust = base / (1 + ((adjusted - center) / scale) ** 2) ** 2
+            scale = max(ROBUST_SCALE, 0.6 * scale)
+        seen = robust.sum(0) > 0
+        log_gains[seen] -= log_gains[seen].mean()
+        log_gains[~seen] = 0
+        gains[:, channel] = np.exp(np.clip(log_gains, -np.log(LIMIT), np.log(LIMIT)))
+    return gains
+
+
+def _weighted_median(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """[P, 1] weighted median of each row of values [P, N]."""
+    order = np.argsort(values, axis=1)
+    cumulative = np.cumsum(np.take_along_axis(weights, order, 1), axis=1)
+    middle = (cumulative >= 0.5 * cumulative[:, -1:]).argmax(1)[:, None]
+    return np.take_along_axis(values, np.take_along_axis(order, middle, 1), 1)
