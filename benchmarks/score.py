@@ -18,9 +18,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument(
-        "mesh", type=Path, help="in the frame of the COLMAP model, e.g. WORKSPACE/export/model.ply"
-    )
+    parser.add_argument("mesh", type=Path, help="in the model's frame, e.g. WORKSPACE/export/model.ply")
     parser.add_argument("truth", type=Path, help="folder with gt_mesh.ply and transforms.json")
     parser.add_argument("--model", type=Path, required=True, help="e.g. WORKSPACE/sfm/model")
     arguments = parser.parse_args()

@@ -1,7 +1,8 @@
-"""Score a finished workspace against a known object: reads the files, leaves the measuring to `meshing.evaluation`.
+"""Score a mesh against a known object: reads the files, leaves the measuring to `meshing.evaluation`.
 
-The truth is a folder with `gt_mesh.ply` and `transforms.json` (w, h, fl_x, fl_y, cx, cy; per frame `file_path` and
-`w2c_opencv`). Mesh and truth meet by the camera centres of the COLMAP model: a similarity, no ICP.
+The truth is a folder with `gt_mesh.ply` and `transforms.json` (w, h, fl_x, fl_y, cx, cy; per frame
+`file_path` and `w2c_opencv`). Mesh and truth meet by the camera centres of the COLMAP model: a similarity,
+no ICP.
 """
 
 from __future__ import annotations

@@ -2,10 +2,10 @@
 
 The definition, used by the demo and by the benchmarks:
 
-- The known surface counts where some camera sees it (first hit of the rays through the pixels), so hidden inner
+- The known surface counts where some camera sees it (first hit of the rays through the pixels): hidden inner
   faces ask nothing of a method that works from photos.
-- The predicted mesh counts inside the known object's box, grown by `BOX_MARGIN`, and above `GROUND_MARGIN`, so the
-  table it may contain is not judged.
+- The predicted mesh counts inside the known object's box, grown by `BOX_MARGIN`, and above `GROUND_MARGIN`:
+  the table it may contain is not judged.
 - accuracy: mean distance from points sampled uniformly on the predicted surface to the known surface.
 - completeness: mean distance from the seen known surface to those points.
 
@@ -21,11 +21,12 @@ import numpy as np
 from stages.geometry.similarity import Similarity
 
 BOX_MARGIN = 0.04  # of the extent: a bulge just outside the object's box is still the method's fault
+FACE_MARGIN = 0.05  # of the extent: faces that lie inside this box are the ones that are sampled again
 GROUND_MARGIN = (
-    0.012  # of the extent, above the lowest point: where object and table meet is nobody's surface
+    0.012  # of the extent above the lowest point: the seam of object and table is nobody's surface
 )
 SEEN_SPACING = (
-    0.004  # of the extent: the seen surface is thinned to one point a voxel, so near views do not outvote
+    0.004  # of the extent: one point of the seen surface a voxel, so that near views do not outvote
 )
 SAMPLES = 400_000
 SCORE_THRESHOLDS = (0.005, 0.01)  # of the extent
@@ -153,19 +154,23 @@ def score_surface(
 
     extent = known.extent
     low, high = known.vertices.min(0), known.vertices.max(0)
-    ground = low[2] + GROUND_MARGIN * extent
+    margin, ground = BOX_MARGIN * extent, low[2] + GROUND_MARGIN * extent
 
-    # Only faces that reach into the box are sampled: the object is as densely covered as if it stood alone.
-    corners = vertices[faces]
-    margin = BOX_MARGIN * extent
-    near = np.all((corners.max(1) > low - margin) & (corners.min(1) < high + margin), axis=1)
-    if not near.any():
-        raise ValueError("no face of the mesh lies inside the known object's box: is it in the same frame?")
-    predicted = sample_surface(vertices, faces[near], samples)
-    inside = np.all((predicted > low - margin) & (predicted < high + margin), axis=1)
-    predicted = predicted[inside & (predicted[:, 2] > ground)]
+    def crop(points: np.ndarray) -> np.ndarray:
+        inside = np.all((points > low - margin) & (points < high + margin), axis=1)
+        return points[inside & (points[:, 2] > ground)]
+
+    predicted = crop(sample_surface(vertices, faces, samples))
+    if len(predicted) < samples // 4:
+        # The object is a small part of the mesh: sample it as if it stood alone.
+        in_box = np.all((vertices > low - FACE_MARGIN * extent) & (vertices < high + FACE_MARGIN * extent), 1)
+        near = in_box[faces].all(1)
+        if near.any():
+            predicted = crop(sample_surface(vertices, faces[near], samples))
     if len(predicted) == 0:
-        raise ValueError("no surface of the mesh lies inside the known object's box, above the ground")
+        raise ValueError(
+            "no surface of the mesh lies inside the known object's box: is it in the same frame?"
+        )
     seen = seen_surface(known)
     seen = seen[seen[:, 2] > ground]
 

@@ -1,0 +1,39 @@
+# make demo   photos -> textured model of a made-up object, with its score; result in demo/
+# make test   all tests
+# make lint   formatting, lint, types, who-may-import-whom
+# Each makes .venv first where needed.
+
+PYTHON ?=
+export PYTHON
+BIN := .venv/bin
+
+.PHONY: help venv demo test lint format docs clean
+
+help:
+	@sed -n 's/^# //p' Makefile
+
+venv:
+	@bash .ci/setup_env.sh
+
+demo: venv
+	$(BIN)/hineus demo demo
+
+test: venv
+	$(BIN)/python -m pytest
+
+lint: venv
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+format: venv
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+docs: venv
+	$(BIN)/python docs/make_reference.py
+	$(BIN)/python -m benchmarks.run_sets --table-only
+
+clean:
+	rm -rf .venv demo build dist *.egg-info
