@@ -71,6 +71,20 @@ class CleanupParams(Section):
     )
     min_views: int = Field(1, ge=0, description="faces seen by fewer cameras than this count as unseen")
     keep_closed: bool = Field(False, description="keep unseen faces that close the surface (watertight where possible)")
+    rings: int = Field(
+        3, ge=0, description="faces within this many steps of a seen one are kept, so borders are not ragged"
+    )
+    max_hidden_area: float = Field(
+        0.002, ge=0, le=1, description="unseen patches up to this part of the seen area are kept: they close small gaps"
+    )
+    roi_radius: float = Field(
+        0.98, gt=0, le=1, description="faces farther from the centre are dropped, in radii of the region of interest"
+    )
+    mask_hull: bool = Field(True, description="where masks exist, drop faces that lie outside them")
+    mask_margin: int = Field(5, ge=0, description="masks grow by this many pixels before faces outside them are dropped")
+    mask_outside: float = Field(
+        0.1, ge=0, le=1, description="a face is outside if it lies off the mask in more than this part of the photos"
+    )
 
 
 class AtlasParams(Section):
@@ -107,9 +121,50 @@ class ReportParams(Section):
 class TrainParams(Section):
     """Posed images to a neural signed distance field."""
 
-    steps: int = Field(3000, ge=1, description="optimiser steps (ignored where `minutes` is set)")
+    steps: int = Field(4000, ge=1, description="optimiser steps (ignored where `minutes` is set)")
     minutes: float | None = Field(None, gt=0, description="wall-clock budget in minutes instead of steps")
     seed: int = Field(0, ge=0, description="random seed")
+    rays: int = Field(1024, ge=1, description="rays per step")
+    samples: int = Field(16, ge=2, description="samples per ray inside the region of interest")
+    free_points: int = Field(1024, ge=0, description="points per step anywhere in the region, for the Eikonal term")
+
+    levels: int = Field(8, ge=1, le=24, description="levels of the SDF's hash encoding")
+    level_features: int = Field(4, ge=1, le=8, description="features per level; CPU kernels exist for 4")
+    log2_rows: int = Field(17, ge=8, le=24, description="a level has at most two to this power rows")
+    coarsest: int = Field(16, ge=2, description="cells along a side of the coarsest level")
+    finest: int = Field(512, ge=4, le=8192, description="cells along a side of the finest level")
+    start_levels: int = Field(4, ge=1, description="levels in use at the start")
+    coarse_until: float = Field(0.4, ge=0, le=1, description="progress at which all levels are in use")
+    hidden: int = Field(64, ge=4, description="width of the hidden layers")
+    sphere_radius: float = Field(0.5, gt=0, lt=1, description="the SDF is this sphere before training, scene units")
+
+    scale_start: float = Field(0.05, gt=0, description="Laplace scale b at the start, scene units")
+    scale_end: float = Field(
+        0.002, gt=0, description="Laplace scale b at the end, scene units; never under half a voxel"
+    )
+    sharpen_until: float = Field(0.9, gt=0, le=1, description="progress at which the Laplace scale is at its end")
+
+    lr_table: float = Field(1e-2, gt=0, description="peak learning rate of the hash tables")
+    lr_network: float = Field(3e-3, gt=0, description="peak learning rate of the networks")
+    lr_warm_up: float = Field(0.02, ge=0, lt=1, description="progress at which the peak rate is reached")
+    lr_final: float = Field(0.03, ge=0, le=1, description="rate at the end as a part of the peak")
+
+    weight_eikonal: float = Field(0.1, ge=0, description="weight of the Eikonal term")
+    weight_sparse: float = Field(1.0, ge=0, description="weight of the SfM points' term, faded out")
+    sparse_until: float = Field(0.6, ge=0, le=1, description="progress at which the SfM points' term is gone")
+    sparse_tolerance: float = Field(0.005, gt=0, description="SfM points off by this count linearly, scene units")
+    sparse_batch: int = Field(512, ge=0, description="SfM points per step")
+    weight_mask: float = Field(0.1, ge=0, description="weight of the mask term, where masks exist")
+    weight_exposure: float = Field(0.1, ge=0, description="weight that holds the photos' gains at 1")
+
+    background: bool = Field(True, description="model what lies outside the region (never where masks exist)")
+    background_samples: int = Field(12, ge=1, description="samples per ray outside the region")
+    background_log2_rows: int = Field(15, ge=8, le=24, description="rows per level of the background's encoding")
+
+    cache_resolution: int = Field(96, ge=8, le=512, description="side of the SDF grid that guides sampling")
+    cache_every: int = Field(64, ge=1, description="steps between refreshes of that grid")
+    checkpoint_every: float = Field(60.0, gt=0, description="seconds between checkpoints")
+    preview_every: float = Field(0.25, gt=0, le=1, description="progress between preview renders")
 
 
 class Config(Section):

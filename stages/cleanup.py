@@ -1,0 +1,134 @@
+"""Raw mesh to a clean, light one: only what the photos show, manifold, within a budget of faces."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from stages import artifacts
+from stages.engine.stage import Stage, StageContext
+from stages.errors import ReconstructionError
+from stages.geometry.cameras import PinholeCameras
+
+logger = logging.getLogger(__name__)
+
+# The visibility test runs on a mesh of this many times the final faces: no slower, and fine enough for clean borders.
+WORKING_FACES = 3
+# Specks below this part of `min_component` go before anything is measured. The rest waits until the unseen is gone:
+# a background shell may be the largest piece.
+SPECK = 0.1
+
+
+def _masks(folder: Path, cameras: PinholeCameras, margin: int) -> Iterator[tuple[int, np.ndarray]]:
+    """Index and widened mask [H, W] bool of every photo that has one."""
+    import cv2
+
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * margin + 1, 2 * margin + 1))
+    for index, name in enumerate(cameras.names):
+        path = artifacts.mask_path(folder, name)
+        if path.is_file():
+            mask = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+            if mask is None:
+                raise ReconstructionError(
+                    f"The mask of {name} cannot be read: {path}", "Try `--force undistort` to write it again."
+                )
+            yield index, cv2.dilate(mask, kernel) > 127
+
+
+def run(context: StageContext) -> dict[str, Any]:
+    from stages.meshing import cleaning
+    from stages.meshing.simplify import decimate
+
+    params = context.params
+    cameras = artifacts.load_scene(context.inputs["undistort"]).cameras
+    vertices, faces = artifacts.load_mesh(context.inputs["extract"])
+    numbers: dict[str, Any] = {"faces_before": len(faces)}
+
+    def keep(selection: np.ndarray, what: str, hint: str) -> None:
+        nonlocal vertices, faces
+        numbers[what] = int(np.count_nonzero(~selection))
+        if not selection.any():
+            raise ReconstructionError(
+                f"Nothing of the mesh is left: its last {len(faces)} faces fell under '{what}'.", hint
+            )
+        vertices, faces = cleaning.compact(vertices, faces[selection])
+
+    context.progress(0, 5, "region of interest and masks")
+    inside = cleaning.inside_ball(vertices, faces, params.roi_radius)
+    keep(
+        inside, "outside_region", "Try `--set undistort.roi_scale=1.5`, or train for longer: `--set train.steps=6000`."
+    )
+    selection, numbers["specks_dropped"] = cleaning.large_pieces(faces, SPECK * params.min_component)
+    keep(selection, "speck_faces", "Try `--set cleanup.min_component=0`.")
+    if params.mask_hull:
+        masks = _masks(context.inputs["undistort"], cameras, params.mask_margin)
+        outside = cleaning.outside_hull(vertices, cameras, masks, params.mask_outside)
+        keep(
+            np.count_nonzero(outside[faces], axis=1) < 2,
+            "outside_masks",
+            "Look at the masks (white is the object), or try `--set cleanup.mask_hull=false`.",
+        )
+
+    context.progress(1, 5, "lightening")
+    vertices, faces = decimate(vertices, faces, WORKING_FACES * params.target_faces)
+
+    context.progress(2, 5, "what the cameras see")
+    if params.min_views > 0:
+        views = cleaning.count_views(
+            vertices,
+            faces,
+            cameras,
+            params.min_views,
+            progress=lambda done, total: context.progress(2 + done / total, 5, "what the cameras see"),
+        )
+        hint = "The poses and the mesh disagree; try `--set cleanup.min_views=0` to look at the raw mesh."
+        keep(_seen_faces(vertices, faces, views >= params.min_views, params), "unseen_faces", hint)
+
+    context.progress(3, 5, "pieces")
+    selection, numbers["pieces_dropped"] = cleaning.large_pieces(faces, params.min_component)
+    keep(selection, "piece_faces", "Try `--set cleanup.min_component=0`.")
+
+    context.progress(4, 5, "decimating")
+    vertices, faces = decimate(*cleaning.repair_manifold(vertices, faces), params.target_faces)
+    state = cleaning.mesh_state(faces)
+    if not state.manifold:
+        logger.warning("mesh is not manifold: %d edges, %d vertices", state.bad_edges, state.bad_vertices)
+    artifacts.save_mesh(context.out, vertices, faces)
+    return {
+        **numbers,
+        "faces": len(faces),
+        "vertices": len(vertices),
+        "open_edges": state.open_edges,
+        "watertight": state.watertight,
+        "manifold": state.manifold,
+    }
+
+
+def _seen_faces(vertices: np.ndarray, faces: np.ndarray, seen: np.ndarray, params: Any) -> np.ndarray:
+    """Faces [F] bool to keep, given which vertices [V] bool are seen: seen ones, their surroundings, small gaps."""
+    from stages.meshing import cleaning
+
+    chosen = seen[faces].any(1)
+    if params.keep_closed:
+        pieces = cleaning.label_pieces(len(faces), cleaning.face_adjacency(faces))
+        return np.bincount(pieces, chosen)[pieces] > 0
+    if not chosen.any():
+        return chosen
+    chosen = cleaning.spread(faces, len(vertices), chosen, params.rings)
+    chosen = cleaning.smooth_selection(faces, len(vertices), chosen, params.rings)
+    area = np.linalg.norm(cleaning.face_normals(vertices, faces), axis=1) / 2
+    return cleaning.fill_small_gaps(vertices, faces, chosen, params.max_hidden_area * float(area[chosen].sum()))
+
+
+CLEANUP = Stage(
+    name="cleanup",
+    version=1,
+    needs=("undistort", "extract"),
+    params="cleanup",
+    run=run,
+    summary="floaters and unseen shells gone, manifold, decimated",
+)

@@ -1,0 +1,64 @@
+"""Neural field to mesh: marching cubes at the resolution the photos support."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from stages import artifacts
+from stages.engine.stage import Stage, StageContext
+from stages.errors import ReconstructionError
+from stages.geometry.cameras import PinholeCameras
+
+# However small the photos, a coarser grid than this loses the object's shape.
+MIN_RESOLUTION = 64
+
+
+def supported_resolution(cameras: PinholeCameras) -> int:
+    """Cells along the region of interest (side 2) so that a cell is one pixel of the closest tenth of the photos."""
+    distance = np.maximum(np.linalg.norm(cameras.centers, axis=1), 1.0)
+    pixels_per_unit = cameras.intrinsics[:, 0, 0] / distance
+    return int(np.ceil(2 * np.quantile(pixels_per_unit, 0.9)))
+
+
+def run(context: StageContext) -> dict[str, Any]:
+    from stages.meshing.isosurface import extract_isosurface
+    from stages.neural.field import load_field
+
+    scene = artifacts.load_scene(context.inputs["undistort"])
+    field = load_field(artifacts.field_path(context.inputs["train"]), context.device)
+    supported = max(supported_resolution(scene.cameras), MIN_RESOLUTION)
+    resolution = min(context.params.resolution, supported)
+    surface = extract_isosurface(
+        field.sdf,
+        resolution,
+        block=context.params.block,
+        progress=lambda done, total: context.progress(done, total, f"marching cubes at {resolution}^3"),
+    )
+    if len(surface.faces) == 0:
+        centre = float(field.sdf(np.zeros((1, 3), dtype=np.float32))[0])
+        raise ReconstructionError(
+            f"The field has no surface inside the region of interest: 0 faces at {resolution}^3 "
+            f"(distance at the centre {centre:+.3f}).",
+            "Training ended too early or the region is wrong: try `--set train.steps=6000`, or "
+            "`--set undistort.roi_scale=1.5`.",
+        )
+    artifacts.save_mesh(context.out, surface.vertices, surface.faces)
+    return {
+        "resolution": resolution,
+        "supported_resolution": supported,
+        "vertices": len(surface.vertices),
+        "faces": len(surface.faces),
+        "evaluated_points": surface.evaluated,
+    }
+
+
+EXTRACT = Stage(
+    name="extract",
+    version=1,
+    needs=("undistort", "train"),
+    params="extract",
+    run=run,
+    summary="field to mesh",
+)

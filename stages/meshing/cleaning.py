@@ -1,0 +1,308 @@
+"""What of a raw mesh is kept: pieces, faces that cameras see, faces inside the masks' hull; and manifold repair.
+
+Every function takes and returns arrays: vertices [V, 3], faces [F, 3], and boolean selections of faces.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from stages.geometry.cameras import PinholeCameras
+
+# A face seen flatter than this (cosine) counts as unseen: no photo says anything of it.
+MIN_COSINE = 0.05
+# Rays cast in one call, to bound memory.
+MAX_RAYS = 1 << 20
+
+
+def face_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Cross products [F, 3] float64 of each face's edges: twice the area long, counter-clockwise side."""
+    a, b, c = (vertices[faces[:, i]].astype(np.float64) for i in range(3))
+    return np.cross(b - a, c - a)
+
+
+def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Area-weighted unit normals [V, 3] float64; +z where a vertex has no area around it."""
+    normals = face_normals(vertices, faces)
+    total = np.stack(
+        [np.bincount(faces.ravel(), np.repeat(normals[:, i], 3), minlength=len(vertices)) for i in range(3)], axis=1
+    )
+    length = np.linalg.norm(total, axis=1, keepdims=True)
+    return np.where(length > 0, total / np.where(length > 0, length, 1), (0.0, 0.0, 1.0))
+
+
+def compact(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The same mesh without vertices that no face uses; order kept."""
+    used = np.zeros(len(vertices), dtype=bool)
+    used[faces] = True
+    new_index = np.cumsum(used) - 1
+    return vertices[used], new_index[faces].astype(np.int32)
+
+
+@dataclass(frozen=True)
+class EdgeUse:
+    """The edges of a mesh and the faces at them.
+
+    Attributes:
+        face: [3F] face of each half-edge, grouped by edge.
+        slot: [3F] 0..2, the half-edge runs from corner `slot` to corner `slot + 1` of its face.
+        forward: [3F] bool, it runs from the lower to the higher vertex.
+        edge: [3F] edge of each half-edge, non-decreasing.
+        counts: [E] half-edges of each edge.
+    """
+
+    face: np.ndarray
+    slot: np.ndarray
+    forward: np.ndarray
+    edge: np.ndarray
+    counts: np.ndarray
+
+    def manifold_pairs(self) -> tuple[np.ndarray, np.ndarray]:
+        """Positions [P] and [P] of the half-edges that make up edges of exactly two faces, consistently turned."""
+        first = np.flatnonzero(self.counts[self.edge[:-1]] == 2) if len(self.edge) else np.zeros(0, dtype=np.int64)
+        first = first[self.edge[first] == self.edge[first + 1]]
+        first = first[self.forward[first] != self.forward[first + 1]]
+        return first, first + 1
+
+
+def edge_use(faces: np.ndarray) -> EdgeUse:
+    """Which faces share which edges."""
+    start, end = faces.astype(np.int64), np.roll(faces, -1, axis=1).astype(np.int64)
+    low, high = np.minimum(start, end).ravel(), np.maximum(start, end).ravel()
+    key = low * (int(faces.max(initial=0)) + 1) + high
+    order = np.argsort(key, kind="stable")
+    sorted_key = key[order]
+    new = np.ones(len(key), dtype=bool)
+    new[1:] = sorted_key[1:] != sorted_key[:-1]
+    edge = np.cumsum(new) - 1
+    return EdgeUse(order // 3, order % 3, (start < end).ravel()[order], edge, np.bincount(edge))
+
+
+def face_adjacency(faces: np.ndarray) -> np.ndarray:
+    """Pairs [P, 2] of faces that share a manifold edge."""
+    use = edge_use(faces)
+    first, second = use.manifold_pairs()
+    return np.stack([use.face[first], use.face[second]], axis=1)
+
+
+def label_pieces(num_faces: int, adjacency: np.ndarray, joined: np.ndarray | None = None) -> np.ndarray:
+    """Connected component [F] of each face; `joined` [P] bool says which of the adjacent pairs [P, 2] count."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    pairs = adjacency if joined is None else adjacency[joined]
+    ones = np.ones(len(pairs), dtype=bool)
+    graph = coo_matrix((ones, (pairs[:, 0], pairs[:, 1])), shape=(num_faces, num_faces))
+    return connected_components(graph, directed=False)[1]
+
+
+@dataclass(frozen=True)
+class MeshState:
+    """How sound a mesh is.
+
+    Attributes:
+        open_edges: edges of one face.
+        bad_edges: edges of more than two faces, or of two that are turned against each other.
+        bad_vertices: vertices where more than one fan of faces meets.
+    """
+
+    open_edges: int
+    bad_edges: int
+    bad_vertices: int
+
+    @property
+    def manifold(self) -> bool:
+        return self.bad_edges == 0 and self.bad_vertices == 0
+
+    @property
+    def watertight(self) -> bool:
+        return self.open_edges == 0 and self.bad_edges == 0
+
+
+def mesh_state(faces: np.ndarray) -> MeshState:
+    """Count what keeps a mesh from being a closed, oriented 2-manifold."""
+    use = edge_use(faces)
+    matched = len(use.manifold_pairs()[0])
+    open_edges = int(np.count_nonzero(use.counts == 1))
+    fans = _fans(faces, use)
+    corners = np.stack([faces.ravel(), fans], axis=1)
+    per_vertex = np.bincount(np.unique(corners, axis=0)[:, 0]) if len(faces) else np.zeros(0)
+    return MeshState(open_edges, len(use.counts) - open_edges - matched, int(np.count_nonzero(per_vertex > 1)))
+
+
+def _fans(faces: np.ndarray, use: EdgeUse) -> np.ndarray:
+    """Fan [3F] of each face corner: corners at one vertex are in one fan if manifold edges lead from one to another."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    first, second = use.manifold_pairs()
+    # The half-edge and its twin run in opposite directions: the start of one is the end of the other.
+    start = use.face * 3 + use.slot
+    end = use.face * 3 + (use.slot + 1) % 3
+    rows = np.concatenate([start[first], end[first]])
+    columns = np.concatenate([end[second], start[second]])
+    size = faces.size
+    graph = coo_matrix((np.ones(len(rows), dtype=bool), (rows, columns)), shape=(size, size))
+    return connected_components(graph, directed=False)[1]
+
+
+def repair_manifold(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A 2-manifold from a mesh that nearly is one.
+
+    Drops degenerate and duplicate faces; at edges of more than two faces, the smallest faces until two are left;
+    where two faces at an edge are turned against each other, or several fans meet in one vertex, gives each fan its
+    own copy of the vertex. Unused vertices go.
+    """
+    a, b, c = faces.T
+    faces = faces[(a != b) & (b != c) & (c != a)]
+    _, first = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
+    faces = faces[np.sort(first)]
+    while True:
+        use = edge_use(faces)
+        crowded = use.counts[use.edge] > 2
+        if not crowded.any():
+            break
+        area = np.linalg.norm(face_normals(vertices, faces), axis=1)
+        crowd_edge, crowd_face = use.edge[crowded], use.face[crowded]
+        order = np.lexsort((area[crowd_face], crowd_edge))
+        smallest = np.ones(len(order), dtype=bool)
+        smallest[1:] = crowd_edge[order][1:] != crowd_edge[order][:-1]
+        keep = np.ones(len(faces), dtype=bool)
+        keep[crowd_face[order][smallest]] = False
+        faces = faces[keep]
+    fans = _fans(faces, use)
+    _, first, corner = np.unique(fans, return_index=True, return_inverse=True)
+    # Fans in the order of their vertices, so that a sound mesh comes back with its vertices where they were.
+    order = np.argsort(faces.ravel()[first], kind="stable")
+    rank = np.empty(len(order), dtype=np.int64)
+    rank[order] = np.arange(len(order))
+    new_faces = rank[corner.reshape(-1)].reshape(-1, 3)
+    return vertices[faces.ravel()[first[order]]], new_faces.astype(np.int32)
+
+
+def large_pieces(faces: np.ndarray, min_part: float) -> tuple[np.ndarray, int]:
+    """Faces [F] bool of pieces with at least `min_part` of the largest piece's faces, and how many pieces go."""
+    labels = label_pieces(len(faces), face_adjacency(faces))
+    sizes = np.bincount(labels)
+    keep = sizes >= min_part * sizes.max(initial=0)
+    return keep[labels], int(np.count_nonzero(~keep))
+
+
+def inside_ball(vertices: np.ndarray, faces: np.ndarray, radius: float) -> np.ndarray:
+    """Faces [F] bool with all corners within `radius` of the origin."""
+    return (np.linalg.norm(vertices, axis=1) <= radius)[faces].all(1)
+
+
+def count_views(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    cameras: PinholeCameras,
+    enough: int,
+    progress: Callable[[int, int], None] | None = None,
+) -> np.ndarray:
+    """In how many cameras' images each vertex [V] shows, counted up to `enough`.
+
+    A vertex shows if it projects into the image, faces the camera and the way there is free. One ray per vertex and
+    camera, so no face is too small to be found; each vertex tries the cameras it faces best first, and stops early.
+    """
+    import open3d as o3d
+
+    scene = o3d.t.geometry.RaycastingScene()
+    scene.add_triangles(
+        o3d.core.Tensor(np.ascontiguousarray(vertices, dtype=np.float32)),
+        o3d.core.Tensor(np.ascontiguousarray(faces, dtype=np.uint32)),
+    )
+    normals = vertex_normals(vertices, faces)
+    edges = vertices[faces] - vertices[np.roll(faces, 1, axis=1)]
+    # The ray starts this far off the surface, or the faces around the vertex would hide it.
+    offset = 0.5 * float(np.median(np.linalg.norm(edges, axis=2)))
+    starts = (vertices + offset * normals).astype(np.float32)
+
+    cosines = np.full((len(vertices), len(cameras)), -1.0, dtype=np.float32)
+    for i, center in enumerate(cameras.centers):
+        pixels, depth = cameras.project(i, vertices)
+        inside = (depth > 0) & (pixels >= 0).all(1) & (pixels < cameras.sizes[i]).all(1)
+        to_camera = center - vertices
+        cosine = np.einsum("vi,vi->v", to_camera, normals) / np.linalg.norm(to_camera, axis=1)
+        cosines[:, i] = np.where(inside, cosine, -1)
+
+    views = np.zeros(len(vertices), dtype=np.int64)
+    best_first = np.argsort(-cosines, axis=1)
+    open_vertices = np.arange(len(vertices))
+    for rank in range(len(cameras)):
+        camera = best_first[open_vertices, rank]
+        facing = cosines[open_vertices, camera] > MIN_COSINE
+        open_vertices, camera = open_vertices[facing], camera[facing]
+        for begin in range(0, len(open_vertices), MAX_RAYS):
+            part = slice(begin, begin + MAX_RAYS)
+            index = open_vertices[part]
+            # Not normalised: the camera is at distance 1, whatever lies before it hides the vertex.
+            direction = cameras.centers[camera[part]] - starts[index]
+            rays = np.concatenate([starts[index], direction], axis=1).astype(np.float32)
+            hidden = scene.test_occlusions(o3d.core.Tensor(rays), tnear=0.0, tfar=0.999).numpy()
+            views[index[~hidden]] += 1
+        open_vertices = open_vertices[views[open_vertices] < enough]
+        if progress is not None:
+            progress(rank + 1, len(cameras))
+        if not len(open_vertices):
+            break
+    return views
+
+
+def spread(faces: np.ndarray, num_vertices: int, chosen: np.ndarray, rings: int) -> np.ndarray:
+    """The chosen faces [F] bool and those within `rings` steps over shared vertices."""
+    for _ in range(rings):
+        near = np.zeros(num_vertices, dtype=bool)
+        near[faces[chosen]] = True
+        chosen = near[faces].any(1)
+    return chosen
+
+
+def smooth_selection(faces: np.ndarray, num_vertices: int, chosen: np.ndarray, rings: int) -> np.ndarray:
+    """A selection of faces [F] bool without notches narrower than `rings` faces: spread, then shrunk back."""
+    grown = spread(faces, num_vertices, chosen, rings)
+    return chosen | ~spread(faces, num_vertices, ~grown, rings)
+
+
+def fill_small_gaps(vertices: np.ndarray, faces: np.ndarray, chosen: np.ndarray, max_area: float) -> np.ndarray:
+    """The chosen faces [F] bool, and the regions of others that touch them and are no larger than `max_area`."""
+    adjacency = face_adjacency(faces)
+    same = ~chosen[adjacency].any(1)
+    labels = label_pieces(len(faces), adjacency, same)
+    area = np.linalg.norm(face_normals(vertices, faces), axis=1) / 2
+    region_area = np.bincount(labels, area)
+    touches = np.zeros(len(region_area), dtype=bool)
+    border = chosen[adjacency[:, 0]] != chosen[adjacency[:, 1]]
+    touches[labels[adjacency[border]].ravel()] = True
+    return chosen | (touches & (region_area <= max_area))[labels]
+
+
+def outside_hull(
+    vertices: np.ndarray,
+    cameras: PinholeCameras,
+    masks: Iterable[tuple[int, np.ndarray]],
+    max_part: float,
+    min_views: int = 2,
+) -> np.ndarray:
+    """Vertices [V] bool outside the visual hull of silhouettes.
+
+    Args:
+        vertices: [V, 3].
+        masks: camera index and [H, W] bool mask, true on the object (widened by the caller's tolerance).
+        max_part: a vertex is outside if it lies off the mask in more than this part of the images it falls into,
+        min_views: and in at least this many of them: one bad mask must not cut the object.
+    """
+    seen = np.zeros(len(vertices), dtype=np.int64)
+    off = np.zeros(len(vertices), dtype=np.int64)
+    for index, mask in masks:
+        pixels, depth = cameras.project(index, vertices)
+        height, width = mask.shape
+        with np.errstate(invalid="ignore"):
+            column, row = np.floor(pixels).astype(np.int64).T
+        inside = (depth > 0) & (column >= 0) & (row >= 0) & (column < width) & (row < height)
+        seen += inside
+        off[inside] += ~mask[row[inside], column[inside]]
+    return (off > max_part * seen) & (off >= np.minimum(min_views, np.maximum(seen, 1)))
