@@ -180,7 +180,13 @@ def metrics_path(folder: Path) -> Path:
     return folder / METRICS
 
 
+def previews_path(folder: Path) -> Path:
+    """Folder of the renders made while training."""
+    return folder / PREVIEWS
+
+
 def preview_path(folder: Path, step: int) -> Path:
+    """Photo, render and normals side by side at one step."""
     return folder / PREVIEWS / f"{step:07d}.png"
 
 
@@ -256,13 +262,22 @@ def provenance_path(folder: Path) -> Path:
     return folder / PROVENANCE
 
 
-# ---------------------------------------------------------------- export: model.glb, model.obj, model.ply
+# ---------------------------------------------------------------- export: model.glb, .obj, .mtl, .png, .ply
 def glb_path(folder: Path) -> Path:
     return folder / "model.glb"
 
 
 def obj_path(folder: Path) -> Path:
     return folder / "model.obj"
+
+
+def mtl_path(folder: Path) -> Path:
+    """The OBJ's material; it names the texture at `obj_texture_path`."""
+    return folder / "model.mtl"
+
+
+def obj_texture_path(folder: Path) -> Path:
+    return folder / "model.png"
 
 
 def ply_path(folder: Path) -> Path:

@@ -1,0 +1,130 @@
+"""The textured mesh to GLB, OBJ + MTL + PNG and PLY, back in the world frame."""
+
+from __future__ import annotations
+
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any
+
+import numpy as np
+
+from stages import artifacts
+from stages.engine.stage import Stage, StageContext
+from stages.errors import ReconstructionError
+from stages.geometry.similarity import Similarity
+
+
+def run(context: StageContext) -> dict[str, Any]:
+    """Write each format of the settings. Returns counts, extents in world units, and bytes of each file."""
+    from stages.meshing.writing import glb_bytes, mtl_text, obj_text, ply_bytes
+
+    scene = artifacts.load_scene(context.inputs["undistort"])
+    atlas = artifacts.load_atlas(context.inputs["atlas"])
+    texture_png = artifacts.base_color_path(context.inputs["bake"]).read_bytes()
+    world = scene.world_from_scene
+    vertices = world.apply(atlas.vertices.astype(np.float64))
+    normals = unit_normals(atlas.vertices, atlas.normals, atlas.faces) @ world.rotation.T
+    numbers: dict[str, Any] = {
+        "vertices": len(vertices),
+        "faces": len(atlas.faces),
+        "extent": [round(float(side), 6) for side in np.ptp(vertices, axis=0)],
+    }
+    sizes: dict[str, int] = {}
+    try:
+        if "glb" in context.params.formats:
+            gltf_from_world = y_up_rotation(world.rotation @ scene.up)
+            data = glb_bytes(
+                vertices @ gltf_from_world.T,
+                normals @ gltf_from_world.T,
+                atlas.uvs,
+                atlas.faces,
+                texture_png,
+                generator=generator(),
+                extras=provenance(scene.cameras.names, world, gltf_from_world),
+            )
+            artifacts.glb_path(context.out).write_bytes(data)
+            sizes["glb"] = len(data)
+        if "obj" in context.params.formats:
+            texture_path, mtl = artifacts.obj_texture_path(context.out), artifacts.mtl_path(context.out)
+            texture_path.write_bytes(texture_png)
+            mtl.write_text(mtl_text(texture_path.name), encoding="utf-8")
+            text = obj_text(vertices, normals, atlas.uvs, atlas.faces, mtl.name)
+            artifacts.obj_path(context.out).write_text(text, encoding="utf-8")
+            sizes["obj"] = len(text)
+        if "ply" in context.params.formats:
+            colors = vertex_colors(texture_png, atlas.uvs)
+            data = ply_bytes(vertices, normals, colors, atlas.faces)
+            artifacts.ply_path(context.out).write_bytes(data)
+            sizes["ply"] = len(data)
+    except ValueError as error:
+        raise ReconstructionError(
+            f"The mesh cannot be exported: {error}.", "Rebuild it: `hineus run PHOTOS --from cleanup`."
+        ) from error
+    return {**numbers, "bytes": sizes}
+
+
+def y_up_rotation(up: np.ndarray) -> np.ndarray:
+    """The smallest proper rotation [3, 3] that turns the unit vector `up` to +Y (glTF's up)."""
+    target = np.array([0.0, 1.0, 0.0])
+    up = up / np.linalg.norm(up)
+    axis, cos = np.cross(up, target), float(up @ target)
+    if cos < -1 + 1e-9:  # upside down: half a turn about X
+        return np.diag([1.0, -1.0, -1.0])
+    skew = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
+    return np.eye(3) + skew + skew @ skew / (1 + cos)
+
+
+def unit_normals(vertices: np.ndarray, normals: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Vertex normals [V, 3] float64 of length 1: those without a length take an adjoining face's, else +Z."""
+    unit = normals.astype(np.float64)
+    lengths = np.linalg.norm(unit, axis=1)
+    bad = ~np.isfinite(lengths) | (lengths < 1e-6)
+    if bad.any():
+        corners = vertices[faces].astype(np.float64)
+        flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        usable = np.linalg.norm(flat, axis=1) > 0
+        unit[bad] = (0, 0, 1)
+        for k in range(3):
+            takes = usable & bad[faces[:, k]]
+            unit[faces[takes, k]] = flat[takes]
+        lengths = np.linalg.norm(unit, axis=1)
+    return unit / lengths[:, None]
+
+
+def vertex_colors(texture_png: bytes, uvs: np.ndarray) -> np.ndarray:
+    """The texture's colours [V, 3] (0..255) at UVs [V, 2]."""
+    import cv2
+
+    from stages.meshing.rendering import sample_texture
+
+    texture = cv2.imdecode(np.frombuffer(texture_png, np.uint8), cv2.IMREAD_COLOR)
+    if texture is None:
+        raise ValueError("expected a readable texture")
+    return sample_texture(cv2.cvtColor(texture, cv2.COLOR_BGR2RGB), uvs)
+
+
+def generator() -> str:
+    """Name and version of this program."""
+    try:
+        return f"hineus {version('hineus')}"
+    except PackageNotFoundError:  # run from a checkout that was never installed
+        return "hineus"
+
+
+def provenance(names: tuple[str, ...], world: Similarity, gltf_from_world: np.ndarray) -> dict[str, Any]:
+    """What a GLB says of its origin: the photos' number and the way back to the world and scene frames."""
+    return {
+        "photos": len(names),
+        "units": "world units of the reconstruction",
+        "gltf_from_world_rotation": gltf_from_world.tolist(),
+        "world_from_scene": world.matrix().tolist(),
+    }
+
+
+EXPORT = Stage(
+    name="export",
+    version=1,
+    needs=("undistort", "atlas", "bake"),
+    params="export",
+    run=run,
+    summary="textured mesh -> GLB, OBJ, PLY",
+)

@@ -1,0 +1,181 @@
+"""Textured meshes as bytes: GLB, OBJ + MTL, PLY. Arrays in, bytes out."""
+
+from __future__ import annotations
+
+import json
+import struct
+from typing import Any
+
+import numpy as np
+
+_FLOAT, _UINT = 5126, 5125
+_ARRAY_BUFFER, _ELEMENT_ARRAY_BUFFER = 34962, 34963
+_LINEAR, _LINEAR_MIPMAP_LINEAR, _CLAMP_TO_EDGE = 9729, 9987, 33071
+ROUGHNESS = 0.9
+
+
+def glb_bytes(
+    vertices: np.ndarray,
+    normals: np.ndarray,
+    uvs: np.ndarray,
+    faces: np.ndarray,
+    texture_png: bytes,
+    name: str = "model",
+    generator: str = "hineus",
+    extras: dict[str, Any] | None = None,
+) -> bytes:
+    """A binary glTF 2.0 file with one mesh and one PBR material (metallic 0, roughness `ROUGHNESS`).
+
+    Written by hand so that every field is chosen here (buffer targets, sampler, extras, the PNG's own
+    bytes): the format is two chunks, JSON and a binary blob (glTF 2.0 specification, section 4).
+
+    Args:
+        vertices: [V, 3] in a right-handed, Y-up frame.
+        normals: [V, 3] unit.
+        uvs: [V, 2], origin at the bottom-left (turned to glTF's top-left here).
+        faces: [F, 3], counter-clockwise seen from outside.
+        texture_png: the base-colour image.
+        extras: JSON-able, kept in the asset's extras.
+
+    Raises:
+        ValueError: an index is out of range, a normal is not unit or a number is not finite.
+    """
+    vertices, normals, uvs, faces = _checked(vertices, normals, uvs, faces)
+    flipped = uvs.copy()
+    flipped[:, 1] = 1 - flipped[:, 1]
+    blobs = [vertices.tobytes(), normals.tobytes(), flipped.tobytes(), faces.tobytes(), texture_png]
+    views, offset, binary = [], 0, b""
+    for k, blob in enumerate(blobs):
+        view: dict[str, Any] = {"buffer": 0, "byteOffset": offset, "byteLength": len(blob)}
+        if k < 4:
+            view["target"] = _ELEMENT_ARRAY_BUFFER if k == 3 else _ARRAY_BUFFER
+        views.append(view)
+        binary += blob + b"\0" * (-len(blob) % 4)
+        offset = len(binary)
+    tree = {
+        "asset": {"version": "2.0", "generator": generator, **({"extras": extras} if extras else {})},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0, "name": name}],
+        "meshes": [
+            {
+                "name": name,
+                "primitives": [
+                    {
+                        "attributes": {"POSITION": 0, "NORMAL": 1, "TEXCOORD_0": 2},
+                        "indices": 3,
+                        "material": 0,
+                    }
+                ],
+            }
+        ],
+        "materials": [
+            {
+                "name": name,
+                "pbrMetallicRoughness": {
+                    "baseColorTexture": {"index": 0},
+                    "metallicFactor": 0.0,
+                    "roughnessFactor": ROUGHNESS,
+                },
+            }
+        ],
+        "textures": [{"source": 0, "sampler": 0}],
+        "samplers": [
+            {
+                "magFilter": _LINEAR,
+                "minFilter": _LINEAR_MIPMAP_LINEAR,
+                "wrapS": _CLAMP_TO_EDGE,
+                "wrapT": _CLAMP_TO_EDGE,
+            }
+        ],
+        "images": [{"bufferView": 4, "mimeType": "image/png", "name": "base_color"}],
+        "accessors": [
+            {
+                "bufferView": 0,
+                "componentType": _FLOAT,
+                "count": len(vertices),
+                "type": "VEC3",
+                "min": vertices.min(0).tolist(),
+                "max": vertices.max(0).tolist(),
+            },
+            {"bufferView": 1, "componentType": _FLOAT, "count": len(normals), "type": "VEC3"},
+            {"bufferView": 2, "componentType": _FLOAT, "count": len(uvs), "type": "VEC2"},
+            {"bufferView": 3, "componentType": _UINT, "count": faces.size, "type": "SCALAR"},
+        ],
+        "bufferViews": views,
+        "buffers": [{"byteLength": len(binary)}],
+    }
+    text = json.dumps(tree, separators=(",", ":"), allow_nan=False).encode()
+    text += b" " * (-len(text) % 4)
+    return b"".join(
+        [
+            struct.pack("<4sII", b"glTF", 2, 12 + 8 + len(text) + 8 + len(binary)),
+            struct.pack("<I4s", len(text), b"JSON"),
+            text,
+            struct.pack("<I4s", len(binary), b"BIN\0"),
+            binary,
+        ]
+    )
+
+
+def obj_text(vertices: np.ndarray, normals: np.ndarray, uvs: np.ndarray, faces: np.ndarray, mtl_name: str) -> str:
+    """An OBJ with positions, UVs (bottom-left origin), normals, and the material "textured" of `mtl_name`."""
+    vertices, normals, uvs, faces = _checked(vertices, normals, uvs, faces)
+    lines = [f"mtllib {mtl_name}", "o model"]
+    lines += [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in vertices.tolist()]
+    lines += [f"vt {u:.7g} {v:.7g}" for u, v in uvs.tolist()]
+    lines += [f"vn {x:.6g} {y:.6g} {z:.6g}" for x, y, z in normals.tolist()]
+    lines.append("usemtl textured")
+    lines += [f"f {a}/{a}/{a} {b}/{b}/{b} {c}/{c}/{c}" for a, b, c in (faces.astype(np.int64) + 1).tolist()]
+    return "\n".join(lines) + "\n"
+
+
+def mtl_text(texture_name: str) -> str:
+    """The material "textured": a matt surface of the colours in `texture_name`."""
+    return f"newmtl textured\nKa 0 0 0\nKd 1 1 1\nKs 0 0 0\nillum 1\nPr {ROUGHNESS}\nPm 0\nmap_Kd {texture_name}\n"
+
+
+def ply_bytes(vertices: np.ndarray, normals: np.ndarray, colors: np.ndarray, faces: np.ndarray) -> bytes:
+    """A binary PLY with vertex normals and colours; vertices at one position (UV seams) are joined.
+
+    Args:
+        vertices, normals: [V, 3].
+        colors: [V, 3] 0..255.
+        faces: [F, 3].
+    """
+    joined, first, inverse = np.unique(
+        np.ascontiguousarray(vertices, dtype=np.float32), axis=0, return_index=True, return_inverse=True
+    )
+    inverse = inverse.reshape(-1)
+    count = np.bincount(inverse)[:, None]
+    mean_colors = np.stack([np.bincount(inverse, colors[:, c]) for c in range(3)], 1) / count
+    vertex = np.empty(len(joined), dtype=[("position", "<f4", 3), ("normal", "<f4", 3), ("color", np.uint8, 3)])
+    vertex["position"] = joined
+    vertex["normal"] = normals[first]
+    vertex["color"] = np.clip(mean_colors + 0.5, 0, 255).astype(np.uint8)
+    face = np.empty(len(faces), dtype=[("count", np.uint8), ("corners", "<i4", 3)])
+    face["count"] = 3
+    face["corners"] = inverse[faces]
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertex)}"]
+    header += [f"property float {axis}" for axis in ("x", "y", "z", "nx", "ny", "nz")]
+    header += [f"property uchar {channel}" for channel in ("red", "green", "blue")]
+    header += [f"element face {len(face)}", "property list uchar int vertex_indices", "end_header"]
+    return ("\n".join(header) + "\n").encode() + vertex.tobytes() + face.tobytes()
+
+
+def _checked(
+    vertices: np.ndarray, normals: np.ndarray, uvs: np.ndarray, faces: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """The arrays as float32 and uint32; wrong ones are refused."""
+    num = len(vertices)
+    if normals.shape != (num, 3) or uvs.shape != (num, 2):
+        raise ValueError(f"expected normals [{num}, 3] and uvs [{num}, 2], got {normals.shape} and {uvs.shape}")
+    if not len(faces) or faces.min() < 0 or faces.max() >= num:
+        raise ValueError(f"expected at least one face with vertices in [0, {num}), got {faces.shape[0]} faces")
+    arrays = [np.ascontiguousarray(array, dtype=np.float32) for array in (vertices, normals, uvs)]
+    if not all(np.isfinite(array).all() for array in arrays):
+        raise ValueError("expected finite vertices, normals and uvs")
+    lengths = np.linalg.norm(arrays[1], axis=1)
+    if np.abs(lengths - 1).max() > 1e-3:
+        raise ValueError(f"expected unit normals, got lengths in [{lengths.min():.3g}, {lengths.max():.3g}]")
+    return arrays[0], arrays[1], arrays[2], np.ascontiguousarray(faces, dtype=np.uint32)

@@ -1,0 +1,290 @@
+"""Export: frames, handedness, and each file read back by another program."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import struct
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from configs.params import ExportParams
+from stages import artifacts
+from stages.artifacts import AtlasMesh
+from stages.engine.stage import StageContext
+from stages.errors import ReconstructionError
+from stages.export import EXPORT, unit_normals, y_up_rotation
+from stages.geometry.cameras import PinholeCameras, PosedScene
+from stages.geometry.similarity import Similarity
+from stages.meshing.writing import glb_bytes, obj_text, ply_bytes
+
+ROOT = Path(__file__).parents[1]
+# No rotation maps this tetrahedron with its four colours to its mirror image.
+CORNERS = np.array([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) * [0.5, 0.4, 0.3]
+FACES = np.array([[0, 1, 2], [0, 3, 1], [0, 2, 3], [1, 3, 2]])  # counter-clockwise from outside
+COLORS = np.array([[220, 30, 30], [30, 200, 40], [40, 60, 210], [230, 220, 40]], np.uint8)
+
+
+def rotation_about(axis: np.ndarray, angle: float) -> np.ndarray:
+    axis = axis / np.linalg.norm(axis)
+    skew = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
+    return np.eye(3) + np.sin(angle) * skew + (1 - np.cos(angle)) * skew @ skew
+
+
+def tetrahedron() -> tuple[AtlasMesh, np.ndarray]:
+    """A tetrahedron with flat normals, each face a quarter of a 32² texture in a colour of its own."""
+    vertices = CORNERS[FACES].reshape(-1, 3)
+    normals = np.cross(vertices[1::3] - vertices[::3], vertices[2::3] - vertices[::3])
+    assert ((normals * vertices[::3]).sum(1) > 0).all()
+    normals = np.repeat(normals / np.linalg.norm(normals, axis=1, keepdims=True), 3, axis=0)
+    texture = np.zeros((32, 32, 3), np.uint8)
+    uvs = []
+    for k in range(4):
+        row, column = divmod(k, 2)
+        texture[row * 16 : row * 16 + 16, column * 16 : column * 16 + 16] = COLORS[k]
+        corner = np.array([column * 0.5, 1 - (row + 1) * 0.5])  # bottom-left of the quarter, v up
+        uvs.append(corner + 0.5 * np.array([[0.2, 0.2], [0.8, 0.2], [0.2, 0.8]]))
+    atlas = AtlasMesh(
+        vertices.astype(np.float32),
+        normals.astype(np.float32),
+        np.concatenate(uvs).astype(np.float32),
+        np.arange(12, dtype=np.int32).reshape(4, 3),
+        32,
+    )
+    return atlas, texture
+
+
+WORLD = Similarity(2.5, rotation_about(np.array([1.0, 2, -1]), 0.8), np.array([10.0, -4, 3]))
+UP = np.array([0.0, 0, 1])
+
+
+@pytest.fixture
+def exported(tmp_path) -> tuple[Path, dict]:
+    context = workspace(tmp_path)
+    return context.out, EXPORT.run(context)
+
+
+def workspace(tmp_path: Path, params: ExportParams | None = None) -> StageContext:
+    from stages.bake import write_png
+
+    folders = {name: tmp_path / name for name in ("undistort", "atlas", "bake", "out", "scratch")}
+    for folder in folders.values():
+        folder.mkdir()
+    atlas, texture = tetrahedron()
+    cameras = PinholeCameras(
+        ("a.jpg",), np.array([[8, 8]]), np.eye(3)[None], np.concatenate([np.eye(3), np.zeros((3, 1))], 1)[None]
+    )
+    scene = PosedScene(cameras, WORLD, np.zeros((1, 3)), np.zeros(1), np.zeros((1, 2)), UP)
+    artifacts.save_scene(folders["undistort"], scene)
+    artifacts.save_atlas(folders["atlas"], atlas)
+    write_png(artifacts.base_color_path(folders["bake"]), texture)
+    return StageContext(
+        inputs={name: folders[name] for name in EXPORT.needs},
+        sources={},
+        out=folders["out"],
+        scratch=folders["scratch"],
+        params=params or ExportParams(),
+    )
+
+
+def color_of(texture: np.ndarray, uv: np.ndarray) -> np.ndarray:
+    """Texture colour at UVs [P, 2] with a bottom-left origin."""
+    size = texture.shape[0]
+    return texture[((1 - uv[:, 1]) * size).astype(int), (uv[:, 0] * size).astype(int)][:, :3]
+
+
+def expect_marks(vertices: np.ndarray, faces: np.ndarray, colors: np.ndarray, from_scene) -> None:
+    """Each face must lie where the tetrahedron's face of its colour lies, wound the same way."""
+    assert len(faces) == 4
+    for face, color in zip(faces, colors, strict=True):
+        mark = np.flatnonzero((np.abs(COLORS.astype(int) - color) < 12).all(1))
+        assert len(mark) == 1
+        expected = from_scene(CORNERS[FACES[mark[0]]])
+        found = vertices[face]
+        turns = [np.roll(found, k, axis=0) for k in range(3)]  # any first corner, never another winding
+        assert min(np.abs(turn - expected).max() for turn in turns) < 1e-4
+
+
+def to_gltf(points: np.ndarray) -> np.ndarray:
+    return WORLD.apply(points) @ y_up_rotation(WORLD.rotation @ UP).T
+
+
+def test_numbers(exported):
+    folder, numbers = exported
+    assert numbers["faces"] == 4
+    np.testing.assert_allclose(numbers["extent"], np.ptp(WORLD.apply(CORNERS), axis=0), atol=1e-5)
+    for suffix in ("glb", "obj", "ply"):
+        assert (folder / f"model.{suffix}").stat().st_size == numbers["bytes"][suffix]
+
+
+def test_glb_read_by_trimesh_is_y_up_and_not_mirrored(exported):
+    import trimesh
+
+    mesh = trimesh.load(exported[0] / "model.glb", force="mesh", process=False)
+    texture = np.asarray(mesh.visual.material.baseColorTexture.convert("RGB"))
+    assert mesh.visual.material.metallicFactor == 0
+    centers = np.asarray(mesh.visual.uv)[mesh.faces].mean(1)  # trimesh turns v back to a bottom-left origin
+    expect_marks(np.asarray(mesh.vertices), np.asarray(mesh.faces), color_of(texture, centers), to_gltf)
+    assert mesh.volume > 0
+    up = to_gltf(np.array([UP, np.zeros(3)]))
+    np.testing.assert_allclose((up[0] - up[1]) / WORLD.scale, [0, 1, 0], atol=1e-9)
+    outward = np.asarray(mesh.vertex_normals)
+    assert ((np.asarray(mesh.vertices) - mesh.vertices.mean(0)) * outward).sum(1).min() > 0
+
+
+def test_glb_read_by_open3d(exported):
+    import open3d as o3d
+
+    model = o3d.io.read_triangle_model(str(exported[0] / "model.glb"))
+    mesh = model.meshes[0].mesh
+    texture = np.asarray(model.materials[0].albedo_img)
+    assert texture.shape[:2] == (32, 32)
+    assert len(mesh.triangles) == 4
+    assert mesh.has_triangle_uvs()
+    np.testing.assert_allclose(np.asarray(mesh.vertices).min(0), to_gltf(CORNERS).min(0), atol=1e-4)
+
+
+def test_obj_read_by_pymeshlab_is_in_the_world_frame(exported):
+    pymeshlab = pytest.importorskip("pymeshlab")
+    import cv2
+
+    meshes = pymeshlab.MeshSet()
+    meshes.load_new_mesh(str(exported[0] / "model.obj"))
+    mesh = meshes.current_mesh()
+    assert mesh.texture_number() == 1  # found through the MTL
+    texture = cv2.imread(str(exported[0] / "model.png"))[..., ::-1]
+    centers = mesh.wedge_tex_coord_matrix().reshape(-1, 3, 2).mean(1)
+    expect_marks(mesh.vertex_matrix(), mesh.face_matrix(), color_of(texture, centers), WORLD.apply)
+
+
+def test_obj_read_by_open3d_has_its_texture(exported):
+    import open3d as o3d
+
+    mesh = o3d.io.read_triangle_mesh(str(exported[0] / "model.obj"), enable_post_processing=True)
+    assert mesh.has_triangle_uvs()
+    assert len(mesh.textures) == 1
+    assert len(mesh.triangles) == 4
+
+
+def test_obj_read_by_trimesh(exported):
+    import trimesh
+
+    mesh = trimesh.load(exported[0] / "model.obj", process=False)
+    texture = np.asarray(mesh.visual.material.image.convert("RGB"))
+    centers = np.asarray(mesh.visual.uv)[mesh.faces].mean(1)
+    expect_marks(np.asarray(mesh.vertices), np.asarray(mesh.faces), color_of(texture, centers), WORLD.apply)
+
+
+def test_ply_read_by_pymeshlab_is_joined_and_coloured(exported):
+    pymeshlab = pytest.importorskip("pymeshlab")
+
+    meshes = pymeshlab.MeshSet()
+    meshes.load_new_mesh(str(exported[0] / "model.ply"))
+    mesh = meshes.current_mesh()
+    assert (mesh.vertex_number(), mesh.face_number()) == (4, 4)
+    order = [int(np.argmin(np.linalg.norm(mesh.vertex_matrix() - p, axis=1))) for p in WORLD.apply(CORNERS)]
+    np.testing.assert_allclose(mesh.vertex_matrix()[order], WORLD.apply(CORNERS), atol=1e-5)
+    for k, vertex in enumerate(order):  # a corner has the mean colour of its three faces
+        expected = COLORS[(k == FACES).any(1)].mean(0)
+        np.testing.assert_allclose(mesh.vertex_color_matrix()[vertex, :3] * 255, expected, atol=1.1)
+
+
+def test_ply_read_by_trimesh_is_watertight(exported):
+    import trimesh
+
+    mesh = trimesh.load(exported[0] / "model.ply", process=False)
+    assert mesh.is_watertight
+    assert mesh.volume > 0
+    assert mesh.visual.kind == "vertex"
+
+
+def test_only_the_wanted_formats_are_written(tmp_path):
+    context = workspace(tmp_path, ExportParams(formats=("glb",)))
+    EXPORT.run(context)
+    assert [p.name for p in context.out.iterdir()] == ["model.glb"]
+
+
+def test_glb_tells_the_way_back_to_the_world(exported):
+    data = (exported[0] / "model.glb").read_bytes()
+    length = struct.unpack_from("<I", data, 12)[0]
+    asset = json.loads(data[20 : 20 + length])["asset"]
+    assert asset["generator"].startswith("hineus")
+    turn = np.array(asset["extras"]["gltf_from_world_rotation"])
+    np.testing.assert_allclose(WORLD.apply(CORNERS) @ turn.T, to_gltf(CORNERS))
+
+
+def test_gltf_validator_finds_nothing(exported):
+    folder = os.environ.get("GLTF_VALIDATOR_DIR", str(ROOT))
+    if not shutil.which("node") or not (Path(folder) / "node_modules" / "gltf-validator").is_dir():
+        pytest.skip("needs node and `npm install gltf-validator`")
+    done = subprocess.run(
+        ["node", str(ROOT / "benchmarks" / "validate_glb.mjs"), str(exported[0] / "model.glb")],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=60,
+        env={**os.environ, "GLTF_VALIDATOR_DIR": folder},
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    report = json.loads(done.stdout)
+    assert (report["numErrors"], report["numWarnings"], report["numInfos"]) == (0, 0, 0), report["messages"]
+    assert report["info"]["totalTriangleCount"] == 4
+
+
+@given(st.lists(st.floats(-1, 1), min_size=3, max_size=3).filter(lambda v: np.linalg.norm(v) > 1e-2))
+def test_up_turns_to_y_by_a_proper_rotation(up):
+    up = np.array(up) / np.linalg.norm(up)
+    rotation = y_up_rotation(up)
+    np.testing.assert_allclose(rotation @ up, [0, 1, 0], atol=1e-6)
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-6)
+    assert np.linalg.det(rotation) == pytest.approx(1)
+
+
+def test_up_at_the_poles():
+    np.testing.assert_allclose(y_up_rotation(np.array([0.0, 1, 0])), np.eye(3))
+    down = y_up_rotation(np.array([0.0, -1, 0]))
+    np.testing.assert_allclose(down @ [0, -1, 0], [0, 1, 0])
+    assert np.linalg.det(down) == pytest.approx(1)
+
+
+def test_normals_without_length_are_mended():
+    atlas, _ = tetrahedron()
+    broken = atlas.normals.copy()
+    broken[4] = 0
+    broken[7] = np.nan
+    mended = unit_normals(atlas.vertices, broken, atlas.faces)
+    np.testing.assert_allclose(mended, atlas.normals, atol=1e-6)
+
+
+def test_wrong_arrays_are_refused():
+    atlas, _ = tetrahedron()
+    with pytest.raises(ValueError, match="unit normals"):
+        glb_bytes(atlas.vertices, atlas.normals * 2, atlas.uvs, atlas.faces, b"")
+    with pytest.raises(ValueError, match=r"vertices in \[0, 12\)"):
+        obj_text(atlas.vertices, atlas.normals, atlas.uvs, atlas.faces + 5, "m.mtl")
+    with pytest.raises(ValueError, match="finite"):
+        glb_bytes(atlas.vertices * np.nan, atlas.normals, atlas.uvs, atlas.faces, b"")
+
+
+def test_ply_header_counts():
+    atlas, _ = tetrahedron()
+    data = ply_bytes(atlas.vertices, atlas.normals, np.zeros((12, 3)), atlas.faces)
+    header, body = data.split(b"end_header\n")
+    assert b"element vertex 4\n" in header
+    assert len(body) == 4 * (24 + 3) + 4 * 13
+
+
+def test_a_mesh_that_cannot_be_written_is_explained(tmp_path):
+    context = workspace(tmp_path)
+    atlas, _ = tetrahedron()
+    artifacts.save_atlas(
+        context.inputs["atlas"], AtlasMesh(atlas.vertices, atlas.normals, atlas.uvs, atlas.faces[:0], 32)
+    )
+    with pytest.raises(ReconstructionError, match="cannot be exported"):
+        EXPORT.run(context)
