@@ -1,1 +1,1 @@
-"""The neural surface: encodings, fields, sampling, rendering, losses, training. Torch and numba only; no stage, no path."""
+"""The neural surface: encodings, fields, sampling, rendering, losses, training. No stage, no path."""

@@ -1,0 +1,44 @@
+"""From signed distance to optical depth along a ray (Laplace density, VolSDF; paper eq. density).
+
+Notation: f signed distance (positive outside), b Laplace scale in scene units, sigma density per scene unit,
+tau optical depth (dimensionless), delta length of a ray section.
+"""
+
+from __future__ import annotations
+
+import torch
+
+# Below this change of f over a section, in units of b, the mid-point rule replaces the difference quotient, which
+# would lose all its digits in float32; the mid-point's relative error there is (0.05)^2 / 24 ~ 1e-4.
+_FLAT = 0.05
+
+
+def laplace_density(sdf: torch.Tensor, scale: torch.Tensor | float) -> torch.Tensor:
+    """Density sigma = Psi_b(-f) / b [any shape], Psi_b the CDF of the zero-mean Laplace distribution.
+
+    1 / (2b) on the surface, 1 / b deep inside, 0 far outside (paper eq. density with alpha = 1 / b).
+    """
+    decay = 0.5 * torch.exp(-sdf.abs() / scale)
+    return torch.where(sdf >= 0, decay, 1 - decay) / scale
+
+
+def _density_integral(sdf: torch.Tensor, scale: torch.Tensor | float) -> torch.Tensor:
+    """Integral of b * laplace_density from `sdf` to infinity: its antiderivative, up to sign. Units: scene."""
+    return torch.relu(-sdf) + 0.5 * scale * torch.exp(-sdf.abs() / scale)
+
+
+def section_optical_depth(
+    sdf_start: torch.Tensor, sdf_end: torch.Tensor, delta: torch.Tensor, scale: torch.Tensor | float
+) -> torch.Tensor:
+    """Optical depth tau of ray sections on which f runs linearly from sdf_start to sdf_end over length delta.
+
+    The exact integral of `laplace_density`, so a section may be far longer than b. Zero where f is large on the
+    whole section; delta / b deep inside.
+    """
+    change = sdf_end - sdf_start
+    flat = change.abs() < _FLAT * scale
+    quotient = (_density_integral(sdf_start, scale) - _density_integral(sdf_end, scale)) / torch.where(
+        flat, torch.ones_like(change), change
+    )
+    middle = laplace_density(0.5 * (sdf_start + sdf_end), scale) * scale
+    return torch.where(flat, middle, quotient) * delta / scale

@@ -1,0 +1,78 @@
+"""The trained field as the rest of the pipeline uses it: NumPy in, NumPy out, in chunks."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from stages.neural.encodings import HashGrid
+from stages.neural.fields import Fields, FieldShape
+
+CHUNK = 1 << 16  # points evaluated at a time: bounds the memory of one call
+
+
+class TrainedField:
+    """A frozen signed distance and colour field in the scene frame.
+
+    All methods take and return float32 NumPy arrays of N rows.
+    """
+
+    def __init__(self, fields: Fields, device: torch.device | str) -> None:
+        self.fields = fields.to(device).eval().requires_grad_(False)
+        self.device = torch.device(device)
+        self.levels = fields.shape.sdf_grid.levels
+
+    @property
+    def voxel_size(self) -> float:
+        """Side of the finest encoding cell, scene units: the SDF has no detail below it."""
+        return self.fields.shape.sdf_grid.voxel_size()
+
+    def sdf(self, points: np.ndarray) -> np.ndarray:
+        """Signed distance [N] at points [N, 3]: positive outside, negative inside the object."""
+        return self._chunked(lambda p: self.fields.sdf.sdf(p, self.levels), points)
+
+    def normals(self, points: np.ndarray) -> np.ndarray:
+        """Unit normals [N, 3], pointing outwards."""
+        return self._chunked(lambda p: torch.nn.functional.normalize(self.fields.sdf(p, self.levels)[2], dim=1), points)
+
+    def color(self, points: np.ndarray, normals: np.ndarray, view_dirs: np.ndarray) -> np.ndarray:
+        """sRGB colour [N, 3] in [0, 1] of surface points seen along unit view_dirs (camera to point)."""
+
+        def evaluate(p: torch.Tensor, n: torch.Tensor, v: torch.Tensor) -> torch.Tensor:
+            _, features, _ = self.fields.sdf(p, self.levels)
+            return self.fields.radiance(p, n, v, features)
+
+        return self._chunked(evaluate, points, normals, view_dirs)
+
+    @torch.no_grad()
+    def _chunked(self, function, *arrays: np.ndarray) -> np.ndarray:
+        parts = []
+        for first in range(0, max(len(arrays[0]), 1), CHUNK):
+            chunk = [torch.from_numpy(np.ascontiguousarray(a[first : first + CHUNK], dtype=np.float32)) for a in arrays]
+            parts.append(function(*(c.to(self.device) for c in chunk)).cpu().numpy())
+        return np.concatenate(parts)
+
+
+def field_state(fields: Fields) -> dict[str, Any]:
+    """What `load_field` needs, as tensors and plain values."""
+    return {"shape": asdict(fields.shape), "weights": fields.state_dict()}
+
+
+def load_field(path: Path, device: torch.device | str = "cpu") -> TrainedField:
+    """Read a field that was saved with `torch.save(field_state(fields), path)`.
+
+    Raises ValueError when the file is not such a field.
+    """
+    state = torch.load(path, map_location="cpu", weights_only=True)
+    if not isinstance(state, dict) or "shape" not in state:
+        raise ValueError(f"{path}: got {type(state).__name__}, expected a trained field")
+    shape = state["shape"]
+    for key in ("sdf_grid", "background_grid"):
+        shape[key] = HashGrid(**shape[key]) if shape[key] else None
+    fields = Fields(FieldShape(**shape))
+    fields.load_state_dict(state["weights"])
+    return TrainedField(fields, device)

@@ -1,0 +1,48 @@
+"""Losses: one pure function per equation, unreduced and unweighted. Weights meet in one sum in `trainer.py`.
+
+Tensors in, tensor out; model queries happen before the call. Shapes: R rays, N points.
+"""
+
+from __future__ import annotations
+
+import torch
+
+# Keeps the norm's gradient finite where prediction and photo agree; far below one 8-bit grey level (4e-3).
+_NORM_EPSILON = 1e-3
+
+
+def rgb_error(predicted: torch.Tensor, observed: torch.Tensor) -> torch.Tensor:
+    """Colour error ||C - C_hat||_2 per ray [R], colours [R, 3] in [0, 1] (paper L_rgb).
+
+    Smoothed near zero: sqrt(|d|^2 + e^2) - e with e = 1e-3. Zero where the colours agree.
+    """
+    squared = ((predicted - observed) ** 2).sum(-1)
+    return torch.sqrt(squared + _NORM_EPSILON**2) - _NORM_EPSILON
+
+
+def eikonal_error(gradients: torch.Tensor) -> torch.Tensor:
+    """(||grad f|| - 1)^2 per point [N] for gradients [N, 3].
+
+    Gropp et al. 2020; the paper's eq. relaxed_eikonal with omega = 1. Zero where f grows at one unit per unit.
+    """
+    return (torch.linalg.vector_norm(gradients, dim=-1) - 1) ** 2
+
+
+def sparse_point_error(sdf: torch.Tensor, tolerance: float) -> torch.Tensor:
+    """Huber distance of SfM points to the surface [N]: f should vanish there (Geo-NeuS).
+
+    f^2 / (2 tolerance) within the tolerance (scene units), |f| - tolerance / 2 beyond: an outlier pulls no harder
+    than its neighbours.
+    """
+    distance = sdf.abs()
+    return torch.where(distance < tolerance, distance**2 / (2 * tolerance), distance - 0.5 * tolerance)
+
+
+def mask_error(opacity: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
+    """Binary cross-entropy per ray [R] between the rendered opacity and the mask, both in [0, 1] (NeuS, L_mask)."""
+    return torch.nn.functional.binary_cross_entropy(opacity.clamp(1e-3, 1 - 1e-3), mask, reduction="none")
+
+
+def exposure_error(log_gains: torch.Tensor) -> torch.Tensor:
+    """Squared log gain per photo and channel [I, 3]: holds the photos' mean exposure at 1."""
+    return log_gains**2

@@ -1,0 +1,121 @@
+"""The photos as one flat tensor of pixels, and rays drawn from it without touching images one by one.
+
+Shapes: I photos, T pixels of all photos together, R rays.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from stages.geometry.cameras import PinholeCameras
+from stages.neural.sampling import intersect_unit_sphere
+
+# More rays are drawn than asked for, since some of a box's rays miss the sphere: a box is 4 / pi its ellipse.
+_OVERDRAW = 1.5
+
+
+@dataclass(frozen=True)
+class RayBatch:
+    """Rays that cross the region of interest.
+
+    Attributes:
+        drawn: [R] int64, which of the rays asked for these are (those that miss the sphere are dropped).
+        images: [R] int64 photo indices.
+        origins, directions: [R, 3], scene frame, directions unit.
+        entry, leave: [R] distances at which the ray crosses the unit sphere.
+        colors: [R, 3] observed sRGB in [0, 1].
+        masks: [R] in [0, 1], or None when there are no masks.
+    """
+
+    drawn: torch.Tensor
+    images: torch.Tensor
+    origins: torch.Tensor
+    directions: torch.Tensor
+    entry: torch.Tensor
+    leave: torch.Tensor
+    colors: torch.Tensor
+    masks: torch.Tensor | None
+
+
+class Photos:
+    """All pixels as uint8, all cameras as tensors."""
+
+    def __init__(
+        self,
+        cameras: PinholeCameras,
+        images: list[np.ndarray],
+        masks: list[np.ndarray] | None,
+        device: torch.device | str,
+    ) -> None:
+        """images: I arrays [H, W, 3] uint8; masks: I arrays [H, W] uint8 or None. Raises ValueError on sizes."""
+        for i, image in enumerate(images):
+            width, height = cameras.sizes[i]
+            if image.shape != (height, width, 3):
+                raise ValueError(f"{cameras.names[i]}: got shape {image.shape}, expected {(height, width, 3)}")
+        self.device = torch.device(device)
+        self.pixels = torch.from_numpy(np.concatenate([i.reshape(-1, 3) for i in images])).to(device)
+        self.masks = torch.from_numpy(np.concatenate([m.ravel() for m in masks])).to(device) if masks else None
+        counts = cameras.sizes.prod(1)
+        self.first = torch.from_numpy(np.concatenate([[0], np.cumsum(counts)[:-1]])).to(device)
+        self.sizes = torch.from_numpy(cameras.sizes).to(device)
+        self.centers = torch.from_numpy(cameras.centers).float().to(device)
+        inverse = np.linalg.inv(cameras.intrinsics)
+        scene_from_pixel = np.einsum("nji,njk->nik", cameras.cam_from_scene[:, :, :3], inverse)
+        self.scene_from_pixel = torch.from_numpy(scene_from_pixel).float().to(device)
+        self.boxes = torch.from_numpy(_sphere_boxes(cameras)).float().to(device)
+
+    def __len__(self) -> int:
+        return len(self.first)
+
+    def draw(self, num_rays: int, generator: torch.Generator) -> RayBatch:
+        """At most num_rays random rays through the unit sphere, photos equally likely."""
+        count = int(num_rays * _OVERDRAW)
+        images = torch.randint(len(self), (count,), generator=generator, device=self.device)
+        place = torch.rand(count, 2, generator=generator, device=self.device)
+        low, high = self.boxes[images, :2], self.boxes[images, 2:]
+        pixels = (low + place * (high - low)).floor()
+        return self.rays(images, pixels, limit=num_rays)
+
+    def rays(self, images: torch.Tensor, pixels: torch.Tensor, limit: int | None = None) -> RayBatch:
+        """Rays through the centres of integer pixels [R, 2] (x, y) of photos [R]; those that miss are dropped."""
+        homogeneous = torch.nn.functional.pad(pixels + 0.5, (0, 1), value=1.0)
+        directions = torch.bmm(self.scene_from_pixel[images], homogeneous.unsqueeze(2)).squeeze(2)
+        directions = torch.nn.functional.normalize(directions, dim=1)
+        origins = self.centers[images]
+        entry, leave, hit = intersect_unit_sphere(origins, directions)
+        kept = torch.nonzero(hit).squeeze(1)[:limit]
+        images, pixels = images[kept], pixels[kept].long()
+        rows = self.first[images] + pixels[:, 1] * self.sizes[images, 0] + pixels[:, 0]
+        return RayBatch(
+            kept,
+            images,
+            origins[kept],
+            directions[kept],
+            entry[kept],
+            leave[kept],
+            self.pixels[rows].float() / 255,
+            None if self.masks is None else self.masks[rows].float() / 255,
+        )
+
+
+def _sphere_boxes(cameras: PinholeCameras) -> np.ndarray:
+    """[I, 4] x0, y0, x1, y1: the part of each photo that can show the unit sphere, in pixels."""
+    longitude, latitude = np.meshgrid(np.linspace(0, 2 * np.pi, 64), np.linspace(-np.pi / 2, np.pi / 2, 33))
+    # Slightly larger than the sphere, so that the polyhedron's faces do not cut it.
+    ball = 1.01 * np.stack(
+        [np.cos(latitude) * np.cos(longitude), np.cos(latitude) * np.sin(longitude), np.sin(latitude)], -1
+    ).reshape(-1, 3)
+    boxes = np.zeros((len(cameras), 4))
+    for i in range(len(cameras)):
+        width, height = cameras.sizes[i]
+        pixels, depth = cameras.project(i, ball)
+        if np.any(depth <= 0.01):  # the camera stands in the sphere or touches it: any pixel may show it
+            boxes[i] = 0, 0, width, height
+            continue
+        low = np.clip(np.floor(pixels.min(0)), 0, [width - 1, height - 1])
+        high = np.clip(np.ceil(pixels.max(0)), low + 1, [width, height])
+        boxes[i] = *low, *high
+    return boxes

@@ -1,0 +1,38 @@
+"""Volume rendering along rays (paper eq. radiance).
+
+Shapes: R rays, K samples a ray, sorted from near to far.
+"""
+
+from __future__ import annotations
+
+import torch
+
+from stages.neural.density import section_optical_depth
+
+
+def sample_optical_depths(sdf: torch.Tensor, distances: torch.Tensor, scale: torch.Tensor | float) -> torch.Tensor:
+    """Optical depth [R, K] of each sample's own stretch of the ray, half way to its neighbours.
+
+    f [R, K] is taken as piecewise linear between the samples at distances [R, K], and integrated exactly. So sparse
+    samples cannot invent a crossing that f does not have, and a crossing between two samples is shared by both.
+    """
+    delta = 0.5 * (distances[:, 1:] - distances[:, :-1])
+    middle = 0.5 * (sdf[:, 1:] + sdf[:, :-1])
+    near_half = section_optical_depth(sdf[:, :-1], middle, delta, scale)
+    far_half = section_optical_depth(middle, sdf[:, 1:], delta, scale)
+    return torch.nn.functional.pad(near_half, (0, 1)) + torch.nn.functional.pad(far_half, (1, 0))
+
+
+def weights_from_optical_depth(tau: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Rendering weights [R, K] and the transmittance [R] left behind the last sample.
+
+    w_k = T_k (1 - exp(-tau_k)), T_k = exp(-sum_{j<k} tau_j); the weights and what is left sum to 1.
+    """
+    total = torch.cumsum(tau, 1)
+    transmittance = torch.exp(-torch.nn.functional.pad(total, (1, 0)))
+    return transmittance[:, :-1] - transmittance[:, 1:], transmittance[:, -1]
+
+
+def composite(weights: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
+    """Sum over samples of weights [R, K] times values [R, K, D] -> [R, D]."""
+    return (weights.unsqueeze(-1) * values).sum(1)

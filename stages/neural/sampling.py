@@ -1,0 +1,111 @@
+"""Where along a ray to look: inside the unit sphere, near the surface of a cached SDF grid.
+
+Shapes: R rays with origins and unit directions [R, 3], K samples a ray. Distances are along the ray, scene units.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+
+from stages.neural.density import section_optical_depth
+from stages.neural.rendering import weights_from_optical_depth
+
+# Part of the samples spread evenly over the ray, so that a surface the cache has missed can still be found.
+EVEN_SHARE = 0.15
+
+
+def intersect_unit_sphere(
+    origins: torch.Tensor, directions: torch.Tensor, near: float = 0.02
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Entry and exit distances [R] of rays through the unit sphere, and whether they hit it [R] bool.
+
+    Entry is at least `near` (a camera may stand inside the sphere).
+    """
+    middle = -(origins * directions).sum(1)
+    closest = origins + middle[:, None] * directions
+    half_squared = 1 - (closest * closest).sum(1)
+    half = half_squared.clamp(min=0).sqrt()
+    entry, leave = (middle - half).clamp(min=near), middle + half
+    return entry, leave, (half_squared > 1e-4) & (leave > entry + 1e-3)
+
+
+class SdfCache:
+    """The SDF on a regular grid over [-1, 1]^3, refreshed now and then; what sampling and visibility read.
+
+    Attributes:
+        values: [1, 1, G, G, G] float32, indexed z, y, x as `grid_sample` wants it.
+    """
+
+    def __init__(self, resolution: int, device: torch.device | str) -> None:
+        self.resolution = resolution
+        self.values = torch.zeros(1, 1, resolution, resolution, resolution, device=device)
+
+    @property
+    def cell(self) -> float:
+        """Side of a cell in scene units."""
+        return 2.0 / (self.resolution - 1)
+
+    def points(self, rows: torch.Tensor) -> torch.Tensor:
+        """Positions [M, 3] of flat grid indices [M]."""
+        side = self.resolution
+        z, y, x = rows // (side * side), rows // side % side, rows % side
+        return torch.stack([x, y, z], 1).float() * self.cell - 1
+
+    @torch.no_grad()
+    def refresh(self, sdf: Callable[[torch.Tensor], torch.Tensor], band: float | None = None) -> int:
+        """Evaluate sdf([M, 3]) -> [M] on the grid: everywhere, or where |cached f| < band. Returns M."""
+        flat = self.values.view(-1)
+        if band is None:
+            rows = torch.arange(flat.numel(), device=flat.device)
+        else:
+            rows = torch.nonzero(flat.abs() < band).squeeze(1)
+        for chunk in rows.split(1 << 17):
+            flat[chunk] = sdf(self.points(chunk))
+        return len(rows)
+
+    def lookup(self, points: torch.Tensor) -> torch.Tensor:
+        """Trilinear f [...] at points [..., 3]; positions outside the cube read its border."""
+        values = torch.nn.functional.grid_sample(
+            self.values, points.reshape(1, 1, 1, -1, 3), align_corners=True, padding_mode="border"
+        )
+        return values.reshape(points.shape[:-1])
+
+
+@torch.no_grad()
+def importance_distances(
+    cache: SdfCache,
+    origins: torch.Tensor,
+    directions: torch.Tensor,
+    entry: torch.Tensor,
+    leave: torch.Tensor,
+    num_samples: int,
+    scale: float,
+    generator: torch.Generator | None,
+    num_bins: int = 64,
+) -> torch.Tensor:
+    """Sorted sample distances [R, K], drawn by inverse CDF from the cache's rendering weights.
+
+    The weights are those of a Laplace density of the given scale, widened to what the cache resolves; a share
+    `EVEN_SHARE` is spread evenly. One stratified draw per sample; the strata's centres without a generator.
+    """
+    device = origins.device
+    edges = torch.linspace(0, 1, num_bins + 1, device=device)
+    distances = entry[:, None] + (leave - entry)[:, None] * edges
+    sdf = cache.lookup(origins[:, None] + distances[..., None] * directions[:, None])
+    delta = (leave - entry)[:, None] / num_bins
+    tau = section_optical_depth(sdf[:, :-1], sdf[:, 1:], delta, max(scale, 0.5 * cache.cell))
+    weights, _ = weights_from_optical_depth(tau)
+    weights = weights + (EVEN_SHARE * weights.sum(1, keepdim=True) + 1e-4) / num_bins
+    cdf = torch.nn.functional.pad(torch.cumsum(weights, 1), (1, 0))
+    cdf = cdf / cdf[:, -1:]
+    if generator is None:
+        offset = torch.full((len(origins), num_samples), 0.5, device=device)
+    else:
+        offset = torch.rand(len(origins), num_samples, generator=generator, device=device)
+    u = (torch.arange(num_samples, device=device) + offset) / num_samples
+    index = torch.searchsorted(cdf, u.contiguous(), right=True).clamp(1, num_bins)
+    low, high = cdf.gather(1, index - 1), cdf.gather(1, index)
+    inside = ((u - low) / (high - low).clamp(min=1e-8)).clamp(0, 1)
+    return entry[:, None] + (leave - entry)[:, None] * (index - 1 + inside) / num_bins

@@ -1,0 +1,30 @@
+"""Schedules against progress in [0, 1], so that a budget can be steps or wall time."""
+
+from __future__ import annotations
+
+import math
+
+
+def exponential(progress: float, start: float, end: float) -> float:
+    """start at 0, end at 1, straight on a log scale between."""
+    return start * (end / start) ** min(max(progress, 0.0), 1.0)
+
+
+def fade_out(progress: float, until: float) -> float:
+    """1 at 0, straight down to 0 at `until`."""
+    return max(0.0, 1.0 - progress / until) if until > 0 else 0.0
+
+
+def warm_up_then_decay(progress: float, warm_up: float, final: float) -> float:
+    """Learning-rate factor: straight up from 0 to 1 until `warm_up`, then a cosine down to `final` at 1."""
+    if progress < warm_up:
+        return progress / warm_up
+    phase = min((progress - warm_up) / (1 - warm_up), 1.0)
+    return final + (1 - final) * 0.5 * (1 + math.cos(math.pi * phase))
+
+
+def active_levels(progress: float, levels: int, start: int, until: float) -> int:
+    """How many levels of the encoding are in use: `start` at 0, one more at even steps, all from `until` on."""
+    if progress >= until:
+        return levels
+    return min(levels, start + int((levels - start + 1) * progress / until))

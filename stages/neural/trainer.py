@@ -1,0 +1,300 @@
+"""Training: one step is one page, and the losses meet in one visible sum.
+
+Shapes: R rays, K samples a ray, N = R K points, P sparse points, I photos.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from configs.params import TrainParams
+from stages.neural import losses, schedules
+from stages.neural.encodings import HashGrid
+from stages.neural.fields import Fields, FieldShape
+from stages.neural.photos import Photos, RayBatch
+from stages.neural.rendering import composite, sample_optical_depths, weights_from_optical_depth
+from stages.neural.sampling import SdfCache, importance_distances
+
+# Samples that weigh less than this get no colour: together they change a pixel by less than one grey level.
+_COLOR_THRESHOLD = 2e-4
+# The background reaches to this many times the distance at which a ray leaves the region of interest.
+_BACKGROUND_NEAR_SHARE = 0.005
+
+
+@dataclass(frozen=True)
+class SparsePoints:
+    """SfM points inside the region of interest: positions [P, 3] and weights [P] in [0, 1]."""
+
+    positions: torch.Tensor
+    weights: torch.Tensor
+
+    @staticmethod
+    def from_scene(points: np.ndarray, errors: np.ndarray, device: torch.device | str) -> SparsePoints:
+        """Keep points inside the unit sphere; weight 1 / (1 + e^2), e the reprojection error in pixels."""
+        inside = np.linalg.norm(points, axis=1) < 0.98
+        weights = 1 / (1 + errors[inside] ** 2)
+        return SparsePoints(
+            torch.from_numpy(points[inside]).float().to(device), torch.from_numpy(weights).float().to(device)
+        )
+
+
+@dataclass(frozen=True)
+class Rendered:
+    """What a batch of rays shows.
+
+    Attributes:
+        colors: [R, 3] sRGB with the background behind, before exposure.
+        opacity: [R] of the surface alone.
+        weights: [R, K] rendering weights of the samples.
+        gradients: [N, 3] of the SDF at the samples.
+        extra_sdf, extra_gradients: the same at the extra points that were asked for.
+    """
+
+    colors: torch.Tensor
+    opacity: torch.Tensor
+    weights: torch.Tensor
+    gradients: torch.Tensor
+    extra_sdf: torch.Tensor
+    extra_gradients: torch.Tensor
+
+
+def field_shape(params: TrainParams, num_images: int, background: bool) -> FieldShape:
+    """The networks' shape for these settings."""
+    grid = HashGrid(params.levels, params.level_features, params.log2_rows, params.coarsest, params.finest)
+    background_grid = HashGrid(6, 4, params.background_log2_rows, 16, 256)
+    return FieldShape(
+        sdf_grid=grid,
+        hidden=params.hidden,
+        features=15,
+        sphere_radius=params.sphere_radius,
+        background_grid=background_grid if background else None,
+        num_images=num_images,
+    )
+
+
+class Trainer:
+    """Networks, optimiser, sampler and random state: all that a checkpoint must hold."""
+
+    def __init__(self, photos: Photos, sparse: SparsePoints, params: TrainParams, device: torch.device | str) -> None:
+        self.photos, self.sparse, self.params = photos, sparse, params
+        self.device = torch.device(device)
+        background = params.background and photos.masks is None
+        self.fields = Fields(field_shape(params, len(photos), background), params.seed).to(device)
+        tables = self.fields.tables()
+        table_ids = {id(table) for table in tables}
+        networks = [p for p in self.fields.parameters() if id(p) not in table_ids]
+        self.optimizer = torch.optim.Adam(
+            [
+                {"params": tables, "base_lr": params.lr_table},
+                {"params": networks, "base_lr": params.lr_network},
+            ],
+            lr=params.lr_table,
+            betas=(0.9, 0.99),
+            eps=1e-15,
+            fused=True,
+        )
+        self.cache = SdfCache(params.cache_resolution, device)
+        self.generator = torch.Generator(device=device).manual_seed(params.seed)
+        self.step_index = 0
+        self.cache_step = -(10**9)
+
+    # ------------------------------------------------------------------ schedules
+    def scale(self, progress: float) -> float:
+        """Laplace scale b in scene units; it ends at half a voxel of the finest level, or at `scale_end`."""
+        floor = 0.5 * self.fields.shape.sdf_grid.voxel_size()
+        return schedules.exponential(
+            progress / self.params.sharpen_until, self.params.scale_start, max(self.params.scale_end, floor)
+        )
+
+    def levels(self, progress: float) -> int:
+        return schedules.active_levels(progress, self.params.levels, self.params.start_levels, self.params.coarse_until)
+
+    # ------------------------------------------------------------------ one step
+    def step(self, progress: float) -> dict[str, torch.Tensor]:
+        """One optimiser step at progress in [0, 1]; returns its unreduced numbers as tensors (no sync)."""
+        params = self.params
+        self._refresh_cache(progress)
+        batch = self.photos.draw(params.rays, self.generator)
+        extra, sparse_weights = self._extra_points()
+        rendered = self.render(batch, progress, extra, self.generator)
+        exposed = rendered.colors * torch.exp(self.fields.log_gains[batch.images])
+
+        photo_error = losses.rgb_error(exposed, batch.colors)
+        num_sparse = len(sparse_weights)
+        if batch.masks is not None:  # outside the masks nothing is known of the colour
+            photo_error = photo_error * batch.masks
+            mask_loss = losses.mask_error(rendered.opacity, batch.masks).mean()
+        else:
+            mask_loss = torch.zeros((), device=self.device)
+        rgb_loss = photo_error.mean()
+        gradients = torch.cat([rendered.gradients, rendered.extra_gradients])
+        eikonal_loss = losses.eikonal_error(gradients).mean()
+        sparse_error = losses.sparse_point_error(rendered.extra_sdf[:num_sparse], params.sparse_tolerance)
+        sparse_loss = (sparse_weights * sparse_error).sum() / max(num_sparse, 1)
+        exposure_loss = losses.exposure_error(self.fields.log_gains).mean()
+
+        loss = (
+            rgb_loss
+            + params.weight_eikonal * eikonal_loss
+            + params.weight_sparse * schedules.fade_out(progress, params.sparse_until) * sparse_loss
+            + params.weight_mask * mask_loss
+            + params.weight_exposure * exposure_loss
+        )
+        self.optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        factor = schedules.warm_up_then_decay(progress, params.lr_warm_up, params.lr_final)
+        for group in self.optimizer.param_groups:
+            group["lr"] = group["base_lr"] * factor
+        self.optimizer.step()
+        self.step_index += 1
+        with torch.no_grad():
+            mse = ((exposed - batch.colors) ** 2).mean()
+            return {
+                "loss": loss.detach(),
+                "rgb": rgb_loss.detach(),
+                "eikonal": eikonal_loss.detach(),
+                "sparse": sparse_loss.detach(),
+                "mask": mask_loss.detach(),
+                "psnr": -10 * torch.log10(mse.clamp(min=1e-10)),
+                "gradient_norm": torch.linalg.vector_norm(rendered.gradients, dim=1).mean(),
+                "opacity": rendered.opacity.detach().mean(),
+            }
+
+    def _extra_points(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Points [E, 3] evaluated beside the rays': first a draw of sparse points, then some anywhere in the ball.
+
+        Returns the sparse points' weights too.
+        """
+        params = self.params
+        count = min(params.sparse_batch, len(self.sparse.weights))
+        chosen = torch.randint(max(len(self.sparse.weights), 1), (count,), generator=self.generator, device=self.device)
+        anywhere = torch.rand(params.free_points, 3, generator=self.generator, device=self.device) * 2 - 1
+        return torch.cat([self.sparse.positions[chosen], anywhere]), self.sparse.weights[chosen]
+
+    # ------------------------------------------------------------------ rendering
+    def render(
+        self,
+        batch: RayBatch,
+        progress: float,
+        extra: torch.Tensor,
+        generator: torch.Generator | None,
+    ) -> Rendered:
+        """Render rays and evaluate the SDF at extra points [E, 3] in the same pass."""
+        scale, levels = self.scale(progress), self.levels(progress)
+        distances = importance_distances(
+            self.cache, batch.origins, batch.directions, batch.entry, batch.leave,
+            self.params.samples, scale, generator,
+        )  # fmt: skip
+        num_rays, num_samples = distances.shape
+        points = (batch.origins[:, None] + distances[..., None] * batch.directions[:, None]).reshape(-1, 3)
+        num_points = len(points)
+        sdf, features, gradients = self.fields.sdf(torch.cat([points, extra]), levels)
+        tau = sample_optical_depths(sdf[:num_points].view(num_rays, num_samples), distances, scale)
+        weights, transmittance = weights_from_optical_depth(tau)
+
+        seen = torch.nonzero(weights.detach().view(-1) > _COLOR_THRESHOLD).squeeze(1)
+        ray = seen // num_samples
+        normals = torch.nn.functional.normalize(gradients[seen], dim=1)
+        sample_colors = self.fields.radiance(points[seen], normals, batch.directions[ray], features[seen])
+        colors = torch.zeros(num_rays, 3, device=self.device).index_add(
+            0, ray, weights.view(-1)[seen, None] * sample_colors
+        )
+        if self.fields.background is not None:
+            colors = colors + self._background(batch, transmittance, generator)
+        return Rendered(
+            colors, 1 - transmittance, weights, gradients[:num_points],
+            sdf[num_points:], gradients[num_points:],
+        )  # fmt: skip
+
+    def _background(
+        self, batch: RayBatch, transmittance: torch.Tensor, generator: torch.Generator | None
+    ) -> torch.Tensor:
+        """Background colour [R, 3] weighted by the transmittance [R] that the surface leaves.
+
+        Samples are even in inverse distance from where the ray leaves the sphere to 200 times as far.
+        """
+        count = self.params.background_samples
+        behind = torch.nonzero(transmittance.detach() > 0.01).squeeze(1)
+        leave, directions = batch.leave[behind], batch.directions[behind]
+        if generator is None:
+            offset = torch.full((len(behind), count + 1), 0.5, device=self.device)
+        else:
+            offset = torch.rand(len(behind), count + 1, generator=generator, device=self.device)
+        place = (torch.arange(count + 1, device=self.device) + offset) / (count + 1)
+        distances = leave[:, None] / (1 - place * (1 - _BACKGROUND_NEAR_SHARE))
+        points = batch.origins[behind, None] + distances[..., None] * directions[:, None]
+        middle = 0.5 * (points[:, 1:] + points[:, :-1])
+        contracted = _contracted_radius(points)
+        delta = (contracted[:, 1:] - contracted[:, :-1]).abs() + 1e-4
+        dirs = directions[:, None].expand_as(middle).reshape(-1, 3)
+        density, colors = self.fields.background(middle.reshape(-1, 3), dirs)
+        tau = density.view(len(behind), count) * delta
+        weights, left = weights_from_optical_depth(tau)
+        # What is left behind the last sample belongs to it: the background is opaque at infinity.
+        weights = torch.cat([weights[:, :-1], weights[:, -1:] + left[:, None]], 1)
+        color = composite(weights, colors.view(len(behind), count, 3))
+        return torch.zeros(len(batch.leave), 3, device=self.device).index_add(
+            0, behind, transmittance[behind, None] * color
+        )
+
+    @torch.no_grad()
+    def _refresh_cache(self, progress: float) -> None:
+        """Bring the sampler's grid up to date: all of it at first and now and then, else near the surface."""
+        every = self.params.cache_every
+        if self.step_index - self.cache_step < every:
+            return
+        levels = self.levels(progress)
+        refreshes = self.step_index // every
+        full = self.step_index <= 4 * every or refreshes % 8 == 0
+        self.cache.refresh(lambda p: self.fields.sdf.sdf(p, levels), None if full else 4 * self.cache.cell)
+        self.cache_step = self.step_index
+
+    # ------------------------------------------------------------------ previews, checkpoints
+    @torch.no_grad()
+    def preview(self, image: int, progress: float, width: int = 160) -> np.ndarray:
+        """Photo, render and normals of photo `image` side by side, [H, 3 W, 3] uint8, W about `width`."""
+        photo_width, photo_height = self.photos.sizes[image].tolist()
+        step = max(1, photo_width // width)
+        y, x = torch.meshgrid(torch.arange(0, photo_height, step), torch.arange(0, photo_width, step), indexing="ij")
+        pixels = torch.stack([x, y], 2).view(-1, 2).float().to(self.device)
+        nothing = torch.zeros(0, 3, device=self.device)
+        photo, color, normal = (torch.zeros(len(pixels), 3) for _ in range(3))
+        for part in torch.arange(len(pixels), device=self.device).split(4096):
+            batch = self.photos.rays(torch.full_like(part, image), pixels[part])
+            rendered = self.render(batch, progress, nothing, None)
+            rows = part[batch.drawn].cpu()
+            gradients = rendered.gradients.view(*rendered.weights.shape, 3)
+            normals = torch.nn.functional.normalize(composite(rendered.weights, gradients), dim=1)
+            photo[rows] = batch.colors.cpu()
+            color[rows] = (rendered.colors * torch.exp(self.fields.log_gains[image])).clamp(0, 1).cpu()
+            normal[rows] = (normals * 0.5 + 0.5).cpu()
+        panels = [panel.view(*x.shape, 3) for panel in (photo, color, normal)]
+        return (255 * torch.cat(panels, 1)).byte().numpy()
+
+    def state(self) -> dict[str, Any]:
+        """Everything that the next step depends on."""
+        return {
+            "fields": self.fields.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+            "cache": self.cache.values,
+            "cache_step": self.cache_step,
+            "generator": self.generator.get_state(),
+            "step_index": self.step_index,
+        }
+
+    def load_state(self, state: dict[str, Any]) -> None:
+        self.fields.load_state_dict(state["fields"])
+        self.optimizer.load_state_dict(state["optimizer"])
+        self.cache.values.copy_(state["cache"])
+        self.cache_step = state["cache_step"]
+        self.generator.set_state(state["generator"].cpu())
+        self.step_index = state["step_index"]
+
+
+def _contracted_radius(points: torch.Tensor) -> torch.Tensor:
+    """|contract(x)| [...] for points [..., 3] outside the unit ball: from 1 to 2."""
+    return 2 - 1 / torch.linalg.vector_norm(points, dim=-1).clamp(min=1.0)

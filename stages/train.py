@@ -1,0 +1,169 @@
+"""train: posed images -> neural signed distance field. Resumes from its last checkpoint after a kill."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import time
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+
+from stages import artifacts
+from stages.engine.stage import Stage, StageContext
+from stages.errors import ReconstructionError
+
+LOG_EVERY = 50  # steps between metric lines
+
+
+def run(context: StageContext) -> dict[str, Any]:
+    """Train until the budget of steps or minutes is spent; write field.pt, metrics.jsonl and previews."""
+    import torch
+
+    from stages.neural.field import field_state
+    from stages.neural.photos import Photos
+    from stages.neural.trainer import SparsePoints, Trainer
+
+    _use_threads(context)
+    folder, params = context.inputs["undistort"], context.params
+    scene = artifacts.load_scene(folder)
+    photos = Photos(scene.cameras, *_load_images(folder, scene.cameras.names), context.device)
+    sparse = SparsePoints.from_scene(scene.points, scene.point_errors, context.device)
+    trainer = Trainer(photos, sparse, params, context.device)
+
+    checkpoint = artifacts.checkpoint_path(context.scratch)
+    metrics = artifacts.metrics_path(context.scratch)
+    spent = _resume(trainer, checkpoint, metrics)
+    started = saved = time.monotonic()
+    previewed = _progress(trainer.step_index, spent, params)
+    with metrics.open("a", encoding="utf-8") as log:
+        while (progress := _progress(trainer.step_index, spent + time.monotonic() - started, params)) < 1:
+            numbers = trainer.step(progress)
+            if trainer.step_index % LOG_EVERY == 0:
+                numbers_out = {key: float(value) for key, value in numbers.items()}
+                _log(log, trainer, progress, numbers_out)
+                context.progress(progress, 1.0, f"PSNR {numbers_out['psnr']:.1f} dB")
+                _check(numbers_out, trainer.step_index)
+            now = time.monotonic()
+            if now - saved > params.checkpoint_every:
+                log.flush()
+                _save(trainer, checkpoint, spent + now - started)
+                saved = now
+            if progress - previewed >= params.preview_every:
+                _preview(trainer, context.scratch, progress)
+                previewed = progress
+    _preview(trainer, context.scratch, 1.0)
+    shutil.copytree(artifacts.previews_path(context.scratch), artifacts.previews_path(context.out))
+    torch.save(field_state(trainer.fields), artifacts.field_path(context.out))
+    artifacts.metrics_path(context.out).write_bytes(metrics.read_bytes())
+    seconds = spent + time.monotonic() - started
+    return {
+        "steps": trainer.step_index,
+        "train_seconds": round(seconds, 1),
+        "rays_per_second": round(trainer.step_index * params.rays / max(seconds, 1e-9)),
+        "photos": len(photos),
+        "sparse_points": len(sparse.weights),
+        **_last_numbers(artifacts.metrics_path(context.out)),
+    }
+
+
+def _use_threads(context: StageContext) -> None:
+    """Torch and numba take as many threads as the run was given."""
+    import numba
+    import torch
+
+    torch.set_num_threads(context.workers)
+    numba.set_num_threads(min(context.workers, numba.config.NUMBA_NUM_THREADS))
+
+
+def _load_images(folder: Path, names: tuple[str, ...]) -> tuple[list[np.ndarray], list[np.ndarray] | None]:
+    """RGB images [H, W, 3] uint8 and masks [H, W] uint8, or None when no photo has a mask."""
+    from PIL import Image
+
+    images, masks = [], []
+    for name in names:
+        with Image.open(artifacts.image_path(folder, name)) as image:
+            images.append(np.asarray(image.convert("RGB")))
+        mask = artifacts.mask_path(folder, name)
+        if mask.exists():
+            with Image.open(mask) as image:
+                masks.append(np.asarray(image.convert("L")))
+    return images, masks if len(masks) == len(images) else None
+
+
+def _progress(step: int, seconds: float, params: Any) -> float:
+    """Part of the budget that is spent, from 0 to 1: of the minutes where they are set, else of the steps."""
+    return seconds / (60 * params.minutes) if params.minutes else step / params.steps
+
+
+def _log(log: IO[str], trainer: Any, progress: float, numbers: dict[str, float]) -> None:
+    record = {
+        "step": trainer.step_index,
+        "progress": round(progress, 5),
+        **{key: float(f"{value:.6g}") for key, value in numbers.items()},
+        "scale": round(trainer.scale(progress), 6),
+        "levels": trainer.levels(progress),
+    }
+    log.write(json.dumps(record) + "\n")
+
+
+def _check(numbers: dict[str, float], step: int) -> None:
+    if not np.isfinite(numbers["loss"]):
+        raise ReconstructionError(
+            f"Training diverged at step {step}: the loss is {numbers['loss']}.",
+            "Lower the learning rates: `--set train.lr_table=0.005 --set train.lr_network=0.001`",
+        )
+
+
+def _save(trainer: Any, path: Path, seconds: float) -> None:
+    """Write the checkpoint beside the old one, then take its place: a kill leaves one of the two whole."""
+    import torch
+
+    partial = path.with_suffix(".partial")
+    torch.save({"trainer": trainer.state(), "seconds": seconds}, partial)
+    os.replace(partial, path)
+
+
+def _resume(trainer: Any, checkpoint: Path, metrics: Path) -> float:
+    """Go on from a checkpoint if there is one; returns the seconds already spent. Later metric lines are cut."""
+    import torch
+
+    if not checkpoint.exists():
+        metrics.unlink(missing_ok=True)
+        return 0.0
+    state = torch.load(checkpoint, map_location=trainer.device, weights_only=True)
+    trainer.load_state(state["trainer"])
+    lines = metrics.read_text(encoding="utf-8").splitlines() if metrics.exists() else []
+    kept = [line for line in lines if json.loads(line)["step"] <= trainer.step_index]
+    metrics.write_text("".join(f"{line}\n" for line in kept), encoding="utf-8")
+    return float(state["seconds"])
+
+
+def _preview(trainer: Any, folder: Path, progress: float) -> None:
+    """Photo, render and normals of one photo, another one each time."""
+    from PIL import Image
+
+    path = artifacts.preview_path(folder, trainer.step_index)
+    path.parent.mkdir(exist_ok=True)
+    image = int(progress * 0.999 * len(trainer.photos))
+    Image.fromarray(trainer.preview(image, progress)).save(path)
+
+
+def _last_numbers(metrics: Path) -> dict[str, float]:
+    """Mean of the last few metric lines, for the summary."""
+    lines = metrics.read_text(encoding="utf-8").splitlines()[-10:]
+    records = [json.loads(line) for line in lines]
+    keys = ("psnr", "rgb", "eikonal", "gradient_norm")
+    return {key: round(float(np.mean([r[key] for r in records])), 4) for key in keys} if records else {}
+
+
+TRAIN = Stage(
+    name="train",
+    version=1,
+    needs=("undistort",),
+    params="train",
+    run=run,
+    summary="learn a signed distance field and its colours from the posed images",
+)

@@ -1,0 +1,62 @@
+"""Each loss: known zeros, known non-zeros, gradients; schedules at their ends."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from stages.neural import losses, schedules
+
+
+def test_rgb_error_is_the_colour_distance():
+    predicted, observed = torch.tensor([[0.3, 0.4, 0.0], [0.2, 0.2, 0.2]]), torch.tensor([[0.0, 0, 0], [0.2] * 3])
+    assert losses.rgb_error(predicted, observed).tolist() == pytest.approx([0.5, 0.0], abs=1e-3)
+
+
+def test_rgb_error_has_a_finite_gradient_at_zero_and_unit_slope_away():
+    predicted = torch.tensor([[0.2, 0.2, 0.2], [0.7, 0.2, 0.2]], requires_grad=True)
+    losses.rgb_error(predicted, torch.full((2, 3), 0.2)).sum().backward()
+    assert predicted.grad[0].tolist() == [0, 0, 0]
+    assert predicted.grad[1].tolist() == pytest.approx([1, 0, 0], abs=1e-4)
+
+
+def test_eikonal_error_is_zero_on_unit_gradients_only():
+    gradients = torch.tensor([[0.0, 1, 0], [0, 0, 3], [0, 0.5, 0]], requires_grad=True)
+    error = losses.eikonal_error(gradients)
+    assert error.tolist() == pytest.approx([0, 4, 0.25])
+    error.sum().backward()
+    assert gradients.grad[1].tolist() == pytest.approx([0, 0, 4])
+
+
+def test_sparse_points_pull_evenly_beyond_the_tolerance():
+    sdf = torch.tensor([0.0, 0.001, -0.1, 0.4], requires_grad=True)
+    error = losses.sparse_point_error(sdf, 0.01)
+    assert error.tolist() == pytest.approx([0, 0.001**2 / 0.02, 0.095, 0.395])
+    error.sum().backward()
+    assert sdf.grad.tolist() == pytest.approx([0, 0.1, -1, 1])
+
+
+def test_mask_error_pulls_the_opacity_towards_the_mask():
+    opacity = torch.tensor([0.9, 0.9], requires_grad=True)
+    error = losses.mask_error(opacity, torch.tensor([1.0, 0.0]))
+    assert error.tolist() == pytest.approx([-math.log(0.9), -math.log(0.1)], rel=1e-4)
+    error.sum().backward()
+    assert opacity.grad[0] < 0 < opacity.grad[1]
+
+
+def test_exposure_error_is_zero_without_gain():
+    log_gains = torch.tensor([[0.0, 0, 0], [0.1, 0, -0.2]])
+    assert losses.exposure_error(log_gains).sum(1).tolist() == pytest.approx([0, 0.05])
+
+
+def test_schedules_meet_their_ends():
+    assert schedules.exponential(0, 0.1, 0.001) == pytest.approx(0.1)
+    assert schedules.exponential(0.5, 0.1, 0.001) == pytest.approx(0.01)
+    assert schedules.exponential(2, 0.1, 0.001) == pytest.approx(0.001)
+    assert [schedules.fade_out(p, 0.5) for p in (0, 0.25, 0.5, 1)] == [1, 0.5, 0, 0]
+    assert schedules.fade_out(0.3, 0) == 0
+    rates = [schedules.warm_up_then_decay(p, 0.1, 0.05) for p in (0, 0.05, 0.1, 1)]
+    assert rates == pytest.approx([0, 0.5, 1, 0.05])
+    assert [schedules.active_levels(p, 8, 4, 0.5) for p in (0, 0.11, 0.49, 0.5, 1)] == [4, 5, 8, 8, 8]

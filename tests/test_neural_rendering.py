@@ -1,0 +1,129 @@
+"""Density, rendering weights and samples against closed forms, quadrature and slow loops."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from stages.neural.density import laplace_density, section_optical_depth
+from stages.neural.rendering import composite, sample_optical_depths, weights_from_optical_depth
+from stages.neural.sampling import SdfCache, importance_distances, intersect_unit_sphere
+
+
+def test_laplace_density_at_known_places():
+    b = 0.1
+    density = laplace_density(torch.tensor([0.0, -100.0, 100.0, b]), b)
+    expected = torch.tensor([0.5 / b, 1 / b, 0.0, 0.5 * math.exp(-1) / b])
+    torch.testing.assert_close(density, expected)
+
+
+@given(start=st.floats(-1, 1), end=st.floats(-1, 1), scale=st.floats(1e-2, 0.5), delta=st.floats(1e-3, 2))
+def test_optical_depth_is_the_integral_of_the_density(start, end, scale, delta):
+    t = torch.linspace(0, 1, 20001, dtype=torch.float64)
+    brute = torch.trapezoid(laplace_density(start + (end - start) * t, scale), t) * delta
+    as64 = [torch.tensor(v, dtype=torch.float64) for v in (start, end, delta)]
+    closed = section_optical_depth(as64[0], as64[1], as64[2], scale)
+    assert closed.item() == pytest.approx(brute.item(), rel=2e-3, abs=1e-7)
+
+
+def test_optical_depth_has_a_gradient_even_where_the_sdf_is_flat():
+    start = torch.full((1,), 1e-4, requires_grad=True)
+    depth = section_optical_depth(start, torch.zeros(1), torch.ones(1), 0.1)
+    depth.sum().backward()
+    # d/df of Psi(-f)/b at f = 0 is -1 / (2 b^2); the start holds half of the middle's share.
+    assert start.grad.item() == pytest.approx(-0.5 * 0.5 / 0.1**2, rel=1e-2)
+
+
+def test_weights_match_a_slow_loop_and_sum_to_one():
+    tau = torch.rand(5, 7, generator=torch.Generator().manual_seed(0)) * 2
+    weights, left = weights_from_optical_depth(tau)
+    for r in range(5):
+        transmittance = 1.0
+        for k in range(7):
+            alpha = 1 - math.exp(-tau[r, k].item())
+            assert weights[r, k].item() == pytest.approx(transmittance * alpha, abs=1e-6)
+            transmittance *= 1 - alpha
+        assert left[r].item() == pytest.approx(transmittance, abs=1e-6)
+    torch.testing.assert_close(weights.sum(1) + left, torch.ones(5))
+
+
+@pytest.mark.parametrize("num_samples", [8, 16, 200])
+def test_a_wall_is_rendered_where_it_stands_whatever_the_samples(num_samples):
+    distances = torch.linspace(0, 2, num_samples)[None]
+    weights, left = weights_from_optical_depth(sample_optical_depths(1.0 - distances, distances, 0.01))
+    depth = (weights * distances).sum()
+    assert left.item() < 1e-6
+    assert depth.item() == pytest.approx(1.0, abs=0.6 * 2 / (num_samples - 1) + 0.01)
+
+
+def test_a_near_miss_stays_transparent_with_few_samples():
+    distances = torch.tensor([[0.0, 0.7, 1.5, 2.0]])
+    _, left = weights_from_optical_depth(sample_optical_depths(torch.full((1, 4), 0.1), distances, 0.005))
+    assert left.item() > 0.999
+
+
+def test_composite_is_the_weighted_sum():
+    weights, values = torch.tensor([[0.25, 0.5]]), torch.tensor([[[1.0, 0, 2], [0, 1, 2]]])
+    torch.testing.assert_close(composite(weights, values), torch.tensor([[0.25, 0.5, 1.5]]))
+
+
+def test_unit_sphere_hits_misses_and_cameras_inside():
+    origins = torch.tensor([[0.0, 0, -3], [0, 2, -3], [0, 0, 0], [0, 0, 3]])
+    directions = torch.tensor([[0.0, 0, 1]] * 4)
+    entry, leave, hit = intersect_unit_sphere(origins, directions, near=0.02)
+    assert hit.tolist() == [True, False, True, False]
+    assert (entry[0].item(), leave[0].item()) == (pytest.approx(2), pytest.approx(4))
+    assert (entry[2].item(), leave[2].item()) == (pytest.approx(0.02), pytest.approx(1))
+
+
+def sphere_cache(resolution: int = 48, radius: float = 0.5) -> SdfCache:
+    cache = SdfCache(resolution, "cpu")
+    cache.refresh(lambda p: torch.linalg.vector_norm(p, dim=1) - radius)
+    return cache
+
+
+def test_cache_reads_back_what_was_written():
+    points = torch.rand(500, 3, generator=torch.Generator().manual_seed(0)) * 1.2 - 0.6
+    expected = torch.linalg.vector_norm(points, dim=1) - 0.5
+    assert (sphere_cache().lookup(points) - expected).abs().max() < 0.02
+    axis = torch.tensor([[0.5, 0, 0], [0, 0.25, 0], [0, 0, -0.75]])  # tells the axes apart
+    cache = SdfCache(33, "cpu")
+    cache.refresh(lambda p: p[:, 0] + 10 * p[:, 1] + 100 * p[:, 2])
+    torch.testing.assert_close(cache.lookup(axis), torch.tensor([0.5, 2.5, -75]), rtol=1e-4, atol=1e-4)
+
+
+def test_band_refresh_touches_only_the_neighbourhood_of_the_surface():
+    cache = sphere_cache()
+    far = cache.values.clone()
+    count = cache.refresh(lambda p: torch.full((len(p),), 9.0), band=2 * cache.cell)
+    assert 0 < count < 0.4 * cache.values.numel()
+    assert torch.equal(cache.values == 9.0, far.abs() < 2 * cache.cell)
+
+
+def test_samples_gather_at_the_surface_sorted_inside_the_interval():
+    cache = sphere_cache()
+    origins, directions = torch.tensor([[0.0, 0, -2]]).expand(64, 3), torch.tensor([[0.0, 0, 1]]).expand(64, 3)
+    entry, leave, _ = intersect_unit_sphere(origins, directions)
+    generator = torch.Generator().manual_seed(0)
+    distances = importance_distances(cache, origins, directions, entry, leave, 16, 0.01, generator)
+    assert (distances[:, 1:] >= distances[:, :-1]).all()
+    assert (distances >= entry[:, None] - 1e-5).all()
+    assert (distances <= leave[:, None] + 1e-5).all()
+    near = ((distances - 1.5).abs() < 0.1).float().mean()
+    assert near > 0.7  # the surface is at 1.5; an even spread would have 0.1
+    assert (distances.max() - distances.min()) > 1.0  # and some look elsewhere
+    fixed = [importance_distances(cache, origins, directions, entry, leave, 16, 0.01, None) for _ in range(2)]
+    assert torch.equal(*fixed)
+
+
+def test_half_of_the_laplace_depth_lies_on_each_side_of_a_wall():
+    """Optical depth up to f = 0 is 1/2 at normal incidence: the density's known bias, stated in the maths page."""
+    distances = torch.linspace(0, 1, 4001, dtype=torch.float64)[None]
+    tau = sample_optical_depths(1.0 - distances, distances, 0.02)
+    assert tau.sum().item() == pytest.approx(0.5, rel=1e-3)
+    assert np.isfinite(tau.numpy()).all()

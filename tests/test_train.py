@@ -1,0 +1,180 @@
+"""Training: it learns, every term reaches the networks, a killed run goes on with the same loss curve."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from sphere_scene import RADIUS, render, ring_of_cameras, sphere_scene, write_undistorted
+
+from configs.params import TrainParams
+from stages import artifacts, train
+from stages.engine.stage import StageContext
+from stages.neural.field import load_field
+from stages.neural.fields import contract
+from stages.neural.photos import Photos
+from stages.neural.trainer import SparsePoints, Trainer
+
+TINY = TrainParams(
+    steps=60, rays=128, samples=12, levels=4, log2_rows=10, coarsest=8, finest=32, hidden=16, start_levels=2,
+    free_points=64, sparse_batch=32, cache_resolution=24, cache_every=16, background_log2_rows=9,
+    background_samples=4,
+)  # fmt: skip
+
+
+def make_trainer(params: TrainParams = TINY, masks: bool = False) -> Trainer:
+    cameras = ring_of_cameras()
+    views = [render(cameras, i) for i in range(len(cameras))]
+    photos = Photos(cameras, [v[0] for v in views], [v[1] for v in views] if masks else None, "cpu")
+    scene = sphere_scene(cameras)
+    return Trainer(photos, SparsePoints.from_scene(scene.points, scene.point_errors, "cpu"), params, "cpu")
+
+
+def test_rays_see_the_pixels_they_were_drawn_from():
+    cameras = ring_of_cameras()
+    photos = make_trainer().photos
+    batch = photos.draw(200, torch.Generator().manual_seed(0))
+    assert len(batch.leave) == 200
+    for row in range(0, 200, 20):
+        image = int(batch.images[row])
+        pixel, _ = cameras.project(image, (batch.origins + batch.directions)[row].double().numpy()[None])
+        x, y = np.floor(pixel[0]).astype(int)
+        assert np.allclose(pixel[0] % 1, 0.5, atol=1e-3)
+        expected = render(cameras, image)[0][y, x] / 255
+        assert np.allclose(batch.colors[row].numpy(), expected, atol=1e-6)
+
+
+def test_the_field_is_a_sphere_before_training():
+    trainer = make_trainer()
+    points = torch.rand(100, 3, generator=torch.Generator().manual_seed(0)) * 2 - 1
+    sdf, _, gradients = trainer.fields.sdf(points, 4)
+    assert (sdf - (points.norm(dim=1) - TINY.sphere_radius)).abs().max() < 1e-3
+    assert (gradients.norm(dim=1) - 1).abs().max() < 2e-2
+    alone = trainer.fields.sdf.sdf(points, 4)
+    torch.testing.assert_close(alone, sdf, rtol=1e-5, atol=1e-6)
+
+
+def test_gradients_are_the_derivative_of_the_sdf():
+    network = make_trainer().fields.sdf
+    generator = torch.Generator().manual_seed(0)
+    with torch.no_grad():
+        network.table += 0.05 * torch.randn(network.table.shape, generator=generator)
+    points = torch.rand(40, 3, generator=generator) - 0.5
+    _, _, gradients = network(points, 4)
+    step = 2e-3
+    for axis in range(3):
+        offset = torch.zeros(3)
+        offset[axis] = step
+        difference = (network.sdf(points + offset, 4) - network.sdf(points - offset, 4)) / (2 * step)
+        assert np.median((difference - gradients[:, axis]).abs().detach().numpy()) < 2e-2
+
+
+def test_every_term_reaches_the_networks():
+    trainer = make_trainer()
+    numbers = trainer.step(0.2)
+    assert {k for k, v in numbers.items() if not torch.isfinite(v)} == set()
+    for name, parameter in trainer.fields.named_parameters():
+        assert parameter.grad is not None, name
+        assert parameter.grad.abs().max() > 0, name
+
+
+def test_masks_switch_the_background_off_and_pull_the_opacity():
+    trainer = make_trainer(masks=True)
+    assert trainer.fields.background is None
+    assert trainer.step(0.2)["mask"] > 0
+
+
+def test_contraction_keeps_the_ball_and_bounds_the_rest():
+    points = torch.tensor([[0.3, 0.2, 0.1], [10.0, 0, 0], [0, -1e6, 0]])
+    expected = torch.tensor([[0.3, 0.2, 0.1], [1.9, 0, 0], [0, -2.0, 0]])
+    torch.testing.assert_close(contract(points), expected, atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.slow
+def test_training_finds_the_ball():
+    params = TINY.model_copy(update={"steps": 300, "rays": 256, "sphere_radius": 0.6})
+    trainer = make_trainer(params, masks=True)
+    numbers = [trainer.step(i / params.steps) for i in range(params.steps)]
+    first, last = (float(np.mean([float(n["rgb"]) for n in part])) for part in (numbers[:10], numbers[-10:]))
+    assert last < 0.4 * first
+    points = torch.nn.functional.normalize(torch.randn(500, 3, generator=torch.Generator().manual_seed(0)), dim=1)
+    # The sides the cameras see: within 60 degrees of the horizon.
+    points = RADIUS * points[points[:, 2].abs() < 0.8]
+    with torch.no_grad():
+        assert trainer.fields.sdf.sdf(points, params.levels).abs().median() < 0.02
+
+
+def context(tmp_path: Path, name: str, params: TrainParams) -> StageContext:
+    folder = tmp_path / "undistort"
+    if not folder.exists():
+        write_undistorted(folder, ring_of_cameras())
+    out, scratch = tmp_path / name, tmp_path / f"{name}_scratch"
+    out.mkdir(exist_ok=True)
+    scratch.mkdir(exist_ok=True)
+    return StageContext(inputs={"undistort": folder}, sources={}, out=out, scratch=scratch, params=params)
+
+
+def metric_lines(path: Path) -> list[dict]:
+    return [json.loads(line) for line in path.read_text().splitlines()]
+
+
+def test_a_killed_run_goes_on_with_the_same_loss_curve(tmp_path, monkeypatch):
+    monkeypatch.setattr(train, "LOG_EVERY", 5)
+    params = TINY.model_copy(update={"checkpoint_every": 1e-9, "preview_every": 1.0})
+    whole = context(tmp_path, "whole", params)
+    numbers = train.run(whole)
+    assert numbers["steps"] == TINY.steps
+
+    class KilledError(Exception):
+        pass
+
+    killed = context(tmp_path, "killed", params)
+    original = Trainer.step
+
+    def step_until_killed(self, progress):
+        if self.step_index == 37:
+            raise KilledError
+        return original(self, progress)
+
+    monkeypatch.setattr(Trainer, "step", step_until_killed)
+    with pytest.raises(KilledError):
+        train.run(killed)
+    monkeypatch.setattr(Trainer, "step", original)
+    assert artifacts.checkpoint_path(killed.scratch).exists()
+    train.run(killed)
+    curves = [metric_lines(artifacts.metrics_path(c.out)) for c in (whole, killed)]
+    assert curves[0] == curves[1]
+    assert [line["step"] for line in curves[0]] == list(range(5, 61, 5))
+
+    fields = [load_field(artifacts.field_path(c.out)) for c in (whole, killed)]
+    points = np.random.default_rng(0).uniform(-1, 1, (50, 3))
+    assert np.array_equal(fields[0].sdf(points), fields[1].sdf(points))
+    assert list(artifacts.previews_path(whole.out).iterdir())
+
+
+def test_the_published_field_answers_in_numpy(tmp_path):
+    run_context = context(tmp_path, "out", TINY.model_copy(update={"steps": 3}))
+    train.run(run_context)
+    field = load_field(artifacts.field_path(run_context.out))
+    points = np.array([[0.0, 0, 0.9], [0, 0, 0.1]])
+    sdf, normals = field.sdf(points), field.normals(points)
+    assert sdf[0] > 0 > sdf[1]
+    assert np.allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-5)
+    colors = field.color(points, normals, -normals)
+    assert colors.shape == (2, 3)
+    assert colors.min() >= 0
+    assert colors.max() <= 1
+
+
+def test_a_budget_in_minutes_ends_on_time_whatever_the_steps(tmp_path):
+    numbers = train.run(context(tmp_path, "out", TINY.model_copy(update={"steps": 10**9, "minutes": 0.02})))
+    assert numbers["train_seconds"] < 10
+
+
+def test_wrong_image_size_is_named():
+    cameras = ring_of_cameras()
+    with pytest.raises(ValueError, match=r"view_00\.png: got shape \(3, 3, 3\)"):
+        Photos(cameras, [np.zeros((3, 3, 3), np.uint8)] * 8, None, "cpu")
