@@ -1,7 +1,7 @@
 """Ingest: photos -> upright 8-bit RGB images COLMAP can read, masks, and a record of each photo.
 
-A photo that needs no change is copied byte for byte under its own name. Photos that cannot be used are named and
-counted, never fatal by themselves.
+A photo that needs no change is copied byte for byte under its own name. Photos that cannot be used are named
+and counted, never fatal by themselves.
 """
 
 from __future__ import annotations
@@ -192,7 +192,7 @@ class _Names:
         self._stems = stems
 
     def target(self, path: str, suffix: str | None) -> str:
-        """`path` itself (suffix None or unchanged), or its stem with `suffix`, made unique where it is not."""
+        """`path` itself (suffix None or unchanged), or its stem with `suffix`, unique in the folder."""
         own = PurePosixPath(path)
         if suffix is None or own.suffix.lower() == suffix:
             return path
@@ -244,10 +244,9 @@ def _take_photo(
     width, height = rgb.size
     if max(width, height) < MIN_SIDE:
         raise _UnusableError(f"only {width} x {height} pixels")
+    mask = alpha
     if mask_file is not None:
         mask = _read_mask(mask_file, source, (width, height), stored_size, orientation)
-    else:
-        mask = alpha
     if mask is not None and not mask.any():
         raise _UnusableError(f"its mask is empty ({mask_file.name if mask_file else 'alpha channel'})")
 
@@ -413,8 +412,9 @@ def _read_mask(
     from PIL import Image, ImageOps
 
     try:
-        with Image.open(file) as image:
-            image.load()
+        with Image.open(file) as stored:
+            stored.load()
+            image: Image.Image = stored
             if image.size != size and image.size == stored_size:
                 exif = image.getexif()
                 exif[ORIENTATION] = orientation

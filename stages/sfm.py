@@ -16,9 +16,7 @@ from stages.errors import ReconstructionError
 
 log = logging.getLogger(__name__)
 
-DEFAULT_FOCAL_FACTOR = (
-    1.2  # COLMAP's guess where nothing is known: focal = 1.2 x longest side (about 45 degrees)
-)
+DEFAULT_FOCAL_FACTOR = 1.2  # COLMAP's guess where nothing is known: focal = 1.2 x longest side (about 45 degrees)
 MIN_VERIFIED = 15  # matches that fit one epipolar geometry before COLMAP believes a pair (its default)
 MIN_PNP = 30  # 3D points a photo must agree with to be placed (COLMAP's default)
 MIN_FEATURES = 50  # below this a photo shows too little texture to match anything
@@ -50,9 +48,7 @@ def run(context: StageContext) -> dict[str, Any]:
         _match(matcher, database_path, params, threads, device)
         evidence = _Evidence(database_path)
         context.progress(PART_MATCHES, 1, "poses")
-        models = _map(
-            database_path, images_folder, work / "models", params, threads, context, len(image_set.images)
-        )
+        models = _map(database_path, images_folder, work / "models", params, threads, context, len(image_set.images))
 
     names = [record.name for record in image_set.images]
     if not models:
@@ -165,7 +161,7 @@ def _extract(database_path: Path, images_folder: Path, params: Any, threads: int
 
 
 def _choose_matcher(params: Any, database_path: Path, num_images: int) -> str:
-    """auto: all pairs for small sets, neighbours in space where most photos carry GPS, else neighbours in name."""
+    """auto: all pairs of small sets, neighbours in space where most photos carry GPS, else in name."""
     import pycolmap
 
     if params.matcher != "auto":
@@ -209,9 +205,9 @@ def _map(
 
     out.mkdir()
     if params.mapper == "global":
-        options = pycolmap.GlobalPipelineOptions()
-        options.num_threads, options.random_seed = threads, params.seed
-        return list(pycolmap.global_mapping(database_path, images_folder, out, options).values())
+        chosen = pycolmap.GlobalPipelineOptions()
+        chosen.num_threads, chosen.random_seed = threads, params.seed
+        return list(pycolmap.global_mapping(database_path, images_folder, out, chosen).values())
 
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads, options.random_seed = threads, params.seed
@@ -225,13 +221,9 @@ def _map(
         nonlocal placed
         placed += 1
         part = min(1.0, placed / max(total, 1))
-        context.progress(
-            PART_MATCHES + (1 - PART_MATCHES) * part, 1, f"{min(placed, total)} of {total} photos placed"
-        )
+        context.progress(PART_MATCHES + (1 - PART_MATCHES) * part, 1, f"{min(placed, total)} of {total} photos placed")
 
-    models = pycolmap.incremental_mapping(
-        database_path, images_folder, out, options, next_image_callback=one_more
-    )
+    models = pycolmap.incremental_mapping(database_path, images_folder, out, options, next_image_callback=one_more)
     return list(models.values())
 
 
@@ -273,17 +265,16 @@ class _Evidence:
         if not linked:
             return f"matches only photos that are left out too (best pair: {best} verified matches)"
         return (
-            f"could not be placed: {len(linked)} registered photos match it (best pair: {max(linked)} verified matches), "
-            f"but fewer than {MIN_PNP} of its 3D points agreed on one position"
+            f"could not be placed: {len(linked)} registered photos match it (best pair: {max(linked)} "
+            f"verified matches), but fewer than {MIN_PNP} of its 3D points agreed on one position"
         )
 
 
 def _hint(matcher: str, params: Any) -> str:
     if matcher != "exhaustive":
         return "Try `--set sfm.matcher=exhaustive`, or add overlapping photos."
-    if params.mapper == "incremental":
-        return "Try `--set sfm.mapper=global`, or add photos that overlap by two thirds and show texture around the object."
-    return "Try `--set sfm.mapper=incremental`, or add photos that overlap by two thirds and show texture around the object."
+    other = "global" if params.mapper == "incremental" else "incremental"
+    return f"Try `--set sfm.mapper={other}`, or add photos that overlap by two thirds and show texture."
 
 
 def _nothing_matched(evidence: _Evidence, names: list[str], matcher: str, params: Any) -> ReconstructionError:
@@ -295,8 +286,8 @@ def _nothing_matched(evidence: _Evidence, names: list[str], matcher: str, params
             f"need {MIN_VERIFIED} (median {median} features a photo)."
         )
         hint = (
-            "Plain surfaces cannot be matched: put the object on something printed, e.g. newspaper, keep it in the frame, "
-            "and let neighbouring photos overlap by two thirds."
+            "Plain surfaces cannot be matched: put the object on something printed, e.g. newspaper, keep "
+            "that in the frame, and let neighbouring photos overlap by two thirds."
         )
         return ReconstructionError(message, hint)
     message = (
@@ -314,7 +305,7 @@ def _check_enough(
         return
     first = "; ".join(f"{item['name']}: {item['reason']}" for item in unregistered[:2])
     raise ReconstructionError(
-        f"Only {len(registered)} of {len(names)} photos were registered (need {needed}). For example {first}.",
+        f"Only {len(registered)} of {len(names)} photos were registered (need {needed}). E.g. {first}.",
         _hint(matcher, params),
     )
 

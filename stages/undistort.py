@@ -1,4 +1,4 @@
-"""Undistort: camera poses + photos -> pinhole images, masks warped by the same maps, and the normalised scene."""
+"""Undistort: poses + photos -> pinhole images, masks warped by the same maps, the normalised scene."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class _Warp:
 
 
 def run(context: StageContext) -> dict[str, Any]:
-    """Warp every registered photo, find the region of interest, write images/, masks/, scene.json, points.npz."""
+    """Warp every registered photo, find the region of interest, write the scene."""
     import cv2
     import pycolmap
 
@@ -194,7 +194,7 @@ def _png_names(names: list[str]) -> list[str]:
 
 # ---------------------------------------------------------------- the scene
 def _sparse_points(model: Any, photos: list[Any]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points [P, 3] in the world frame, their errors [P], and observations [M, 2] (image index, point index)."""
+    """Points [P, 3] in the world frame, errors [P], observations [M, 2] (image index, point index)."""
     index_of = {photo.image_id: i for i, photo in enumerate(photos)}
     ids = sorted(model.points3D)
     points = np.array([model.points3D[i].xyz for i in ids], dtype=np.float64).reshape(-1, 3)
@@ -220,7 +220,7 @@ def _normalise(
         region = normalisation.find_region(cameras, points, masks)
     except ValueError as error:
         raise ReconstructionError(
-            f"No region of interest could be found from {len(cameras)} cameras and {len(points)} sparse points ({error}).",
+            f"No region of interest found from {len(cameras)} cameras and {len(points)} points ({error}).",
             "Photograph the object from more sides, or try `--set sfm.matcher=exhaustive`.",
         ) from error
     if params.up == "auto":

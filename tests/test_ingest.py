@@ -1,0 +1,367 @@
+"""Ingest: what is kept, what is turned, what is left out, and the sentences for unusable input."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from configs.params import IngestParams
+from stages import artifacts
+from stages.artifacts import ImageSet
+from stages.engine.stage import StageContext
+from stages.errors import InputError
+from stages.ingest import DIAGONAL_35MM, INGEST
+
+SIZE = (96, 72)
+
+
+@pytest.fixture
+def photos(tmp_path: Path) -> Path:
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    return folder
+
+
+def picture(seed: int, size: tuple[int, int] = SIZE) -> Image.Image:
+    """Smooth colours, so that JPEG keeps them, different for each seed."""
+    generator = np.random.default_rng(seed)
+    small = Image.fromarray(generator.integers(0, 256, (4, 4, 3), dtype=np.uint8))
+    return small.resize(size, Image.Resampling.BICUBIC)
+
+
+def write_photos(folder: Path, count: int = 4, suffix: str = ".jpg", first: int = 0) -> list[str]:
+    names = [f"{first + i:03d}{suffix}" for i in range(count)]
+    for i, name in enumerate(names):
+        picture(first + i).save(folder / name)
+    return names
+
+
+def exif_of(
+    orientation: int | None = None,
+    focal_mm: float | None = None,
+    focal_35mm: int | None = None,
+    pitch: tuple[float, int] | None = None,
+    model: str | None = None,
+    taken_width: int | None = None,
+) -> Image.Exif:
+    exif = Image.Exif()
+    if orientation:
+        exif[0x0112] = orientation
+    if model:
+        exif[0x0110] = model
+    tags = exif.get_ifd(0x8769)
+    if focal_mm:
+        tags[0x920A] = focal_mm
+    if focal_35mm:
+        tags[0xA405] = focal_35mm
+    if pitch:
+        tags[0xA20E], tags[0xA210] = pitch
+    if taken_width:
+        tags[0xA002] = taken_width
+    return exif
+
+
+def ingest(photos: Path, masks: Path | None = None, **params: object) -> tuple[ImageSet, Path, dict[str, object]]:
+    out, scratch = photos.parent / "out", photos.parent / "scratch"
+    for folder in (out, scratch):
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir()
+    sources = {"photos": photos} if masks is None else {"photos": photos, "masks": masks}
+    numbers = INGEST.run(
+        StageContext({}, sources, out, scratch, IngestParams(**params), workers=2)  # type: ignore[arg-type]
+    )
+    return artifacts.load_image_set(out), out, numbers
+
+
+def reasons(image_set: ImageSet) -> dict[str, str]:
+    return {item.source: item.reason for item in image_set.skipped}
+
+
+# ---------------------------------------------------------------- kept as it is
+@pytest.mark.parametrize("suffix", [".jpg", ".png", ".tif", ".bmp", ".JPG"])
+def test_plain_photo_is_copied_byte_for_byte_under_its_name(photos: Path, suffix: str):
+    (photos / "left").mkdir()
+    names = write_photos(photos, 3, suffix)
+    shutil.copy(photos / names[0], photos / "left" / names[0])
+    picture(9).save(photos / "left" / names[0])
+    image_set, out, numbers = ingest(photos)
+    assert [record.name for record in image_set.images] == [*names, f"left/{names[0]}"]
+    assert numbers["images"] == 4
+    for record in image_set.images:
+        assert artifacts.image_path(out, record.name).read_bytes() == (photos / record.source).read_bytes()
+        assert (record.width, record.height) == SIZE
+
+
+def test_a_second_run_gives_the_same_records(photos: Path):
+    write_photos(photos, 6)
+    write_photos(photos, 3, ".webp", first=3)
+    assert ingest(photos)[0] == ingest(photos)[0]
+
+
+# ---------------------------------------------------------------- re-encoded
+@pytest.mark.parametrize("orientation", range(2, 9))
+def test_exif_orientation_is_applied_and_gone(photos: Path, orientation: int):
+    write_photos(photos, 3)
+    upright = picture(7)
+    undo = {
+        2: Image.Transpose.FLIP_LEFT_RIGHT,
+        3: Image.Transpose.ROTATE_180,
+        4: Image.Transpose.FLIP_TOP_BOTTOM,
+        5: Image.Transpose.TRANSPOSE,
+        6: Image.Transpose.ROTATE_90,
+        7: Image.Transpose.TRANSVERSE,
+        8: Image.Transpose.ROTATE_270,
+    }[orientation]
+    upright.transpose(undo).save(photos / "turned.jpg", quality=97, exif=exif_of(orientation))
+    image_set, out, _ = ingest(photos)
+    record = image_set.images[-1]
+    assert record.name == "turned.jpg"
+    assert (record.width, record.height) == SIZE
+    with Image.open(artifacts.image_path(out, record.name)) as written:
+        assert written.getexif().get(0x0112, 1) == 1
+        difference = np.abs(np.asarray(written, dtype=int) - np.asarray(upright, dtype=int))
+    assert difference.mean() < 4  # JPEG twice; a wrong turn differs by about 60
+
+
+def test_formats_colmap_cannot_read_are_encoded_anew(photos: Path):
+    write_photos(photos, 2)
+    picture(2).save(photos / "web.webp")
+    picture(3).convert("L").save(photos / "grey.png")
+    picture(4).convert("CMYK").save(photos / "cmyk.jpg")
+    picture(5).convert("P").save(photos / "palette.png")
+    Image.fromarray(np.arange(96 * 72, dtype=np.uint16).reshape(72, 96) * 9).save(photos / "deep.png")
+    image_set, out, _ = ingest(photos)
+    assert not image_set.skipped
+    names = {record.source: record.name for record in image_set.images}
+    assert names["web.webp"] == "web.jpg"
+    for record in image_set.images:
+        with Image.open(artifacts.image_path(out, record.name)) as written:
+            assert written.mode == "RGB"
+            assert written.size == SIZE
+    with Image.open(artifacts.image_path(out, "deep.png")) as written:
+        assert np.asarray(written).max() == 96 * 72 * 9 // 257  # scaled to 8 bits, not clipped
+
+
+def test_names_stay_unique_when_suffixes_change(photos: Path):
+    write_photos(photos, 2)
+    picture(5).save(photos / "a.jpg")
+    picture(6).save(photos / "a.webp")
+    picture(7).save(photos / "a.png")
+    image_set, _, _ = ingest(photos)
+    names = {record.source: record.name for record in image_set.images}
+    assert names["a.jpg"] == "a.jpg"
+    assert names["a.png"] == "a.png"
+    assert names["a.webp"] == "a.webp.jpg"
+
+
+def test_large_photos_are_reduced_and_the_focal_prior_with_them(photos: Path):
+    for i in range(3):
+        picture(i, (400, 300)).save(photos / f"{i}.jpg", exif=exif_of(focal_35mm=50))
+    image_set, _, _ = ingest(photos, max_side=100)
+    record = image_set.images[0]
+    assert (record.width, record.height) == (100, 75)
+    assert record.focal_px == pytest.approx(50 / DIAGONAL_35MM * 125)
+
+
+# ---------------------------------------------------------------- focal prior and cameras
+def test_focal_prior_from_35mm_equivalent_is_by_the_diagonal(photos: Path):
+    write_photos(photos, 2)
+    picture(2, (120, 90)).save(photos / "z.jpg", exif=exif_of(focal_35mm=28))
+    image_set, _, numbers = ingest(photos)
+    assert image_set.images[0].focal_px is None
+    assert image_set.images[-1].focal_px == pytest.approx(28 / DIAGONAL_35MM * 150)
+    assert numbers["with_focal"] == 1
+
+
+@pytest.mark.parametrize(("unit", "per_mm"), [(2, 25.4), (3, 10.0), (4, 1.0)])
+def test_focal_prior_from_the_pixel_pitch(photos: Path, unit: int, per_mm: float):
+    write_photos(photos, 2)
+    # 20 pixels a mm on a sensor of 192 pixels, since halved to 96
+    exif = exif_of(focal_mm=8.0, pitch=(20.0 * per_mm, unit), taken_width=192)
+    picture(2).save(photos / "z.jpg", exif=exif)
+    assert ingest(photos)[0].images[-1].focal_px == pytest.approx(8.0 * 20.0 / 2)
+
+
+def test_contradicting_pixel_pitch_is_not_believed(photos: Path):
+    write_photos(photos, 2)
+    picture(2).save(photos / "z.jpg", exif=exif_of(focal_mm=8.0, focal_35mm=35, pitch=(25.4 * 500, 2)))
+    assert ingest(photos)[0].images[-1].focal_px == pytest.approx(35 / DIAGONAL_35MM * 120)
+
+
+def test_cameras_are_told_apart_by_model_focal_length_and_size(photos: Path):
+    for i in range(2):
+        picture(i).save(photos / f"a{i}.jpg", exif=exif_of(model="A", focal_mm=4.0))
+    picture(2).save(photos / "b.jpg", exif=exif_of(model="B", focal_mm=4.0))
+    picture(3).save(photos / "c.jpg", exif=exif_of(model="A", focal_mm=8.0))
+    picture(4, (72, 96)).save(photos / "d.jpg", exif=exif_of(model="A", focal_mm=4.0))
+    image_set, _, numbers = ingest(photos)
+    cameras = [record.camera for record in image_set.images]
+    assert cameras[0] == cameras[1]
+    assert len(set(cameras)) == numbers["cameras"] == 4
+
+
+def test_blur_is_lower_for_the_blurred(photos: Path):
+    write_photos(photos, 2)
+    noise = Image.fromarray(np.random.default_rng(0).integers(0, 256, (72, 96, 3), dtype=np.uint8))
+    noise.save(photos / "sharp.png")
+    noise.resize((24, 18)).resize(SIZE).save(photos / "soft.png")
+    blur = {record.name: record.blur for record in ingest(photos)[0].images}
+    assert blur["soft.png"] < 0.2 * blur["sharp.png"]
+
+
+# ---------------------------------------------------------------- left out, not fatal
+def test_unusable_files_are_named_and_counted(photos: Path):
+    names = write_photos(photos, 4)
+    whole = (photos / names[0]).read_bytes()
+    (photos / "cut.jpg").write_bytes(whole[: len(whole) // 2])
+    (photos / "text.jpg").write_text("not a picture")
+    (photos / "notes.txt").write_text("lens: 50 mm")
+    (photos / "clip.mp4").write_bytes(b"0")
+    (photos / "twin.jpg").write_bytes(whole)
+    picture(0, (32, 32)).save(photos / "icon.png")
+    (photos / ".DS_Store").write_bytes(b"0")
+    image_set, _, numbers = ingest(photos)
+    why = reasons(image_set)
+    assert [record.name for record in image_set.images] == names
+    assert numbers["skipped"] == len(why) == 6
+    assert "truncated" in why["cut.jpg"]
+    assert why["text.jpg"].startswith("cannot be read")
+    assert why["notes.txt"] == "not an image (.txt)"
+    assert "video" in why["clip.mp4"]
+    assert why["twin.jpg"] == "same file as 000.jpg"
+    assert why["icon.png"] == "only 32 x 32 pixels"
+
+
+# ---------------------------------------------------------------- sentences
+def test_missing_folder(tmp_path: Path):
+    (tmp_path / "x").mkdir()
+    with pytest.raises(InputError, match=r"The photo folder .*nowhere does not exist\."):
+        ingest(tmp_path / "x" / "nowhere")
+
+
+def test_a_file_instead_of_a_folder(photos: Path):
+    name = write_photos(photos, 1)[0]
+    shutil.move(photos / name, photos.parent / name)
+    with pytest.raises(InputError, match="is a file; a folder of photos is needed"):
+        ingest(photos.parent / name)
+
+
+def test_empty_folder(photos: Path):
+    with pytest.raises(InputError, match=r"is empty: found 0 photos, need at least 3\."):
+        ingest(photos)
+
+
+def test_folder_of_text_files(photos: Path):
+    for i in range(5):
+        (photos / f"{i}.txt").write_text(str(i))
+    with pytest.raises(InputError) as caught:
+        ingest(photos)
+    assert "Found 0 usable photos" in caught.value.message
+    assert "need at least 3" in caught.value.message
+    assert "5 files left out: 5 x not an image (.txt), e.g. 0.txt" in caught.value.message
+    assert caught.value.hint
+
+
+def test_two_photos(photos: Path):
+    write_photos(photos, 2)
+    with pytest.raises(InputError, match=r"Found 2 usable photos in .*, need at least 3\."):
+        ingest(photos)
+
+
+# ---------------------------------------------------------------- masks
+def half_mask(size: tuple[int, int] = SIZE, value: int = 255) -> np.ndarray:
+    mask = np.zeros(size[::-1], dtype=np.uint8)
+    mask[: size[1] // 2] = value
+    return mask
+
+
+def write_masks(folder: Path, names: list[str], pattern: str = "{stem}.png", value: int = 255) -> Path:
+    folder.mkdir()
+    for name in names:
+        target = folder / pattern.format(stem=Path(name).stem, name=name)
+        Image.fromarray(half_mask(value=value)).save(target)
+    return folder
+
+
+@pytest.mark.parametrize("pattern", ["{stem}.png", "{name}.png", "{stem}_mask.png", "{stem}.bmp"])
+@pytest.mark.parametrize("value", [255, 1])
+def test_masks_are_found_by_name(photos: Path, pattern: str, value: int):
+    names = write_photos(photos, 3)
+    masks = write_masks(photos.parent / "masks", names, pattern, value)
+    image_set, out, numbers = ingest(photos, masks)
+    assert numbers["masks"] == 3
+    assert all(record.has_mask for record in image_set.images)
+    written = np.asarray(Image.open(artifacts.mask_path(out, names[0])))
+    np.testing.assert_array_equal(written, half_mask())
+
+
+def test_mask_folder_inside_the_photo_folder_is_not_taken_for_photos(photos: Path):
+    names = write_photos(photos, 3)
+    masks = write_masks(photos / "masks", names)
+    image_set, _, _ = ingest(photos, masks)
+    assert [record.name for record in image_set.images] == names
+
+
+def test_mask_is_reduced_and_turned_with_its_photo(photos: Path):
+    write_photos(photos, 2)
+    picture(2).save(photos / "z.jpg", exif=exif_of(orientation=6))
+    masks = write_masks(photos.parent / "masks", ["000.jpg", "001.jpg", "z.jpg"])  # drawn on the stored pixels
+    image_set, out, _ = ingest(photos, masks, max_side=72)
+    assert (image_set.images[-1].width, image_set.images[-1].height) == (54, 72)
+    written = np.asarray(Image.open(artifacts.mask_path(out, "z.jpg")))
+    assert written.shape == (72, 54)
+    assert written[:, -20:].min() == 255  # the stored top is the upright right
+    assert written[:, :20].max() == 0
+
+
+def test_alpha_channel_is_the_mask(photos: Path):
+    for i in range(3):
+        image = picture(i)
+        image.putalpha(Image.fromarray(half_mask()))
+        image.save(photos / f"{i}.png")
+    opaque = picture(3)
+    opaque.putalpha(255)
+    opaque.save(photos / "opaque.png")
+    image_set, out, numbers = ingest(photos)
+    assert numbers["masks"] == 3
+    assert [record.has_mask for record in image_set.images] == [True, True, True, False]
+    np.testing.assert_array_equal(np.asarray(Image.open(artifacts.mask_path(out, "0.png"))), half_mask())
+    assert Image.open(artifacts.image_path(out, "0.png")).mode == "RGB"
+
+
+def test_missing_masks(photos: Path):
+    names = write_photos(photos, 5)
+    masks = write_masks(photos.parent / "masks", names[:3])
+    with pytest.raises(InputError, match=r"2 of 5 photos have no mask in .*: 003\.jpg, 004\.jpg\.") as caught:
+        ingest(photos, masks)
+    assert "--masks" in caught.value.hint
+
+
+def test_mask_of_the_wrong_size(photos: Path):
+    names = write_photos(photos, 3)
+    masks = write_masks(photos.parent / "masks", names)
+    Image.fromarray(half_mask((50, 40))).save(masks / "001.png")
+    with pytest.raises(InputError, match=r"mask 001\.png is 50 x 40 pixels, .*001\.jpg is 96 x 72"):
+        ingest(photos, masks)
+
+
+def test_unreadable_mask_and_missing_mask_folder(photos: Path):
+    names = write_photos(photos, 3)
+    masks = write_masks(photos.parent / "masks", names)
+    (masks / "001.png").write_bytes(b"nothing")
+    with pytest.raises(InputError, match=r"The mask .*001\.png cannot be read"):
+        ingest(photos, masks)
+    with pytest.raises(InputError, match=r"mask folder .* does not exist"):
+        ingest(photos, photos / "none")
+
+
+def test_photo_with_an_empty_mask_is_left_out(photos: Path):
+    names = write_photos(photos, 4)
+    masks = write_masks(photos.parent / "masks", names)
+    Image.fromarray(np.zeros(SIZE[::-1], np.uint8)).save(masks / "002.png")
+    image_set, _, _ = ingest(photos, masks)
+    assert reasons(image_set) == {"002.jpg": "its mask is empty (002.png)"}
