@@ -1,6 +1,6 @@
 """A pipeline of four tiny stages: the engine's test object.
 
-ingest reads the photos' first letters; sfm repeats them and can be told to die in the middle; undistort reduces
+ingest reads the first letters of the photos; sfm repeats them and can be told to die; undistort reduces
 that to one bit, so most changes end there; export writes the bit.
 """
 

@@ -1,0 +1,421 @@
+"""The commands: parse, load the settings, run. The only place that catches HineusError.
+
+Modules that are slow to import are imported inside the commands, so that `hineus --help` answers at once.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable, Sequence
+from contextlib import nullcontext
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from typer.core import TyperGroup
+
+from stages.engine.stage import Stage
+from stages.errors import HineusError, SystemRequirementError
+from stages.pipeline import PIPELINE
+
+if TYPE_CHECKING:
+    from hineus_cli.console import ProgressDisplay
+    from hineus_cli.reconstruct import Reconstruction, Request
+
+INTERRUPTED = 130
+
+Photos = Annotated[
+    Path | None,
+    typer.Argument(help="Folder of photos; may be left out for a workspace that knows its own.", show_default=False),
+]
+WorkspaceOption = Annotated[
+    Path | None,
+    typer.Option("--workspace", "-w", help="Folder for all results; default: PHOTOS_hineus here.", show_default=False),
+]
+Masks = Annotated[
+    Path | None, typer.Option(help="Folder of masks, named like the photos, white on the object.", show_default=False)
+]
+NoMasks = Annotated[bool, typer.Option("--no-masks", help="Forget the masks of the last run.")]
+Preset = Annotated[
+    str | None,
+    typer.Option(help="See `hineus presets`; default: gpu with a CUDA device, else cpu.", show_default=False),
+]
+ConfigFile = Annotated[
+    Path | None, typer.Option("--config", help="YAML file of settings, over the preset.", show_default=False)
+]
+Sets = Annotated[
+    list[str] | None,
+    typer.Option("--set", help="One setting, over all else: section.key=value. Repeatable.", show_default=False),
+]
+Device = Annotated[str, typer.Option(help="auto, cpu or cuda.")]
+Workers = Annotated[int | None, typer.Option(min=1, help="CPU threads; default: all.", show_default=False)]
+Time = Annotated[
+    str | None, typer.Option(help="Training budget, like 5m or 90s: sets train.minutes.", show_default=False)
+]
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout.")]
+Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Say more.")]
+
+
+@dataclass
+class Session:
+    """One invocation: the pipeline it serves, and what is needed to tell of a failure."""
+
+    pipeline: Sequence[Stage]
+    json: bool = False
+    log_path: Path | None = None
+    progress: ProgressDisplay | None = None
+
+
+class HineusGroup(TyperGroup):
+    """The command group that turns errors into sentences and exit codes."""
+
+    pipeline: Sequence[Stage] = PIPELINE
+
+    def main(self, *args: Any, **extra: Any) -> Any:
+        session = Session(self.pipeline)
+        try:
+            return super().main(*args, obj=session, **extra)
+        except HineusError as error:
+            _tell(session, type(error).__name__, error.message, error.hint, error.exit_code)
+            sys.exit(error.exit_code)
+        except Exception as error:
+            _tell(session, type(error).__name__, *_unexpected(session, error), HineusError.exit_code)
+            sys.exit(HineusError.exit_code)
+
+    def invoke(self, ctx: Any) -> Any:
+        try:
+            return super().invoke(ctx)
+        except KeyboardInterrupt:
+            from hineus_cli.console import show_error
+
+            show_error("Stopped.", "What was finished is kept: run the same command to go on from there.")
+            raise typer.Exit(INTERRUPTED) from None
+
+
+def _unexpected(session: Session, error: Exception) -> tuple[str, str]:
+    """Message and hint for an error nobody foresaw; its traceback goes to the log, or to stderr before there is one."""
+    stage = session.progress.running if session.progress else None
+    where = f" in stage {stage}" if stage else ""
+    if session.log_path is not None and session.log_path.exists():
+        hint = f"The full traceback is at the end of {session.log_path}."
+    else:
+        import traceback
+
+        traceback.print_exc()
+        hint = "The traceback is above."
+    text = " ".join(str(error).split())
+    return f"Unexpected error{where}: {type(error).__name__}: {text}", f"{hint} Please report it with that."
+
+
+def _tell(session: Session, kind: str, message: str, hint: str, exit_code: int) -> None:
+    from hineus_cli.console import show_error
+
+    show_error(message, hint)
+    if session.json:
+        error = {"type": kind, "message": message, "hint": hint, "exit_code": exit_code}
+        typer.echo(json.dumps({"ok": False, "error": error}))
+
+
+# ---------------------------------------------------------------- run
+def run(
+    context: typer.Context,
+    photos: Photos = None,
+    workspace: WorkspaceOption = None,
+    masks: Masks = None,
+    no_masks: NoMasks = False,
+    preset: Preset = None,
+    config: ConfigFile = None,
+    sets: Sets = None,
+    from_stage: Annotated[
+        str | None, typer.Option("--from", help="Run this stage and all after it, even if fresh.", show_default=False)
+    ] = None,
+    until: Annotated[str | None, typer.Option(help="Stop after this stage.", show_default=False)] = None,
+    force: Annotated[
+        list[str] | None, typer.Option(help="Run this stage even if fresh. Repeatable.", show_default=False)
+    ] = None,
+    device: Device = "auto",
+    workers: Workers = None,
+    time: Time = None,
+    as_json: Json = False,
+    verbose: Verbose = False,
+) -> None:
+    """Photos to a textured asset: run every stage that is not up to date."""
+    from hineus_cli.reconstruct import Request
+
+    request = Request(
+        photos=photos,
+        workspace=workspace,
+        masks=masks,
+        no_masks=no_masks,
+        preset=preset,
+        config=config,
+        sets=tuple(sets or ()),
+        from_stage=from_stage,
+        until=until,
+        force=tuple(force or ()),
+        device=device,
+        workers=workers,
+        time=time,
+    )
+    _run(context.obj, request, as_json, verbose)
+
+
+def stage_command(stage: Stage) -> Callable[..., None]:
+    """The subcommand of one stage: bring what it needs up to date, then run it, then stop."""
+
+    def command(
+        context: typer.Context,
+        photos: Photos = None,
+        workspace: WorkspaceOption = None,
+        masks: Masks = None,
+        no_masks: NoMasks = False,
+        preset: Preset = None,
+        config: ConfigFile = None,
+        sets: Sets = None,
+        force: Annotated[bool, typer.Option("--force", help="Run it even if it is fresh.")] = False,
+        device: Device = "auto",
+        workers: Workers = None,
+        time: Time = None,
+        as_json: Json = False,
+        verbose: Verbose = False,
+    ) -> None:
+        from hineus_cli.reconstruct import Request
+
+        request = Request(
+            photos=photos,
+            workspace=workspace,
+            masks=masks,
+            no_masks=no_masks,
+            preset=preset,
+            config=config,
+            sets=tuple(sets or ()),
+            until=stage.name,
+            force=(stage.name,) if force else (),
+            device=device,
+            workers=workers,
+            time=time,
+        )
+        _run(context.obj, request, as_json, verbose)
+
+    command.__doc__ = f"Stage: {stage.summary or stage.name}."
+    return command
+
+
+def _run(session: Session, request: Request, as_json: bool, verbose: bool) -> None:
+    from hineus_cli.console import ProgressDisplay, set_up_logging, stdout_kept_clean
+    from hineus_cli.reconstruct import choose_folder, reconstruct
+
+    session.json = as_json
+    session.log_path = choose_folder(request).absolute() / "hineus.log"
+    set_up_logging(verbose)
+    with stdout_kept_clean() if as_json else nullcontext(), ProgressDisplay() as session.progress:
+        result = reconstruct(request, session.pipeline, session.progress)
+    _show(result, as_json)
+
+
+def _show(result: Reconstruction, as_json: bool) -> None:
+    from hineus_cli.console import outcome_table, people
+
+    console = people()
+    console.print(outcome_table(result.outcomes))
+    results = {"textured model": result.glb, "report": result.report, "workspace": result.workspace.root}
+    for what, path in results.items():
+        if path is not None:
+            console.print(f"{what}: {path}", markup=False, soft_wrap=True)
+    if as_json:
+        typer.echo(
+            json.dumps(
+                {
+                    "ok": True,
+                    "workspace": str(result.workspace.root),
+                    "preset": result.preset,
+                    "device": result.device,
+                    "workers": result.workers,
+                    "stages": [asdict(outcome) for outcome in result.outcomes],
+                    "glb": str(result.glb) if result.glb else None,
+                    "report": str(result.report) if result.report else None,
+                }
+            )
+        )
+
+
+# ---------------------------------------------------------------- looking
+def status(
+    context: typer.Context,
+    workspace: Annotated[Path, typer.Argument(help="The workspace's folder.")] = Path("."),
+    verify: Annotated[bool, typer.Option("--verify", help="Read every output back and compare its hash.")] = False,
+    as_json: Json = False,
+) -> None:
+    """How each stage of a workspace stands: fresh, stale or missing, and why."""
+    from configs.load import load_config
+    from configs.params import Config
+    from hineus_cli.console import product, status_table
+    from stages.engine.fingerprint import SourceDigests
+    from stages.engine.status import pipeline_status
+    from stages.engine.workspace import Workspace
+
+    session: Session = context.obj
+    session.json = as_json
+    opened = Workspace.open(workspace)
+    config = load_config(file=opened.config_path) if opened.config_path.exists() else Config()
+    sources = {name: None if path is None else Path(path) for name, path in opened.record.sources.items()}
+    digests = SourceDigests(sources, opened.digest_cache)
+    statuses = pipeline_status(session.pipeline, opened, config, digests, verify)
+    if not as_json:
+        product().print(status_table(statuses))
+        return
+    stages = [
+        {
+            "name": each.name,
+            "state": each.state,
+            "reason": each.reason,
+            "size": each.manifest.size if each.manifest else None,
+            "wall_s": each.manifest.wall_s if each.manifest else None,
+            "cpu_s": each.manifest.cpu_s if each.manifest else None,
+            "peak_rss": each.manifest.peak_rss if each.manifest else None,
+            "created": each.manifest.created if each.manifest else None,
+            "numbers": dict(each.manifest.numbers) if each.manifest else None,
+        }
+        for each in statuses
+    ]
+    typer.echo(json.dumps({"workspace": str(opened.root), "sources": dict(opened.record.sources), "stages": stages}))
+
+
+def doctor(
+    context: typer.Context,
+    folder: Annotated[Path, typer.Option(help="Where workspaces would lie; its free disk is shown.")] = Path("."),
+    as_json: Json = False,
+) -> None:
+    """Is this machine fit? Versions, missing libraries, GPU, memory, disk, and what to install."""
+    from rich.table import Table
+    from rich.text import Text
+
+    from hineus_cli.console import product
+    from hineus_cli.doctor import examine
+
+    session: Session = context.obj
+    session.json = as_json
+    findings = examine(folder.absolute())
+    lacking = [finding for finding in findings if finding.state == "missing"]
+    if as_json:
+        typer.echo(json.dumps({"ok": not lacking, "findings": [asdict(finding) for finding in findings]}))
+        if lacking:
+            raise typer.Exit(SystemRequirementError.exit_code)
+        return
+    table = Table(header_style="bold")
+    for heading in ("what", "", "found", "advice"):
+        table.add_column(heading, overflow="fold")
+    colours = {"ok": "green", "note": "yellow", "missing": "red"}
+    for finding in findings:
+        state = Text(finding.state, style=colours[finding.state])
+        table.add_row(finding.what, state, Text(finding.found), Text(finding.advice))
+    product().print(table)
+    if lacking:
+        names = ", ".join(finding.what for finding in lacking)
+        advice = dict.fromkeys(finding.advice for finding in findings if finding.state != "ok" and finding.advice)
+        raise SystemRequirementError(f"This machine lacks {names}.", "Try: " + "; ".join(advice))
+
+
+def show_config(
+    preset: Preset = None,
+    config: ConfigFile = None,
+    sets: Sets = None,
+    describe: Annotated[bool, typer.Option("--describe", help="Describe every setting instead.")] = False,
+) -> None:
+    """Print the settings as they would be used, as YAML that `--config` takes; or describe them all."""
+    from rich.table import Table
+    from rich.text import Text
+
+    from configs.load import config_yaml, describe_settings, load_config
+    from hineus_cli.console import product
+
+    if not describe:
+        typer.echo(config_yaml(load_config(preset, config, sets or ())), nl=False)
+        return
+    table = Table("setting", "values", "bounds", "default", "meaning", header_style="bold")
+    for setting in describe_settings():
+        cells = (setting.key, setting.type, setting.bounds, str(setting.default), setting.description)
+        table.add_row(*(Text(cell) for cell in cells))
+    product().print(table)
+
+
+def presets() -> None:
+    """List the presets."""
+    from configs.load import preset_names, preset_summary
+
+    for name in preset_names():
+        typer.echo(f"{name:<8}{preset_summary(name)}")
+
+
+def demo(
+    context: typer.Context,
+    folder: Annotated[Path, typer.Option("--workspace", "-w", help="Where photos and results go.")] = Path("demo"),
+    preset: Preset = None,
+    device: Device = "auto",
+    workers: Workers = None,
+    as_json: Json = False,
+    verbose: Verbose = False,
+) -> None:
+    """Make photos of a known object, reconstruct it, and score the result against the truth."""
+    from hineus_cli.console import key_numbers, people, set_up_logging, stdout_kept_clean
+    from hineus_cli.demo import run_demo
+
+    session: Session = context.obj
+    session.json = as_json
+    set_up_logging(verbose)
+    with stdout_kept_clean() if as_json else nullcontext():
+        result = run_demo(folder=folder, preset=preset, device=device, workers=workers)
+    if as_json:
+        typer.echo(json.dumps({"ok": True, **result}, default=str))
+    else:
+        people().print(key_numbers(result), markup=False)
+
+
+# ---------------------------------------------------------------- the table of commands
+def _version(wanted: bool) -> None:
+    if wanted:
+        from importlib import metadata
+
+        typer.echo(f"hineus {metadata.version('hineus')}")
+        raise typer.Exit()
+
+
+def build_app(pipeline: Sequence[Stage] = PIPELINE) -> typer.Typer:
+    """The command line over `pipeline`: `run`, one command a stage, and the ones that look."""
+
+    class Group(HineusGroup):
+        pass
+
+    Group.pipeline = pipeline
+    app = typer.Typer(
+        cls=Group,
+        no_args_is_help=True,
+        add_completion=False,
+        pretty_exceptions_enable=False,
+        rich_markup_mode="rich",
+    )
+
+    @app.callback()
+    def hineus(
+        version: Annotated[
+            bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
+        ] = False,
+    ) -> None:
+        """Photos in, textured 3D asset out. Start with `hineus doctor`, then `hineus run PHOTOS`."""
+
+    for command in (run, status, doctor, presets, demo):
+        app.command()(command)
+    app.command("config")(show_config)
+    for stage in pipeline:
+        app.command(stage.name, rich_help_panel="One stage (and what it needs)")(stage_command(stage))
+    return app
+
+
+app = build_app()
+
+
+def main() -> None:
+    """The `hineus` command."""
+    app(prog_name="hineus")

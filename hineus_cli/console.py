@@ -1,0 +1,251 @@
+"""What a person sees: console, logging, progress bars, tables. Everything for people goes to stderr.
+
+Only this module configures logging.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import sys
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.table import Table
+
+    from stages.engine.runner import StageOutcome
+    from stages.engine.stage import Stage
+    from stages.engine.status import StageStatus
+
+OURS = ("hineus_cli", "stages", "configs")
+TRACEBACKS = "hineus_cli.tracebacks"  # the logger whose records go to the log file only
+
+PLAIN_WIDTH = 160  # columns where the output is a pipe or a file
+PLAIN_EVERY_S = 30.0  # seconds between progress lines there
+MAX_NUMBERS = 4  # numbers of a stage in the summary table
+
+GIB = 1 << 30
+
+_STATE_COLOURS = {"ran": "green", "skipped": "dim", "fresh": "green", "stale": "yellow", "missing": "red"}
+
+
+def people() -> Console:
+    """The console for people, on stderr."""
+    return _console(stderr=True)
+
+
+def product() -> Console:
+    """The console for what a command is asked to print (a table, settings), on stdout."""
+    return _console(stderr=False)
+
+
+def _console(stderr: bool) -> Console:
+    from rich.console import Console
+
+    stream = sys.stderr if stderr else sys.stdout
+    width = None if stream.isatty() else PLAIN_WIDTH
+    return Console(stderr=stderr, width=width, highlight=False, soft_wrap=False)
+
+
+# ---------------------------------------------------------------- logging
+def set_up_logging(verbose: bool = False) -> None:
+    """Warnings of everybody and what our stages say go to stderr; `verbose` adds our debug lines."""
+    from rich.logging import RichHandler
+
+    handler = RichHandler(console=people(), show_time=False, show_path=False, markup=False, rich_tracebacks=False)
+    handler.setLevel(logging.DEBUG if verbose else logging.INFO)
+    handler.addFilter(lambda record: record.name != TRACEBACKS)
+    root = logging.getLogger()
+    for old in [old for old in root.handlers if isinstance(old, RichHandler)]:
+        root.removeHandler(old)
+    root.addHandler(handler)
+    root.setLevel(logging.WARNING)
+    for name in OURS:
+        logging.getLogger(name).setLevel(logging.DEBUG)
+
+
+@contextlib.contextmanager
+def log_to_file(path: Path) -> Iterator[None]:
+    """Everything that is logged inside goes to `path`, too, and the traceback of what is raised."""
+    handler = logging.FileHandler(path, encoding="utf-8")
+    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+    root = logging.getLogger()
+    root.addHandler(handler)
+    try:
+        yield
+    except Exception:
+        logging.getLogger(TRACEBACKS).error("the run failed", exc_info=True)
+        raise
+    finally:
+        root.removeHandler(handler)
+        handler.close()
+
+
+@contextlib.contextmanager
+def stdout_kept_clean() -> Iterator[None]:
+    """What is printed inside, by Python or by a C library, goes to stderr: stdout is for the JSON that follows."""
+    sys.stdout.flush()
+    saved = os.dup(1)
+    try:
+        os.dup2(2, 1)
+        with contextlib.redirect_stdout(sys.stderr):
+            yield
+    finally:
+        os.dup2(saved, 1)
+        os.close(saved)
+
+
+# ---------------------------------------------------------------- errors
+def show_error(message: str, hint: str = "") -> None:
+    """A panel where a person looks on; plain lines in a pipe, where they can be searched for."""
+    from rich.panel import Panel
+    from rich.text import Text
+
+    console = people()
+    if not console.is_terminal:
+        print(f"Error: {message}", file=sys.stderr)
+        if hint:
+            print(hint, file=sys.stderr)
+        return
+    text = Text(message)
+    if hint:
+        text.append(f"\n\n{hint}", style="cyan")
+    console.print(Panel(text, title="Error", title_align="left", border_style="red"))
+
+
+# ---------------------------------------------------------------- progress
+class ProgressDisplay:
+    """A bar with an ETA for each stage; in a pipe, a line at its start, its end and now and then between."""
+
+    def __init__(self) -> None:
+        from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
+        from rich.progress import TimeRemainingColumn as Remaining
+
+        self.running: str | None = None
+        self._console = people()
+        self._bars = Progress(
+            TextColumn("{task.description:<10}"),
+            BarColumn(bar_width=30),
+            TaskProgressColumn(),
+            TimeElapsedColumn(),
+            TextColumn("left"),
+            Remaining(),
+            TextColumn("{task.fields[note]}"),
+            console=self._console,
+            disable=not self._console.is_terminal,
+        )
+        self._task: Any = None
+        self._printed_at = 0.0
+
+    def __enter__(self) -> ProgressDisplay:
+        self._bars.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._bars.stop()
+
+    def stage_started(self, stage: Stage, reason: str) -> None:
+        self.running = stage.name
+        self._printed_at = time.monotonic()
+        self._line(f"{stage.name}: {stage.summary or 'running'} ({reason})")
+        self._task = self._bars.add_task(stage.name, total=None, note="")
+
+    def stage_progress(self, stage: Stage, done: float, total: float, note: str) -> None:
+        self._bars.update(self._task, completed=done, total=total, note=note)
+        if not self._console.is_terminal and time.monotonic() - self._printed_at > PLAIN_EVERY_S:
+            self._printed_at = time.monotonic()
+            self._line(f"{stage.name}: {100 * done / max(total, 1e-9):.0f} % {note}".rstrip())
+
+    def stage_finished(self, stage: Stage, outcome: StageOutcome) -> None:
+        self.running = None
+        if outcome.action == "ran":
+            self._bars.update(self._task, completed=1, total=1, note="")
+            self._line(f"{stage.name}: done in {outcome.wall_s:.1f} s")
+        else:
+            self._line(f"{stage.name}: skipped ({outcome.reason})")
+
+    def _line(self, text: str) -> None:
+        self._console.print(text, style="dim", markup=False)
+
+
+# ---------------------------------------------------------------- tables
+def outcome_table(outcomes: Sequence[StageOutcome]) -> Table:
+    """Stage, what became of it and why, its cost, its key numbers. The total counts only what ran now."""
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(title=None, header_style="bold")
+    for heading in ("stage", "what", "why"):
+        table.add_column(heading, overflow="fold")
+    for heading in ("wall s", "CPU s", "peak GiB"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    table.add_column("numbers", overflow="fold")
+    for outcome in outcomes:
+        table.add_row(
+            outcome.name,
+            outcome.action,
+            Text(outcome.reason),
+            f"{outcome.wall_s:.1f}",
+            f"{outcome.cpu_s:.1f}",
+            f"{outcome.peak_rss / GIB:.2f}",
+            Text(key_numbers(outcome.numbers)),
+            style="dim" if outcome.action == "skipped" else None,
+        )
+    ran = [outcome for outcome in outcomes if outcome.action == "ran"]
+    table.add_section()
+    table.add_row(
+        "total",
+        f"{len(ran)} ran",
+        "",
+        f"{sum(outcome.wall_s for outcome in ran):.1f}",
+        f"{sum(outcome.cpu_s for outcome in ran):.1f}",
+        f"{max((outcome.peak_rss for outcome in ran), default=0) / GIB:.2f}",
+        "",
+    )
+    return table
+
+
+def status_table(statuses: Sequence[StageStatus]) -> Table:
+    """Stage, how it stands and why, what it holds and what it cost."""
+    from rich.table import Table
+    from rich.text import Text
+
+    from stages.engine.workspace import show_bytes
+
+    table = Table(header_style="bold")
+    for heading in ("stage", "state", "why"):
+        table.add_column(heading, overflow="fold")
+    for heading in ("size", "wall s", "CPU s", "peak GiB"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    table.add_column("made (UTC)", no_wrap=True)
+    for status in statuses:
+        made = status.manifest
+        cost = (
+            (show_bytes(made.size), f"{made.wall_s:.1f}", f"{made.cpu_s:.1f}", f"{made.peak_rss / GIB:.2f}")
+            if made
+            else ("", "", "", "")
+        )
+        created = made.created.replace("T", " ").removesuffix("+00:00") if made else ""
+        state = Text(status.state, style=_STATE_COLOURS[status.state])
+        table.add_row(status.name, state, Text(status.reason), *cost, created)
+    return table
+
+
+def key_numbers(numbers: Mapping[str, Any]) -> str:
+    """The first few plain values of what a stage returned, in one line."""
+    plain = [(name, value) for name, value in numbers.items() if isinstance(value, (int, float, str))]
+    return ", ".join(f"{name.replace('_', ' ')} {_short(value)}" for name, value in plain[:MAX_NUMBERS])
+
+
+def _short(value: float | str) -> str:
+    if isinstance(value, bool) or not isinstance(value, float):
+        return str(value)
+    return f"{value:.4g}"

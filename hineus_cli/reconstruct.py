@@ -1,0 +1,243 @@
+"""From what the user said to a finished workspace: which folder, photos, settings and device, then the run."""
+
+from __future__ import annotations
+
+import ctypes
+import logging
+import os
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from configs.load import load_config
+from configs.params import Config
+from hineus_cli.console import log_to_file
+from stages import artifacts
+from stages.engine.runner import Listener, StageOutcome, run_pipeline
+from stages.engine.stage import Stage
+from stages.engine.workspace import Workspace
+from stages.errors import ConfigError, InputError, SystemRequirementError
+
+log = logging.getLogger(__name__)
+
+_TIME = re.compile(r"^(?:(?P<h>[\d.]+)h)?(?:(?P<m>[\d.]+)m(?:in)?)?(?:(?P<s>[\d.]+)s)?$")
+
+
+@dataclass(frozen=True)
+class Request:
+    """What the user asked for; None is "not said".
+
+    Attributes:
+        photos: folder of photos; a workspace that was run before knows its own.
+        workspace: folder; default `<photos' name>_hineus` here.
+        masks: folder of masks; kept from the last run while the photos are the same, unless `no_masks`.
+        preset, config, sets: layers of settings. With neither preset nor config, a workspace keeps its own.
+        from_stage, until, force: see `run_pipeline`.
+        device: "auto", "cpu" or "cuda".
+        workers: CPU threads; default all that this process may use.
+        time: training budget, for example "5m".
+    """
+
+    photos: Path | None = None
+    workspace: Path | None = None
+    masks: Path | None = None
+    no_masks: bool = False
+    preset: str | None = None
+    config: Path | None = None
+    sets: Sequence[str] = ()
+    from_stage: str | None = None
+    until: str | None = None
+    force: Sequence[str] = ()
+    device: str = "auto"
+    workers: int | None = None
+    time: str | None = None
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """A finished run: where it lies, what each stage did, and what it was done with."""
+
+    workspace: Workspace
+    config: Config
+    preset: str | None
+    device: str
+    workers: int
+    outcomes: tuple[StageOutcome, ...]
+
+    @property
+    def glb(self) -> Path | None:
+        return _existing(artifacts.glb_path(self.workspace.stage_folder("export")))
+
+    @property
+    def report(self) -> Path | None:
+        return _existing(artifacts.report_path(self.workspace.stage_folder("report")))
+
+
+def reconstruct(request: Request, pipeline: Sequence[Stage], listener: Listener | None = None) -> Reconstruction:
+    """Do what was asked.
+
+    Raises:
+        HineusError: a child by what the user can do.
+    """
+    if request.workers is not None:
+        # Read when the heavy libraries load, which is inside the stages.
+        os.environ["OMP_NUM_THREADS"] = str(request.workers)
+    workspace = Workspace.open(choose_folder(request), create=True)
+    photos, masks = choose_sources(request, workspace)
+    preset, config = choose_config(request, workspace)
+    device = choose_device(request.device)
+    workers = request.workers or available_cores()
+    with workspace.lock(), log_to_file(workspace.log_path):
+        log.debug("preset %s, device %s, %d workers, photos %s", preset, device, workers, photos)
+        outcomes = run_pipeline(
+            pipeline,
+            workspace,
+            config,
+            {"photos": photos, "masks": masks},
+            device=device,
+            workers=workers,
+            from_stage=request.from_stage,
+            until=request.until,
+            force=request.force,
+            listener=listener,
+            preset=preset,
+        )
+    return Reconstruction(workspace, config, preset, device, workers, tuple(outcomes))
+
+
+def choose_folder(request: Request) -> Path:
+    """The workspace's folder: the one named, or one named after the photos, or here if here is one.
+
+    Raises:
+        ConfigError: nothing says which.
+    """
+    if request.workspace is not None:
+        return request.workspace
+    if request.photos is not None:
+        return Path.cwd() / f"{request.photos.resolve().name}_hineus"
+    if (Path.cwd() / "workspace.json").exists():
+        return Path.cwd()
+    raise ConfigError(
+        "Neither a folder of photos nor a workspace is given.",
+        "Try `hineus run PHOTOS`, or `--workspace DIR` for one that exists.",
+    )
+
+
+def choose_sources(request: Request, workspace: Workspace) -> tuple[Path, Path | None]:
+    """Photos and masks: those given, else those the workspace was last run with.
+
+    Raises:
+        InputError: there are none, a given one does not exist, or the workspace lies inside the photos.
+    """
+    known = workspace.record.sources
+    for name, given in (("photos", request.photos), ("masks", request.masks)):
+        if given is not None and not given.exists():
+            raise InputError(f"There is no {name} folder {given}.", "Check the path with `ls`.")
+    recorded = known.get("photos")
+    photos = request.photos.resolve() if request.photos else Path(recorded) if recorded else None
+    if photos is None:
+        raise InputError(
+            f"The workspace {workspace.root} does not know its photos yet.",
+            f"Name them: `hineus run PHOTOS --workspace {workspace.root}`.",
+        )
+    if workspace.root == photos or photos in workspace.root.parents:
+        raise InputError(
+            f"The workspace {workspace.root} lies inside the photo folder {photos}, so it would be read as photos.",
+            "Choose a folder outside with `--workspace DIR`.",
+        )
+    masks = request.masks.resolve() if request.masks else None
+    remembered = known.get("masks")
+    if masks is None and remembered and not request.no_masks and str(photos) == recorded:
+        masks = Path(remembered)
+    return photos, masks
+
+
+def choose_config(request: Request, workspace: Workspace) -> tuple[str | None, Config]:
+    """The preset's name and the settings.
+
+    A workspace goes on with the settings it was last run with, `--set` on top, until a preset or a file is named.
+
+    Raises:
+        ConfigError: see `load_config`.
+    """
+    sets = list(request.sets)
+    if request.time is not None:
+        sets.append(f"train.minutes={minutes(request.time)}")
+    kept = request.preset is None and request.config is None and workspace.config_path.exists()
+    if not kept:
+        named = request.preset or default_preset()
+        return named, load_config(named, request.config, sets)
+    preset = workspace.record.preset
+    log.info("settings: those of the last run (preset %s); name a --preset to start anew", preset or "none")
+    try:
+        return preset, load_config(None, workspace.config_path, sets)
+    except ConfigError as error:
+        if str(workspace.config_path) not in error.message:
+            raise
+        raise ConfigError(
+            error.message, "These are the settings of the last run. Name a preset to start anew: `--preset cpu`."
+        ) from error
+
+
+def choose_device(name: str) -> str:
+    """ "cpu" or "cuda".
+
+    Raises:
+        ConfigError: it is neither of these nor "auto".
+        SystemRequirementError: CUDA was asked for and is not there.
+    """
+    if name not in ("auto", "cpu", "cuda"):
+        raise ConfigError(f"There is no device '{name}'.", "Choose `--device auto`, `cpu` or `cuda`.")
+    if name == "cuda" and not has_cuda():
+        raise SystemRequirementError(
+            "No CUDA device can be used here.", "Run `hineus doctor` to see why, or use `--device cpu`."
+        )
+    return "cuda" if name == "cuda" or (name == "auto" and has_cuda()) else "cpu"
+
+
+def default_preset() -> str:
+    return "gpu" if has_cuda() else "cpu"
+
+
+def has_cuda() -> bool:
+    """Whether PyTorch can use a CUDA device; quick where there is no driver."""
+    try:
+        ctypes.CDLL("libcuda.so.1")
+    except OSError:
+        return False
+    import torch
+
+    return bool(torch.cuda.is_available())
+
+
+def available_cores() -> int:
+    """CPU cores this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def minutes(text: str) -> float:
+    """ "90s", "5m", "1h30m" or "5" (minutes) as minutes.
+
+    Raises:
+        ConfigError: it is none of these, or not positive.
+    """
+    refusal = ConfigError(f"--time {text} is no length of time.", "Try `--time 5m`, `--time 90s` or `--time 1h30m`.")
+    found = _TIME.match(text.strip())
+    try:
+        if found and any(found.groups()):
+            hours, mins, seconds = (float(found[unit] or 0) for unit in "hms")
+            total = 60 * hours + mins + seconds / 60
+        else:
+            total = float(text)
+    except ValueError:
+        raise refusal from None
+    if not 0 < total < float("inf"):
+        raise refusal
+    return total
+
+
+def _existing(path: Path) -> Path | None:
+    return path if path.exists() else None

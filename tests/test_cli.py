@@ -1,0 +1,319 @@
+"""The command line over the toy pipeline: what is said, where it is said, and with which exit code."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from toy_pipeline import TOY, failing, with_stage
+from typer.testing import CliRunner, Result
+
+from hineus_cli import doctor, reconstruct
+from hineus_cli.app import build_app
+from hineus_cli.console import key_numbers
+from hineus_cli.doctor import Finding
+from stages.errors import ConfigError, InputError, ReconstructionError
+
+REPOSITORY = Path(__file__).parents[1]
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The current folder, with `photos/` in it, on a machine without a GPU."""
+    (tmp_path / "photos").mkdir()
+    for index in range(3):
+        (tmp_path / "photos" / f"{index}.jpg").write_text(f"{index}")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(reconstruct, "has_cuda", lambda: False)
+    return tmp_path
+
+
+def hineus(*arguments: str, pipeline: Any = TOY) -> Result:
+    return CliRunner().invoke(build_app(pipeline), arguments)
+
+
+def outcome(result: Result) -> dict[str, Any]:
+    assert result.exit_code == 0, result.output
+    return json.loads(result.stdout)
+
+
+def actions(result: Result) -> dict[str, str]:
+    return {stage["name"]: stage["action"] for stage in outcome(result)["stages"]}
+
+
+# ---------------------------------------------------------------- running
+def test_run_makes_the_workspace_beside_and_says_where_the_model_is(folder: Path) -> None:
+    result = hineus("run", "photos")
+    assert result.exit_code == 0
+    assert result.stdout == ""
+    assert f"textured model: {folder}/photos_hineus/export/model.glb" in result.stderr
+    assert "sfm: letters to poses (not made yet)" in result.stderr
+    assert "started at 0, ended at" in result.stderr
+
+
+def test_json_is_one_object_on_stdout(folder: Path) -> None:
+    data = outcome(hineus("run", "photos", "--json"))
+    assert data["ok"] is True
+    assert data["preset"] == "cpu"
+    assert data["device"] == "cpu"
+    assert [stage["name"] for stage in data["stages"]] == [stage.name for stage in TOY]
+    assert Path(data["glb"]).is_file()
+    assert data["report"] is None
+
+
+def test_what_stages_print_stays_out_of_the_json(folder: Path) -> None:
+    def chatty(context: Any) -> dict[str, Any]:
+        print("hello from python")
+        return TOY[3].run(context)
+
+    assert outcome(hineus("run", "photos", "--json", pipeline=with_stage("export", run=chatty)))["ok"] is True
+
+
+def test_workspace_remembers_photos_masks_and_settings(folder: Path) -> None:
+    (folder / "masks").mkdir()
+    (folder / "masks" / "0.png").write_text("m")
+    hineus("run", "photos", "--masks", "masks", "-w", "ws", "--preset", "tiny", "--set", "sfm.seed=5")
+    again = hineus("run", "-w", "ws", "--json")
+    assert set(actions(again).values()) == {"skipped"}
+    assert outcome(again)["preset"] == "tiny"
+    assert "settings: those of the last run (preset tiny)" in again.stderr
+    assert actions(hineus("run", "photos", "-w", "ws", "--no-masks", "--json"))["ingest"] == "ran"
+    named = outcome(hineus("run", "-w", "ws", "--preset", "cpu", "--json"))
+    assert "parameter sfm.seed changed 5 -> 0" in named["stages"][1]["reason"]
+
+
+def test_kept_settings_can_be_fed_back(folder: Path) -> None:
+    hineus("run", "photos", "-w", "one", "--set", "sfm.max_features=300")
+    hineus("run", "photos", "-w", "two", "--config", "one/config.yaml")
+    assert (folder / "one/config.yaml").read_text() == (folder / "two/config.yaml").read_text()
+
+
+def test_from_until_force(folder: Path) -> None:
+    assert list(actions(hineus("run", "photos", "--until", "sfm", "--json"))) == ["ingest", "sfm"]
+    hineus("run", "photos")
+    assert actions(hineus("run", "photos", "--from", "undistort", "--json")) == {
+        "ingest": "skipped",
+        "sfm": "skipped",
+        "undistort": "ran",
+        "export": "ran",
+    }
+    assert actions(hineus("run", "photos", "--force", "sfm", "--json"))["sfm"] == "ran"
+
+
+def test_each_stage_is_a_command(folder: Path) -> None:
+    assert actions(hineus("undistort", "photos", "-w", "ws", "--json")) == dict.fromkeys(
+        ["ingest", "sfm", "undistort"], "ran"
+    )
+    assert actions(hineus("sfm", "-w", "ws", "--json")) == {"ingest": "skipped", "sfm": "skipped"}
+    assert actions(hineus("sfm", "-w", "ws", "--force", "--json")) == {"ingest": "skipped", "sfm": "ran"}
+
+
+def test_time_sets_the_training_budget(folder: Path) -> None:
+    hineus("run", "photos", "--time", "90s")
+    assert "minutes: 1.5" in (folder / "photos_hineus" / "config.yaml").read_text()
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"), [("5m", 5), ("90s", 1.5), ("1h30m", 90), ("5", 5), ("0.5h", 30), ("2min", 2)]
+)
+def test_times(text: str, expected: float) -> None:
+    assert reconstruct.minutes(text) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("text", ["", "0", "-5m", "5x", "m", "nan", "inf", "1.2.3m"])
+def test_wrong_times_are_refused(text: str) -> None:
+    with pytest.raises(ConfigError, match="is no length of time"):
+        reconstruct.minutes(text)
+
+
+# ---------------------------------------------------------------- errors
+@pytest.mark.parametrize(
+    ("arguments", "exit_code", "sentences"),
+    [
+        (["run"], 2, ["Neither a folder of photos nor a workspace is given.", "Try `hineus run PHOTOS`"]),
+        (["run", "nowhere"], 3, ["There is no photos folder nowhere."]),
+        (["run", "photos", "--masks", "nowhere"], 3, ["There is no masks folder nowhere."]),
+        (["run", "-w", "new"], 3, ["does not know its photos yet", "hineus run PHOTOS --workspace"]),
+        (["run", "photos", "-w", "photos/ws"], 3, ["lies inside the photo folder"]),
+        (["run", "photos", "--set", "sfm.max_feature=1"], 2, ["Unknown setting `sfm.max_feature`", "Did you mean"]),
+        (["run", "photos", "--set", "sfm.seed=-1"], 2, ["`sfm.seed` = -1", "must be >= 0"]),
+        (["run", "photos", "--preset", "tinny"], 2, ["no preset 'tinny'", "--preset tiny"]),
+        (["run", "photos", "--until", "sfmm"], 2, ["There is no stage 'sfmm'", "Did you mean `--until sfm`?"]),
+        (["run", "photos", "--time", "soon"], 2, ["--time soon is no length of time"]),
+        (["run", "photos", "--device", "tpu"], 2, ["There is no device 'tpu'"]),
+        (["run", "photos", "--device", "cuda"], 6, ["No CUDA device can be used here.", "hineus doctor"]),
+        (["run", "photos", "--bogus"], 2, ["No such option: --bogus"]),
+        (["status", "nowhere"], 5, ["There is no workspace at", "hineus run PHOTOS"]),
+    ],
+)
+def test_error_sentences_and_exit_codes(
+    folder: Path, arguments: list[str], exit_code: int, sentences: list[str]
+) -> None:
+    result = hineus(*arguments)
+    assert result.exit_code == exit_code
+    assert result.stdout == ""
+    for sentence in sentences:
+        assert sentence in result.stderr
+
+
+def test_a_stage_s_error_has_its_exit_code_and_is_json_too(folder: Path) -> None:
+    def few() -> ReconstructionError:
+        return ReconstructionError("Only 7 of 40 photos were registered.", "Add overlapping photos.")
+
+    result = hineus("run", "photos", "--json", pipeline=with_stage("sfm", run=failing(few)))
+    assert result.exit_code == 4
+    assert "Error: Only 7 of 40 photos were registered.\nAdd overlapping photos." in result.stderr
+    assert json.loads(result.stdout) == {
+        "ok": False,
+        "error": {
+            "type": "ReconstructionError",
+            "message": "Only 7 of 40 photos were registered.",
+            "hint": "Add overlapping photos.",
+            "exit_code": 4,
+        },
+    }
+
+
+def test_unforeseen_error_is_short_and_its_traceback_is_in_the_log(folder: Path) -> None:
+    broken = with_stage("sfm", run=failing(lambda: ZeroDivisionError("one over nothing")))
+    result = hineus("run", "photos", pipeline=broken)
+    assert result.exit_code == 1
+    assert "Unexpected error in stage sfm: ZeroDivisionError: one over nothing" in result.stderr
+    log = folder / "photos_hineus" / "hineus.log"
+    assert str(log) in result.stderr
+    assert "Traceback" not in result.stderr
+    assert "Traceback (most recent call last)" in log.read_text()
+    assert hineus("run", "photos").exit_code == 0
+
+
+def test_interruption_is_told(folder: Path) -> None:
+    result = hineus("run", "photos", pipeline=with_stage("sfm", run=failing(KeyboardInterrupt)))
+    assert result.exit_code == 130
+    assert "run the same command to go on" in result.stderr
+    assert actions(hineus("run", "photos", "--json"))["ingest"] == "skipped"
+
+
+def test_folder_that_is_no_workspace_is_left_alone(folder: Path) -> None:
+    (folder / "mine").mkdir()
+    (folder / "mine" / "export").mkdir()
+    (folder / "mine" / "export" / "thesis.doc").write_text("years of work")
+    result = hineus("run", "photos", "-w", "mine")
+    assert result.exit_code == 5
+    assert "is no workspace, and it holds 1 other" in result.stderr
+    assert (folder / "mine" / "export" / "thesis.doc").exists()
+
+
+def test_settings_of_another_version_are_told(folder: Path) -> None:
+    hineus("run", "photos")
+    kept = folder / "photos_hineus" / "config.yaml"
+    kept.write_text(kept.read_text() + "hologram: {}\n")
+    result = hineus("run", "photos")
+    assert result.exit_code == 2
+    assert "Unknown setting `hologram`" in result.stderr
+    assert "--preset cpu" in result.stderr
+    assert hineus("run", "photos", "--preset", "cpu").exit_code == 0
+
+
+# ---------------------------------------------------------------- looking
+def test_status_says_why(folder: Path) -> None:
+    hineus("run", "photos")
+    (folder / "photos" / "1.jpg").write_text("changed")
+    (folder / "photos_hineus" / "export" / "model.glb").unlink()
+    result = hineus("status", "photos_hineus")
+    assert result.exit_code == 0
+    for sentence in ("photo 1.jpg changed", "input stage ingest is stale", "output model.glb missing"):
+        assert sentence in result.stdout
+    stages = {stage["name"]: stage for stage in outcome(hineus("status", "photos_hineus", "--json"))["stages"]}
+    assert {name: stage["state"] for name, stage in stages.items()} == {
+        "ingest": "stale",
+        "sfm": "stale",
+        "undistort": "stale",
+        "export": "missing",
+    }
+    assert stages["sfm"]["size"] > 0
+
+
+def test_status_verify_reads_everything(folder: Path) -> None:
+    hineus("run", "photos")
+    model = folder / "photos_hineus" / "export" / "model.glb"
+    model.write_text("X" * len(model.read_text()))
+    assert "contents changed" not in hineus("status", "photos_hineus").stdout
+    assert "contents changed" in hineus("status", "photos_hineus", "--verify").stdout
+
+
+def test_config_prints_what_config_takes(folder: Path) -> None:
+    printed = hineus("config", "--preset", "tiny", "--set", "sfm.seed=9")
+    (folder / "mine.yaml").write_text(printed.stdout)
+    assert hineus("config", "--config", "mine.yaml").stdout == printed.stdout
+    assert "  seed: 9\n" in printed.stdout
+    assert "sfm.max_features" in hineus("config", "--describe").stdout
+
+
+def test_presets_are_listed() -> None:
+    listed = hineus("presets").stdout
+    assert all(f"{name} " in listed for name in ("cpu", "gpu", "tiny"))
+
+
+def test_doctor_says_what_to_install(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doctor, "REQUIRED", {"json": "pip", "no_such_module": "no-such-module"})
+    monkeypatch.setattr(doctor, "missing_libraries", lambda: ["libGL.so.1"])
+    monkeypatch.setattr(doctor, "_gpu", lambda: Finding("GPU", "note", "none"))
+    result = hineus("doctor")
+    assert result.exit_code == 6
+    assert "This machine lacks no_such_module, system libraries." in result.stderr
+    assert "pip install no-such-module; apt-get install -y libgl1" in result.stderr
+    data = json.loads(hineus("doctor", "--json").stdout)
+    assert data["ok"] is False
+    assert {"hineus", "Python", "memory", "disk", "CPU cores", "GPU"} <= {each["what"] for each in data["findings"]}
+
+
+def test_doctor_is_content_with_a_fit_machine(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doctor, "REQUIRED", {"json": "pip"})
+    monkeypatch.setattr(doctor, "missing_libraries", lambda: [])
+    monkeypatch.setattr(doctor, "_gpu", lambda: Finding("GPU", "note", "none"))
+    assert hineus("doctor").exit_code == 0
+
+
+def test_numbers_are_short() -> None:
+    assert key_numbers({"mean_error_px": 0.123456, "photos": 3, "names": ["a"]}) == "mean error px 0.1235, photos 3"
+
+
+# ---------------------------------------------------------------- the real command line
+def test_help_lists_every_stage_and_loads_nothing_heavy() -> None:
+    program = (
+        "import sys\n"
+        "from hineus_cli.app import main, PIPELINE\n"
+        "heavy = {'torch', 'open3d', 'pycolmap', 'cv2', 'trimesh', 'pymeshlab', 'xatlas', 'numba', 'scipy', 'PIL'}\n"
+        "assert not heavy & set(sys.modules), heavy & set(sys.modules)\n"
+        "print(' '.join(stage.name for stage in PIPELINE))\n"
+        "sys.argv = ['hineus', '--help']\n"
+        "main()\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program], cwd=REPOSITORY, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    names, _, listed = done.stdout.partition("\n")
+    assert names.split() == [
+        "ingest", "sfm", "undistort", "train", "extract", "cleanup", "atlas", "bake", "export", "report"
+    ]  # fmt: skip
+    for name in [*names.split(), "run", "status", "doctor", "demo", "config", "presets"]:
+        assert f" {name} " in listed
+
+
+def test_module_is_the_command() -> None:
+    command = [sys.executable, "-m", "hineus_cli", "--version"]
+    done = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=True)
+    assert done.stdout.startswith("hineus ")
+
+
+def test_photos_that_cannot_be_read_are_told(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(path: Path) -> str:
+        raise PermissionError(13, "Permission denied", str(path))
+
+    monkeypatch.setattr("stages.engine.fingerprint.file_sha256", refuse)
+    result = hineus("run", "photos")
+    assert result.exit_code == InputError.exit_code
+    assert "cannot be read: Permission denied" in result.stderr

@@ -1,0 +1,118 @@
+"""Settings: the order of the layers, the sentences of refusal, the presets, the descriptions."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from configs.load import config_yaml, describe_settings, load_config, preset_names, preset_summary, preset_text
+from configs.params import Config
+from stages.errors import ConfigError
+
+
+def test_order_is_defaults_preset_file_set(tmp_path: Path) -> None:
+    tiny = load_config("tiny")
+    assert tiny.extract.resolution != Config().extract.resolution
+    assert tiny.sfm.matcher == Config().sfm.matcher
+    file = tmp_path / "mine.yaml"
+    file.write_text("extract:\n  resolution: 111\natlas:\n  padding: 7\nsfm:\n")
+    with_file = load_config("tiny", file)
+    assert with_file.extract.resolution == 111
+    assert with_file.extract.block == tiny.extract.block  # a file changes only what it names
+    with_set = load_config("tiny", file, ["extract.resolution=112", "extract.resolution=113"])
+    assert (with_set.extract.resolution, with_set.atlas.padding) == (113, 7)
+
+
+def test_presets_validate_and_say_what_they_are() -> None:
+    assert {"cpu", "gpu", "tiny"} <= set(preset_names())
+    for name in preset_names():
+        assert isinstance(load_config(name), Config)
+        assert preset_text(name).startswith("# ")
+        assert len(preset_summary(name)) > 10
+
+
+def test_every_setting_is_described() -> None:
+    settings = describe_settings()
+    assert len(settings) > 25
+    assert [setting.key for setting in settings if not setting.description or not setting.type] == []
+    by_key = {setting.key: setting for setting in settings}
+    assert by_key["bake.views"].bounds == ">= 1, <= 32"
+    assert by_key["sfm.mapper"].type == "incremental | global"
+    assert by_key["train.minutes"].type == "number | null"
+
+
+def test_yaml_round_trip(tmp_path: Path) -> None:
+    config = load_config("tiny", sets=["train.minutes=2.5", "export.formats=[glb]", "undistort.up=+y"])
+    file = tmp_path / "config.yaml"
+    file.write_text(config_yaml(config))
+    assert load_config(file=file) == config
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("train.minutes=5", 5.0),
+        ("train.minutes=null", None),
+        ("train.minutes=1e-1", 0.1),
+        ("bake.gain=false", False),
+        ("export.formats=[glb, ply]", ("glb", "ply")),
+        ("undistort.up=-z", "-z"),
+        (" sfm.seed = 3", 3),
+    ],
+)
+def test_set_takes_yaml_values(text: str, expected: Any) -> None:
+    section, _, key = text.strip().partition("=")[0].strip().partition(".")
+    assert getattr(getattr(load_config(sets=[text]), section), key) == expected
+
+
+@pytest.mark.parametrize(
+    ("text", "message", "hint"),
+    [
+        ("sfm.max_feature=1", "Unknown setting `sfm.max_feature` in --set", "Did you mean `sfm.max_features`?"),
+        ("max_features=1", "Unknown setting `max_features`", "Did you mean `sfm.max_features`?"),
+        ("bake.max_features=500", "Unknown setting `bake.max_features`", "Did you mean `sfm.max_features`?"),
+        ("expotr=1", "Unknown setting `expotr`", "Did you mean `export`?"),
+        ("qqqq.wwww=1", "Unknown setting `qqqq`", "lists all settings"),
+        ("sfm.max_features=3", "`sfm.max_features` = 3 in --set sfm.max_features=3 is out of bounds", ">= 100"),
+        ("train.minutes=-1", "`train.minutes` = -1 in", "must be > 0"),
+        ("bake.views=many", "`bake.views` = 'many' in", "must be whole number >= 1, <= 32"),
+        ("sfm.matcher=off", "`sfm.matcher` = 'off' in", "auto | exhaustive"),
+        ("export.formats=[glb, stl]", "`export.formats` = 'stl' in", "list of (glb | obj | ply)"),
+        ("sfm=3", "`sfm` in --set sfm=3 is a section of settings", "`sfm.matcher`"),
+        ("sfm.seed", "is not of the form section.key=value", "--set sfm.seed=1"),
+        ("sfm.seed=[1", "the value is not valid YAML", "Quote it"),
+    ],
+)
+def test_refusals_name_the_setting_and_the_way_out(text: str, message: str, hint: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        load_config(sets=[text])
+    assert message in caught.value.message
+    assert hint in f"{caught.value.message} {caught.value.hint}"
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("sfm:\n  sed: 1\n", "Unknown setting `sfm.sed` in "),
+        ("sfm:\n  seed: -1\n", "out of bounds: it must be >= 0"),
+        ("sfm: [\n", "is not valid YAML at line"),
+        ("- 1\n", "holds list where sections were expected"),
+    ],
+)
+def test_refusals_name_the_file(tmp_path: Path, content: str, message: str) -> None:
+    file = tmp_path / "mine.yaml"
+    file.write_text(content)
+    with pytest.raises(ConfigError) as caught:
+        load_config(file=file)
+    assert message in caught.value.message
+    assert "mine.yaml" in caught.value.message
+
+
+def test_absent_file_and_unknown_preset(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"no\.yaml cannot be read"):
+        load_config(file=tmp_path / "no.yaml")
+    with pytest.raises(ConfigError, match="no preset 'tinny'") as caught:
+        load_config("tinny")
+    assert "Did you mean `--preset tiny`?" in caught.value.hint
