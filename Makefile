@@ -16,7 +16,7 @@ venv:
 	@bash .ci/setup_env.sh
 
 demo: venv
-	$(BIN)/hineus demo demo
+	$(BIN)/hineus demo
 
 test: venv
 	$(BIN)/python -m pytest

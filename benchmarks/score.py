@@ -15,9 +15,7 @@ from stages.errors import HineusError
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("mesh", type=Path, help="in the model's frame, e.g. WORKSPACE/export/model.ply")
     parser.add_argument("truth", type=Path, help="folder with gt_mesh.ply and transforms.json")
     parser.add_argument("--model", type=Path, required=True, help="e.g. WORKSPACE/sfm/model")

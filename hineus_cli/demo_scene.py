@@ -39,9 +39,7 @@ def _ellipsoid(points: np.ndarray, center: tuple, radii: tuple) -> np.ndarray:
     return (np.linalg.norm(offset, axis=1) - 1.0) * min(radii)
 
 
-def _cone_stroke(
-    points: np.ndarray, start: tuple, end: tuple, radius_a: float, radius_b: float
-) -> np.ndarray:
+def _cone_stroke(points: np.ndarray, start: tuple, end: tuple, radius_a: float, radius_b: float) -> np.ndarray:
     """A line segment thickened by a radius that goes linearly from `radius_a` to `radius_b`."""
     a, b = np.array(start), np.array(end)
     along = np.clip((points - a) @ (b - a) / ((b - a) @ (b - a)), 0.0, 1.0)
@@ -56,9 +54,7 @@ def _ring(points: np.ndarray, center: tuple, major: float, minor: float) -> np.n
     return np.hypot(around, offset[:, 0]) - minor
 
 
-def _rounded_disc(
-    points: np.ndarray, center: tuple, radius: float, half_height: float, rounding: float
-) -> np.ndarray:
+def _rounded_disc(points: np.ndarray, center: tuple, radius: float, half_height: float, rounding: float) -> np.ndarray:
     offset = points - np.array(center)
     radial = np.hypot(offset[:, 0], offset[:, 1]) - radius + rounding
     vertical = np.abs(offset[:, 2]) - half_height + rounding
@@ -73,9 +69,7 @@ def _smooth_union(a: np.ndarray, b: np.ndarray, width: float) -> np.ndarray:
 
 def _parts(points: np.ndarray) -> list[tuple[np.ndarray, int]]:
     """Implicit distance and material of each part, [P] each, in design units."""
-    ripples = (
-        0.006 * np.sin(19 * points[:, 0]) * np.sin(17 * points[:, 1] + 1.0) * np.sin(18 * points[:, 2] + 2.0)
-    )
+    ripples = 0.006 * np.sin(19 * points[:, 0]) * np.sin(17 * points[:, 1] + 1.0) * np.sin(18 * points[:, 2] + 2.0)
     body = _ellipsoid(points, (0.0, 0.0, 0.37), (0.37, 0.27, 0.27)) + ripples
     head = _ellipsoid(points, (0.27, 0.03, 0.70), (0.165, 0.155, 0.16))
     tail = _cone_stroke(points, (-0.28, 0.0, 0.42), (-0.50, -0.05, 0.64), 0.11, 0.045)
@@ -199,9 +193,7 @@ class ValueNoise:
         return sum(layers) / strengths.sum()
 
 
-def figurine_materials(
-    design: np.ndarray, rng: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def figurine_materials(design: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Linear albedo [V, 3], metalness [V] and gloss [V] of the bird at points in design units."""
     from scipy.spatial import cKDTree
 
@@ -264,9 +256,7 @@ def make_environment(rng: np.random.Generator, height: int = 128) -> np.ndarray:
     for _ in range(10):  # furniture: darker blocks at the horizon
         x, w = int(rng.integers(width)), int(rng.integers(width // 30, width // 10))
         top = int(height * rng.uniform(0.30, 0.45))
-        cv2.rectangle(
-            environment, (x, top), (x + w, int(0.55 * height)), (rng.uniform(0.05, 0.3, 3)).tolist(), -1
-        )
+        cv2.rectangle(environment, (x, top), (x + w, int(0.55 * height)), (rng.uniform(0.05, 0.3, 3)).tolist(), -1)
     for x, top, w, h, strength in ((0.10, 0.14, 0.13, 0.20, 9.0), (0.62, 0.20, 0.10, 0.16, 4.0)):
         a = (int(x * width), int(top * height))
         b = (int((x + w) * width), int((top + h) * height))
@@ -316,20 +306,14 @@ def _remap(image: np.ndarray, x: np.ndarray, y: np.ndarray, border: int) -> np.n
     return cv2.remap(image, maps[0], maps[1], cv2.INTER_LINEAR, borderMode=border).reshape(padded, -1)[:count]
 
 
-def _light_samples(
-    environment: np.ndarray, count: int, rng: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray]:
+def _light_samples(environment: np.ndarray, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Directions [count, 3] drawn by brightness; the radiance times solid angle [count, 3] of each."""
     height = environment.shape[0]
     directions = _sphere_directions(height).reshape(-1, 3)
-    solid_angle = (
-        np.repeat(np.sin((np.arange(height) + 0.5) / height * np.pi), 2 * height) * np.pi**2 / height**2
-    )
+    solid_angle = np.repeat(np.sin((np.arange(height) + 0.5) / height * np.pi), 2 * height) * np.pi**2 / height**2
     power = environment.reshape(-1, 3).mean(1) * solid_angle
     cumulative = np.cumsum(power) / power.sum()
-    chosen = np.searchsorted(cumulative, (np.arange(count) + rng.random(count)) / count).clip(
-        0, len(power) - 1
-    )
+    chosen = np.searchsorted(cumulative, (np.arange(count) + rng.random(count)) / count).clip(0, len(power) - 1)
     probability = power[chosen] / power.sum()
     weights = environment.reshape(-1, 3)[chosen] * (solid_angle[chosen] / probability / count)[:, None]
     return directions[chosen], weights
@@ -458,16 +442,12 @@ def camera_ring(num_photos: int, rng: np.random.Generator) -> np.ndarray:
     counts = np.floor(rings).astype(int)
     counts[0] += num_photos - counts.sum()
     poses = []
-    for ring, (count, elevation, distance) in enumerate(
-        zip(counts, (24, 42, 62), (2.45, 2.5, 2.6), strict=True)
-    ):
+    for ring, (count, elevation, distance) in enumerate(zip(counts, (24, 42, 62), (2.45, 2.5, 2.6), strict=True)):
         for i in range(count):
             azimuth = 2 * np.pi * (i + 0.37 * ring + rng.uniform(-0.08, 0.08)) / count
             tilt = np.radians(elevation + rng.uniform(-2.5, 2.5))
             radius = distance + rng.uniform(-0.12, 0.12)
-            center = radius * np.array(
-                [np.cos(tilt) * np.cos(azimuth), np.cos(tilt) * np.sin(azimuth), np.sin(tilt)]
-            )
+            center = radius * np.array([np.cos(tilt) * np.cos(azimuth), np.cos(tilt) * np.sin(azimuth), np.sin(tilt)])
             target = np.array([0, 0, 0.38]) + rng.uniform(-0.03, 0.03, 3)
             poses.append(_look_at(center, target, roll=np.radians(rng.uniform(-3, 3))))
     return np.array(poses)
@@ -498,9 +478,7 @@ def _ground_radiance(scene: LitScene, x: np.ndarray, y: np.ndarray) -> np.ndarra
     return color
 
 
-def _surroundings(
-    scene: LitScene, origins: np.ndarray, directions: np.ndarray, environment: np.ndarray
-) -> np.ndarray:
+def _surroundings(scene: LitScene, origins: np.ndarray, directions: np.ndarray, environment: np.ndarray) -> np.ndarray:
     """Radiance [P, 3] along rays that miss the bird: the ground below, the room above."""
     color = np.empty((len(directions), 3), np.float32)
     down = directions[:, 2] < -1e-6
@@ -555,13 +533,9 @@ def _shade_figurine(
     return _interpolate(scene, hit, chosen, scene.diffuse) + strength * fresnel * mirror
 
 
-def _box_on_screen(
-    bounds: np.ndarray, cam_from_world: np.ndarray, focal: float, width: int, height: int
-) -> tuple:
+def _box_on_screen(bounds: np.ndarray, cam_from_world: np.ndarray, focal: float, width: int, height: int) -> tuple:
     """Columns and rows [x0, x1), [y0, y1) that can show the bird."""
-    corners = np.array(
-        [[bounds[i, 0], bounds[j, 1], bounds[k, 2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)]
-    )
+    corners = np.array([[bounds[i, 0], bounds[j, 1], bounds[k, 2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
     in_cam = corners @ cam_from_world[:3, :3].T + cam_from_world[:3, 3]
     pixels = focal * in_cam[:, :2] / in_cam[:, 2:] + [width / 2, height / 2]
     low, high = np.floor(pixels.min(0)).astype(int) - 1, np.ceil(pixels.max(0)).astype(int) + 1
@@ -574,15 +548,11 @@ def render(scene: LitScene, cam_from_world: np.ndarray, focal: float, size: tupl
     focal = SUPERSAMPLING * focal
     rotation = cam_from_world[:3, :3]
     center = -rotation.T @ cam_from_world[:3, 3]
-    x, y = np.meshgrid(
-        (np.arange(width) + 0.5 - width / 2) / focal, (np.arange(height) + 0.5 - height / 2) / focal
-    )
+    x, y = np.meshgrid((np.arange(width) + 0.5 - width / 2) / focal, (np.arange(height) + 0.5 - height / 2) / focal)
     directions = np.stack([x, y, np.ones_like(x)], -1) @ rotation
     directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
     flat = directions.reshape(-1, 3)
-    image = _surroundings(scene, np.broadcast_to(center, flat.shape), flat, scene.sharp).reshape(
-        height, width, 3
-    )
+    image = _surroundings(scene, np.broadcast_to(center, flat.shape), flat, scene.sharp).reshape(height, width, 3)
 
     x0, x1, y0, y1 = _box_on_screen(scene.bounds, cam_from_world, focal, width, height)
     views = directions[y0:y1, x0:x1].reshape(-1, 3)

@@ -77,9 +77,7 @@ def score_mesh(mesh_path: Path, model: Path, truth: Path) -> dict[str, float]:
     )
     mesh = trimesh.load(mesh_path, process=False, force="mesh")
     try:
-        score = score_surface(
-            world_from_model.apply(np.asarray(mesh.vertices)), np.asarray(mesh.faces), known
-        )
+        score = score_surface(world_from_model.apply(np.asarray(mesh.vertices)), np.asarray(mesh.faces), known)
     except ValueError as error:
         raise InputError(f"{mesh_path} cannot be scored: {error}.", f"Look at it, and at {truth}.") from error
     return score.as_dict()

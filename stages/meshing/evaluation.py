@@ -22,12 +22,8 @@ from stages.geometry.similarity import Similarity
 
 BOX_MARGIN = 0.04  # of the extent: a bulge just outside the object's box is still the method's fault
 FACE_MARGIN = 0.05  # of the extent: faces that lie inside this box are the ones that are sampled again
-GROUND_MARGIN = (
-    0.012  # of the extent above the lowest point: the seam of object and table is nobody's surface
-)
-SEEN_SPACING = (
-    0.004  # of the extent: one point of the seen surface a voxel, so that near views do not outvote
-)
+GROUND_MARGIN = 0.012  # of the extent above the lowest point: the seam of object and table is nobody's surface
+SEEN_SPACING = 0.004  # of the extent: one point of the seen surface a voxel, so that near views do not outvote
 SAMPLES = 400_000
 SCORE_THRESHOLDS = (0.005, 0.01)  # of the extent
 
@@ -141,9 +137,7 @@ def sample_surface(vertices: np.ndarray, faces: np.ndarray, count: int, seed: in
     return corners[chosen, 0] + u * edge_b[chosen] + v * edge_c[chosen]
 
 
-def score_surface(
-    vertices: np.ndarray, faces: np.ndarray, known: KnownSurface, samples: int = SAMPLES
-) -> SurfaceScore:
+def score_surface(vertices: np.ndarray, faces: np.ndarray, known: KnownSurface, samples: int = SAMPLES) -> SurfaceScore:
     """Compare a predicted mesh (vertices [V, 3], faces [F, 3], in the truth's frame) with the known surface.
 
     Raises:
@@ -168,9 +162,7 @@ def score_surface(
         if near.any():
             predicted = crop(sample_surface(vertices, faces[near], samples))
     if len(predicted) == 0:
-        raise ValueError(
-            "no surface of the mesh lies inside the known object's box: is it in the same frame?"
-        )
+        raise ValueError("no surface of the mesh lies inside the known object's box: is it in the same frame?")
     seen = seen_surface(known)
     seen = seen[seen[:, 2] > ground]
 
