@@ -1,0 +1,361 @@
+"""Run `hineus run` with default settings on sets of photos, and keep what it cost and what came out.
+
+python -m benchmarks.run_sets DATA                  every set in DATA that has no result yet
+python -m benchmarks.run_sets DATA banana viking    these
+python -m benchmarks.run_sets --demo                `hineus demo`
+python -m benchmarks.run_sets --table-only          only rewrite the tables of docs/benchmarks.md
+
+A set is a folder with `images/` (or `image/`) and, where the truth is known, `gt_mesh.ply` and `transforms.json`.
+Results go to benchmarks/results/SET.json; workspaces and contact sheets to benchmarks/out/. A set that was cut off
+goes on where it stopped; seconds are those of the stages, as the workspace recorded them when each ran.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import shutil
+import subprocess
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).parent.parent
+RESULTS = ROOT / "benchmarks" / "results"
+OUT = ROOT / "benchmarks" / "out"
+PAGE = ROOT / "docs" / "benchmarks.md"
+VALIDATOR = ROOT / "benchmarks" / "validate_glb.mjs"
+DEMO = "demo"
+GIB = 1 << 30
+
+
+@dataclass(frozen=True)
+class StageCost:
+    """What one stage took, and the plain numbers it returned."""
+
+    name: str
+    wall_s: float
+    cpu_s: float
+    peak_rss: int
+    numbers: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Result:
+    """One set.
+
+    Attributes:
+        name: of the set.
+        command: that made it, with DATA for the folder of sets.
+        machine: CPU, cores, versions.
+        stages: in order.
+        score: distances in percent of the extent, or None without truth; see `stages.meshing.evaluation`.
+        validator: counts of the glTF validator's messages, or None where it is not installed.
+        glb_bytes: size of the textured model.
+    """
+
+    name: str
+    command: str
+    machine: dict[str, str]
+    stages: tuple[StageCost, ...]
+    score: dict[str, float] | None
+    validator: dict[str, int] | None
+    glb_bytes: int
+
+    @property
+    def wall_s(self) -> float:
+        return sum(stage.wall_s for stage in self.stages)
+
+    @property
+    def cpu_s(self) -> float:
+        return sum(stage.cpu_s for stage in self.stages)
+
+    @property
+    def peak_rss(self) -> int:
+        return max(stage.peak_rss for stage in self.stages)
+
+    def number(self, stage: str, name: str) -> Any:
+        """A number that a stage returned, or None."""
+        return next((each.numbers.get(name) for each in self.stages if each.name == stage), None)
+
+
+# ---------------------------------------------------------------- running
+def photos_of(folder: Path) -> Path | None:
+    """The folder of photos of a set."""
+    return next((folder / name for name in ("images", "image") if (folder / name).is_dir()), None)
+
+
+def find_sets(data: Path, names: Sequence[str]) -> list[str]:
+    """The sets to run: those named, else all in `data`.
+
+    Raises:
+        SystemExit: a named one has no photos, or there are none at all.
+    """
+    found = sorted(folder.name for folder in data.iterdir() if photos_of(folder)) if data.is_dir() else []
+    unknown = [name for name in names if name not in found]
+    if unknown or not found:
+        sys.exit(
+            f"no photos for {', '.join(unknown) or 'any set'} in {data}; the sets there: {', '.join(found) or '-'}"
+        )
+    return list(names) or found
+
+
+def run_set(name: str, data: Path | None) -> Result:
+    """Run one set (or the demo, without `data`) in a process of its own, and measure its result.
+
+    Raises:
+        RuntimeError: `hineus` failed; its message is included.
+    """
+    OUT.mkdir(parents=True, exist_ok=True)
+    workspace = OUT / name
+    if data is None:
+        arguments, shown = ["demo", "--workspace", str(workspace)], "hineus demo"
+        truth: Path | None = workspace
+    else:
+        photos = photos_of(data / name)
+        assert photos is not None  # find_sets looked
+        arguments = ["run", str(photos), "--workspace", str(workspace)]
+        shown = f"hineus run DATA/{name}/{photos.name}"
+        truth = data / name
+    answer = _hineus([*arguments, "--json"])
+    stages = tuple(
+        StageCost(
+            stage["name"],
+            round(stage["wall_s"], 2),
+            round(stage["cpu_s"], 2),
+            int(stage["peak_rss"]),
+            {key: value for key, value in stage["numbers"].items() if isinstance(value, (bool, int, float, str))},
+        )
+        for stage in answer["stages"]
+    )
+    folder = Path(answer["workspace"])
+    glb = Path(answer["glb"])
+    contact_sheet(folder, OUT / f"{name}.png")
+    return Result(name, shown, machine(), stages, _score(folder, truth), validate(glb), glb.stat().st_size)
+
+
+def _hineus(arguments: Sequence[str]) -> dict[str, Any]:
+    command = [sys.executable, "-m", "hineus_cli", *arguments]
+    done = subprocess.run(command, cwd=ROOT, stdout=subprocess.PIPE, text=True, check=False)
+    if done.returncode != 0:
+        raise RuntimeError(f"{' '.join(arguments)} ended with {done.returncode}: {done.stdout[-2000:]}")
+    return json.loads(done.stdout)
+
+
+def _score(workspace: Path, truth: Path | None) -> dict[str, float] | None:
+    from hineus_cli.scoring import has_truth, score_mesh
+    from stages import artifacts
+
+    if truth is None or not has_truth(truth):
+        return None
+    return score_mesh(artifacts.ply_path(workspace / "export"), artifacts.model_path(workspace / "sfm"), truth)
+
+
+def validate(glb: Path) -> dict[str, int] | None:
+    """Errors, warnings, infos, hints that the glTF validator finds; None without Node.js or the package."""
+    if shutil.which("node") is None:
+        return None
+    done = subprocess.run(
+        ["node", str(VALIDATOR), str(glb)], cwd=VALIDATOR.parent, capture_output=True, text=True, check=False
+    )
+    try:
+        report = json.loads(done.stdout)
+    except ValueError:
+        print(f"the glTF validator did not run: {done.stderr.strip()[-300:]}", file=sys.stderr)
+        return None
+    issues = report.get("issues", report)
+    return {name: int(issues[key]) for name, key in VALIDATOR_COUNTS.items() if key in issues}
+
+
+VALIDATOR_COUNTS = {"errors": "numErrors", "warnings": "numWarnings", "infos": "numInfos", "hints": "numHints"}
+
+
+def contact_sheet(workspace: Path, path: Path) -> None:
+    """Four sides of the textured mesh, and under them the bare geometry."""
+    import numpy as np
+    from PIL import Image
+
+    from stages import artifacts
+    from stages.meshing.rendering import render_textured, turntable
+
+    atlas = artifacts.load_atlas(workspace / "atlas")
+    scene = artifacts.load_scene(workspace / "undistort")
+    with Image.open(artifacts.base_color_path(workspace / "bake")) as image:
+        texture = np.asarray(image.convert("RGB"))
+    grey = np.full((1, 1, 3), 200, np.uint8)
+    rows = []
+    for colors, normals in ((texture, None), (grey, atlas.normals)):
+        views = turntable(atlas.vertices, scene.up)
+        rows.append(
+            np.hstack(
+                [render_textured(atlas.vertices, atlas.faces, atlas.uvs, colors, view, normals) for view in views]
+            )
+        )
+    Image.fromarray(np.vstack(rows)).save(path)
+
+
+def machine() -> dict[str, str]:
+    """What the figures were measured on."""
+    from importlib.metadata import version
+
+    cpu = platform.processor()
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+        cpu = next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
+    except (OSError, StopIteration):
+        pass
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return {
+        "cpu": cpu,
+        "cores": str(cores),
+        "python": platform.python_version(),
+        **{name: version(name) for name in ("hineus", "torch", "pycolmap", "open3d")},
+    }
+
+
+# ---------------------------------------------------------------- result files
+def save_result(result: Result) -> None:
+    RESULTS.mkdir(parents=True, exist_ok=True)
+    text = json.dumps(asdict(result), indent=1, allow_nan=False)
+    (RESULTS / f"{result.name}.json").write_text(text + "\n", encoding="utf-8")
+
+
+def load_results(folder: Path = RESULTS) -> list[Result]:
+    """All results there are, the demo first, then by name."""
+    results = []
+    for path in folder.glob("*.json"):
+        data = json.loads(path.read_text(encoding="utf-8"))
+        data["stages"] = tuple(StageCost(**stage) for stage in data["stages"])
+        results.append(Result(**data))
+    return sorted(results, key=lambda result: (result.name != DEMO, result.name))
+
+
+# ---------------------------------------------------------------- tables
+def summary_table(results: Sequence[Result]) -> str:
+    """One row a set: what was registered, what it cost, how far it is from the truth."""
+    header = [
+        "set", "photos registered", "wall min", "CPU min", "peak GiB", "faces", "GLB MB",
+        "distance %", "accuracy %", "completeness %", "F at 1 %", "glTF errors / warnings",
+    ]  # fmt: skip
+    rows = [
+        [
+            result.name,
+            f"{_text(result.number('sfm', 'registered'))} of {_text(result.number('sfm', 'images'))}",
+            f"{result.wall_s / 60:.1f}",
+            f"{result.cpu_s / 60:.1f}",
+            f"{result.peak_rss / GIB:.2f}",
+            _text(result.number("cleanup", "faces")),
+            f"{result.glb_bytes / 1e6:.1f}",
+            *(_score_cell(result, name) for name in ("mean", "accuracy", "completeness", "f_one_percent")),
+            f"{result.validator['errors']} / {result.validator['warnings']}" if result.validator else "-",
+        ]
+        for result in results
+    ]
+    return _markdown(header, rows)
+
+
+def stage_table(results: Sequence[Result]) -> str:
+    """Wall and CPU seconds of each stage, one column a set."""
+    names = list(dict.fromkeys(stage.name for result in results for stage in result.stages))
+    costs = [{stage.name: stage for stage in result.stages} for result in results]
+    rows = [
+        [name, *(f"{cost[name].wall_s:.1f} / {cost[name].cpu_s:.1f}" if name in cost else "-" for cost in costs)]
+        for name in names
+    ]
+    rows.append(["all", *(f"{result.wall_s:.0f} / {result.cpu_s:.0f}" for result in results)])
+    return _markdown(["stage", *(result.name for result in results)], rows)
+
+
+def memory_table(results: Sequence[Result]) -> str:
+    """Peak memory of each stage in GiB, one column a set."""
+    names = list(dict.fromkeys(stage.name for result in results for stage in result.stages))
+    costs = [{stage.name: stage for stage in result.stages} for result in results]
+    rows = [[name, *(f"{cost[name].peak_rss / GIB:.2f}" if name in cost else "-" for cost in costs)] for name in names]
+    return _markdown(["stage", *(result.name for result in results)], rows)
+
+
+def texture_table(results: Sequence[Result]) -> str:
+    """What the bake stage says of its texture."""
+    names = list(
+        dict.fromkeys(
+            name
+            for result in results
+            for stage in result.stages
+            if stage.name == "bake"
+            for name, value in stage.numbers.items()
+            if isinstance(value, (int, float)) and not isinstance(value, bool)
+        )
+    )
+    rows = [[name.replace("_", " "), *(_text(result.number("bake", name)) for result in results)] for name in names]
+    return _markdown(["texture", *(result.name for result in results)], rows)
+
+
+TABLES = {"summary": summary_table, "stages": stage_table, "memory": memory_table, "texture": texture_table}
+
+
+def with_tables(page: str, results: Sequence[Result]) -> str:
+    """The page with every table between its markers `<!-- table NAME -->` and `<!-- end NAME -->` made anew.
+
+    Raises:
+        ValueError: a marker is missing.
+    """
+    for name, table in TABLES.items():
+        begin, end = f"<!-- table {name} -->", f"<!-- end {name} -->"
+        if page.count(begin) != 1 or page.count(end) != 1:
+            raise ValueError(f"the markers {begin} and {end} are expected once each")
+        before, rest = page.split(begin)
+        after = rest.split(end)[1]
+        body = table(results) if results else "Not measured yet."
+        page = f"{before}{begin}\n{body}\n{end}{after}"
+    return page
+
+
+def _markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    lines = [header, ["---"] + ["---:"] * (len(header) - 1), *rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def _score_cell(result: Result, name: str) -> str:
+    return f"{result.score[name]:.2f}" if result.score else "-"
+
+
+def _text(value: Any) -> str:
+    if value is None:
+        return "-"
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("data", type=Path, nargs="?", help="folder of sets")
+    parser.add_argument("sets", nargs="*", help="names of sets; default: all")
+    parser.add_argument("--demo", action="store_true", help="run the demo, too")
+    parser.add_argument("--again", action="store_true", help="also sets that have a result")
+    parser.add_argument("--table-only", action="store_true", help="run nothing")
+    arguments = parser.parse_args()
+    jobs: list[tuple[str, Path | None]] = [(DEMO, None)] if arguments.demo else []
+    if arguments.data is not None and not arguments.table_only:
+        jobs += [(name, arguments.data.resolve()) for name in find_sets(arguments.data, arguments.sets)]
+    if not jobs and not arguments.table_only:
+        parser.error("name a folder of sets, or --demo, or --table-only")
+    failed = []
+    for name, data in [] if arguments.table_only else jobs:
+        if (RESULTS / f"{name}.json").exists() and not arguments.again:
+            print(f"{name}: has a result (--again measures it anew)", file=sys.stderr)
+            continue
+        print(f"{name}: running", file=sys.stderr)
+        try:
+            save_result(run_set(name, data))
+        except RuntimeError as error:
+            print(f"{name}: {error}", file=sys.stderr)
+            failed.append(name)
+    PAGE.write_text(with_tables(PAGE.read_text(encoding="utf-8"), load_results()), encoding="utf-8")
+    return 1 if failed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
