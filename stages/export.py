@@ -10,6 +10,7 @@ import numpy as np
 from stages import artifacts
 from stages.engine.stage import Stage, StageContext
 from stages.errors import ReconstructionError
+from stages.geometry.orientation import y_up_rotation
 from stages.geometry.similarity import Similarity
 
 
@@ -60,17 +61,6 @@ def run(context: StageContext) -> dict[str, Any]:
             f"The mesh cannot be exported: {error}.", "Rebuild it: `hineus run PHOTOS --from cleanup`."
         ) from error
     return {**numbers, "bytes": sizes}
-
-
-def y_up_rotation(up: np.ndarray) -> np.ndarray:
-    """The smallest proper rotation [3, 3] that turns the unit vector `up` to +Y (glTF's up)."""
-    target = np.array([0.0, 1.0, 0.0])
-    up = up / np.linalg.norm(up)
-    axis, cos = np.cross(up, target), float(up @ target)
-    if cos < -1 + 1e-9:  # upside down: half a turn about X
-        return np.diag([1.0, -1.0, -1.0])
-    skew = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
-    return np.eye(3) + skew + skew @ skew / (1 + cos)
 
 
 def unit_normals(vertices: np.ndarray, normals: np.ndarray, faces: np.ndarray) -> np.ndarray:

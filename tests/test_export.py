@@ -19,8 +19,9 @@ from stages import artifacts
 from stages.artifacts import AtlasMesh
 from stages.engine.stage import StageContext
 from stages.errors import ReconstructionError
-from stages.export import EXPORT, unit_normals, y_up_rotation
+from stages.export import EXPORT, unit_normals
 from stages.geometry.cameras import PinholeCameras, PosedScene
+from stages.geometry.orientation import y_up_rotation
 from stages.geometry.similarity import Similarity
 from stages.meshing.writing import glb_bytes, obj_text, ply_bytes
 

@@ -43,7 +43,7 @@ def choose_labels(
     pairs = pairs[seen[pairs[:, 0]] & seen[pairs[:, 1]]]
     rng = np.random.default_rng(seed)
     for _ in range(passes):
-        first: np.ndarray = rng.random(num_faces) < 0.5
+        first: np.ndarray = rng.random((num_faces,)) < 0.5
         changed = 0
         for moving in (first, ~first):
             active = pairs[moving[pairs[:, 0]]]

@@ -1,0 +1,264 @@
+"""The report: one self-contained page, whatever an earlier stage left behind."""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+import shutil
+import subprocess
+import xml.etree.ElementTree as ET
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from configs.params import ReportParams
+from stages import artifacts
+from stages.artifacts import AtlasMesh, ImageRecord, ImageSet, SkippedImage
+from stages.bake import write_png
+from stages.engine.stage import StageContext
+from stages.geometry.cameras import PinholeCameras, PosedScene
+from stages.geometry.orientation import y_up_rotation
+from stages.geometry.similarity import Similarity
+from stages.report import REPORT, draw_stills, duration, line_chart, pack_viewer
+
+ROOT = Path(__file__).parents[1]
+UP = np.array([0.0, 0, 1])
+
+
+def pyramid() -> AtlasMesh:
+    vertices = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0], [0, 0, 1.5]]) * 0.5
+    faces = np.array([[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]], np.int32)
+    normals = vertices / np.linalg.norm(vertices, axis=1, keepdims=True)
+    uvs = np.array([[0.1, 0.1], [0.9, 0.1], [0.9, 0.9], [0.1, 0.9], [0.5, 0.5]])
+    return AtlasMesh(vertices.astype(np.float32), normals.astype(np.float32), uvs.astype(np.float32), faces, 16)
+
+
+def manifest(stage: str, **numbers) -> str:
+    return json.dumps(
+        {
+            "stage": stage, "version": 1, "params": {"speed": 3}, "numbers": numbers, "wall_s": 75.0, "cpu_s": 100.5,
+            "peak_rss": 2**30, "versions": {"hineus": "0.1.0"}, "created": "2024-01-01T00:00:00+00:00",
+        }
+    )  # fmt: skip
+
+
+@pytest.fixture
+def context(tmp_path) -> StageContext:
+    """The bare minimum: a scene, an atlas and a texture."""
+    folders = {name: tmp_path / name for name in (*REPORT.needs, "out", "scratch")}
+    for folder in folders.values():
+        folder.mkdir()
+    pose = np.concatenate([np.eye(3), [[0], [0], [3]]], 1)[None]
+    cameras = PinholeCameras(("a.png",), np.array([[8, 8]]), np.eye(3)[None], pose)
+    scene = PosedScene(cameras, Similarity.identity(), np.zeros((1, 3)), np.zeros(1), np.zeros((1, 2)), UP)
+    artifacts.save_scene(folders["undistort"], scene)
+    artifacts.save_atlas(folders["atlas"], pyramid())
+    texture = np.zeros((16, 16, 3), np.uint8)
+    texture[:8], texture[8:] = (230, 40, 40), (40, 70, 220)
+    write_png(artifacts.base_color_path(folders["bake"]), texture)
+    return StageContext(
+        inputs={name: folders[name] for name in REPORT.needs},
+        sources={},
+        out=folders["out"],
+        scratch=folders["scratch"],
+        params=ReportParams(),
+    )
+
+
+@pytest.fixture
+def full(context) -> StageContext:
+    """Every stage left all it can."""
+    inputs = context.inputs
+    records = []
+    for name in ("a.png", "b <odd>.png", "c.png"):
+        path = artifacts.image_path(inputs["ingest"], name)
+        path.parent.mkdir(exist_ok=True)
+        write_png(path, np.full((30, 40, 3), 120, np.uint8))
+        records.append(ImageRecord(name, name, 40, 30, None, "0", 5.0, False, "00"))
+    skipped = (SkippedImage("notes.txt", "not an image"),)
+    artifacts.save_image_set(inputs["ingest"], ImageSet(tuple(records), skipped))
+    artifacts.save_registration(
+        inputs["sfm"],
+        {
+            "registered": ["a.png", "c.png"],
+            "unregistered": [{"name": "b <odd>.png", "reason": "only 3 matches"}],
+        },
+    )
+    lines = [{"step": 10 * i, "psnr": 10 + i, "loss": 0.5 / (i + 1), "rgb": None} for i in range(50)]
+    text = "\n".join(json.dumps(line) for line in lines) + '\n{"step": 500, "psn'
+    artifacts.metrics_path(inputs["train"]).write_text(text)
+    preview = artifacts.preview_path(inputs["train"], 100)
+    preview.parent.mkdir()
+    write_png(preview, np.full((20, 20, 3), 90, np.uint8))
+    kinds = np.zeros((16, 16), np.uint8)
+    kinds[:4, :12], kinds[4:8, :4] = 255, 128
+    write_png(artifacts.provenance_path(inputs["bake"]), kinds)
+    for stage in REPORT.needs:
+        (inputs[stage] / "manifest.json").write_text(manifest(stage, faces=1234, share=0.123456))
+    return context
+
+
+class Links(HTMLParser):
+    """Collects what a page refers to, and checks that its tags close."""
+
+    VOID = frozenset({"meta", "img", "br"})
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.links: list[str] = []
+        self.open: list[str] = []
+
+    def handle_starttag(self, tag, attrs):
+        self.links += [value for key, value in attrs if key in ("src", "href")]
+        if tag not in self.VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attrs):
+        self.links += [value for key, value in attrs if key in ("src", "href")]
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+
+def page(context: StageContext) -> str:
+    numbers = REPORT.run(context)
+    path = artifacts.report_path(context.out)
+    assert numbers["bytes"] == path.stat().st_size
+    return path.read_text(encoding="utf-8")
+
+
+def parsed(html: str) -> Links:
+    links = Links()
+    links.feed(html)
+    assert links.open == []
+    return links
+
+
+def test_the_page_says_it_all_and_refers_to_nothing_outside(full):
+    html = page(full)
+    links = parsed(html).links
+    assert len(links) >= 8 + 2 + 1 + 3
+    assert all(link.startswith("data:image/") for link in links)
+    assert not re.search(r"https?://", html)
+    for text in (
+        "only 3 matches",
+        "2 of 3 photos were placed",
+        "b &lt;odd&gt;.png",
+        "notes.txt: not an image",
+        "1 min 15 s",
+        "1.00 GB",
+        "faces 1,234",
+        "share 0.1235",
+        "preview at step 100",
+        "&#34;speed&#34;: 3",
+        "hineus 0.1.0",
+        "75.0 %",
+    ):
+        assert text in html, text
+    assert html.count("<polyline") == 2  # psnr and loss; rgb is never a number
+
+
+def test_photos_left_out_come_first_and_the_number_is_capped(full):
+    html = page(StageContext(full.inputs, {}, full.out, full.scratch, ReportParams(thumbnails=1)))
+    shown = html[html.index('class="thumbs"') :]
+    assert shown.count("<figure") == 1
+    assert "only 3 matches" in shown
+    assert "The first 1 are shown" in html
+
+
+def test_a_report_from_almost_nothing(context):
+    html = page(context)
+    parsed(html)
+    assert "<h2>The model</h2>" in html
+    assert "<h2>Stages</h2>" not in html
+    assert "<h2>Photos</h2>" not in html
+    assert "<h2>Training</h2>" not in html
+
+
+def test_damaged_inputs_are_left_out(full):
+    (full.inputs["train"] / "manifest.json").write_text("{")
+    artifacts.image_path(full.inputs["ingest"], "c.png").write_text("not an image")
+    artifacts.provenance_path(full.inputs["bake"]).write_text("not an image")
+    html = page(full)
+    assert "<td>train</td>" not in html
+    assert "<td>sfm</td>" in html
+    assert "Where each texel comes from" not in html
+
+
+def test_the_viewer_gets_the_mesh_y_up():
+    atlas = pyramid()
+    packed = pack_viewer(atlas, np.zeros((16, 16, 3), np.uint8), UP)
+
+    def decode(key, kind, columns):
+        return np.frombuffer(base64.b64decode(packed[key]), kind).reshape(-1, columns)
+
+    positions = packed["low"] + decode("positions", "<u2", 3) / 65535 * packed["size"]
+    np.testing.assert_allclose(positions, atlas.vertices @ y_up_rotation(UP).T, atol=1e-4)
+    assert positions[4].argmax() == 1  # the tip points along +Y
+    np.testing.assert_array_equal(decode("faces", "<u4", 3), atlas.faces)
+    uvs = decode("uvs", "<u2", 2) / 65535
+    np.testing.assert_allclose(uvs[:, 1], 1 - atlas.uvs[:, 1], atol=1e-4)  # images start at the top
+    normals = decode("normals", np.int8, 3) / 127
+    np.testing.assert_allclose(normals, atlas.normals @ y_up_rotation(UP).T, atol=5e-3)
+
+
+def test_stills_show_texture_then_shape():
+    texture = np.zeros((16, 16, 3), np.uint8)
+    texture[:] = (230, 40, 40)
+    stills = draw_stills(pyramid(), texture, UP)
+    assert len(stills) == 8
+    for still in stills[:4]:
+        assert ((still == (230, 40, 40)).all(2)).mean() > 0.05
+    for still in stills[4:]:
+        drawn = still[(still < 250).all(2)]
+        assert len(drawn) > 0.05 * still.shape[0] ** 2
+        assert np.ptp(drawn.astype(int), axis=1).max() <= 1  # grey
+
+
+def test_chart_runs_from_corner_to_corner():
+    root = ET.fromstring(line_chart([(0, 1.0), (50, 2.0), (100, 3.0)], 420, 180))
+    points = [tuple(map(float, p.split(","))) for p in root.find("polyline").get("points").split()]
+    assert points[0] == (52, 158)
+    assert points[-1] == (412, 8)
+    assert points[1] == (232, 83)
+
+
+def test_chart_of_a_constant_and_of_decades():
+    assert "nan" not in line_chart([(0, 1.0), (1, 1.0)])
+    assert ">log<" in line_chart([(0, 1.0), (1, 0.001)])
+    assert ">log<" not in line_chart([(0, 1.0), (1, -1.0)])
+
+
+def test_durations_are_readable():
+    assert [duration(s) for s in (None, 3.21, 61)] == ["-", "3.2 s", "1 min 01 s"]
+
+
+@pytest.mark.slow
+def test_the_page_works_in_a_browser(full):
+    """What headless Chromium shows above the fold: the model, drawn by the page's own script."""
+    import cv2
+
+    browser = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+    if not browser:
+        pytest.skip("needs Chromium")
+    page(full)
+    screenshot = full.scratch / "page.png"
+    done = subprocess.run(
+        [
+            browser, "--headless=new", "--no-sandbox", "--disable-dev-shm-usage", "--enable-unsafe-swiftshader",
+            "--use-gl=angle", "--use-angle=swiftshader", f"--user-data-dir={full.scratch / 'profile'}",
+            "--window-size=900,640", "--virtual-time-budget=5000", f"--screenshot={screenshot}",
+            artifacts.report_path(full.out).as_uri(),
+        ],
+        capture_output=True,
+        text=True,
+        timeout=90,
+        check=False,
+    )  # fmt: skip
+    assert screenshot.exists(), done.stderr[-2000:]
+    blue, green, red = cv2.imread(str(screenshot)).astype(int).transpose(2, 0, 1)
+    assert ((red > 180) & (green < 90) & (blue < 90)).sum() > 2000
+    assert ((blue > 180) & (green < 110) & (red < 90)).sum() > 2000
