@@ -359,18 +359,17 @@ def demo(
     verbose: Verbose = False,
 ) -> None:
     """Make photos of a known object, reconstruct it, and score the result against the truth."""
-    from hineus_cli.console import key_numbers, people, set_up_logging, stdout_kept_clean
-    from hineus_cli.demo import run_demo
+    from hineus_cli.console import set_up_logging, stdout_kept_clean
+    from hineus_cli.demo import WORKSPACE, run_demo
 
     session: Session = context.obj
     session.json = as_json
+    session.log_path = folder.absolute() / WORKSPACE / "hineus.log"
     set_up_logging(verbose)
     with stdout_kept_clean() if as_json else nullcontext():
         result = run_demo(folder=folder, preset=preset, device=device, workers=workers)
     if as_json:
         typer.echo(json.dumps({"ok": True, **result}, default=str))
-    else:
-        people().print(key_numbers(result), markup=False)
 
 
 # ---------------------------------------------------------------- the table of commands

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from stages.engine.status import StageStatus
 
 OURS = ("hineus_cli", "stages", "configs")
+CONSOLE_HANDLER = "hineus-console"
 TRACEBACKS = "hineus_cli.tracebacks"  # the logger whose records go to the log file only
 
 PLAIN_WIDTH = 160  # columns where the output is a pipe or a file
@@ -58,11 +59,18 @@ def set_up_logging(verbose: bool = False) -> None:
     """Warnings of everybody and what our stages say go to stderr; `verbose` adds our debug lines."""
     from rich.logging import RichHandler
 
-    handler = RichHandler(console=people(), show_time=False, show_path=False, markup=False, rich_tracebacks=False)
+    console = people()
+    handler: logging.Handler
+    if console.is_terminal:
+        handler = RichHandler(console=console, show_time=False, show_path=False, markup=False)
+    else:
+        handler = logging.StreamHandler(sys.stderr)
+        handler.setFormatter(logging.Formatter("%(levelname)s: %(message)s"))
+    handler.name = CONSOLE_HANDLER
     handler.setLevel(logging.DEBUG if verbose else logging.INFO)
     handler.addFilter(lambda record: record.name != TRACEBACKS)
     root = logging.getLogger()
-    for old in [old for old in root.handlers if isinstance(old, RichHandler)]:
+    for old in [old for old in root.handlers if old.name == CONSOLE_HANDLER]:
         root.removeHandler(old)
     root.addHandler(handler)
     root.setLevel(logging.WARNING)
@@ -70,10 +78,17 @@ def set_up_logging(verbose: bool = False) -> None:
         logging.getLogger(name).setLevel(logging.DEBUG)
 
 
+class _LogFile(logging.FileHandler):
+    """A log that cannot be written (the disk is full) is no reason to hide the error that says so."""
+
+    def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802 - the name is logging's
+        """Go on without this record."""
+
+
 @contextlib.contextmanager
 def log_to_file(path: Path) -> Iterator[None]:
     """Everything that is logged inside goes to `path`, too, and the traceback of what is raised."""
-    handler = logging.FileHandler(path, encoding="utf-8")
+    handler = _LogFile(path, encoding="utf-8")
     handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
     root = logging.getLogger()
     root.addHandler(handler)
@@ -84,7 +99,8 @@ def log_to_file(path: Path) -> Iterator[None]:
         raise
     finally:
         root.removeHandler(handler)
-        handler.close()
+        with contextlib.suppress(OSError):
+            handler.close()
 
 
 @contextlib.contextmanager

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
-from pydantic import BaseModel
+if TYPE_CHECKING:  # pydantic takes a tenth of a second that `hineus --help` need not wait for
+    from pydantic import BaseModel
 
 
 class Progress(Protocol):

@@ -187,7 +187,7 @@ class Workspace:
         return load_manifest(self.stage_folder(stage))
 
     def recover(self, stage: str) -> None:
-        """Complete a publication that a crash cut off; needs the lock."""
+        """Complete a publication that a crash cut off, drop what a killed stage had written; needs the lock."""
         work, final = self.work_folder(stage), self.stage_folder(stage)
         out, old = work / "out", work / "old"
         with storage_errors(self.root, f"recovering '{stage}'"):
@@ -196,6 +196,7 @@ class Workspace:
             elif old.exists() and not final.exists():
                 old.rename(final)
             _remove(old)
+            _remove(out)
 
     def begin(self, stage: str, fingerprint: str) -> tuple[Path, Path]:
         """An empty `out` folder, and the scratch folder, emptied unless it is of this fingerprint."""
