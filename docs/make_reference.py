@@ -1,0 +1,114 @@
+"""Write docs/reference.md from the code: every command, every setting, every preset, every exit code.
+
+python docs/make_reference.py
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import typer.main
+
+from configs.load import Setting, describe_settings, preset_names, preset_summary, preset_text
+from configs.params import Config
+from hineus_cli.app import app
+from stages import errors
+from stages.errors import HineusError
+
+PAGE = Path(__file__).parent / "reference.md"
+
+HEAD = """# Reference
+
+Made by `python docs/make_reference.py` from the code; a test fails when it is out of date. Do not edit.
+"""
+
+
+def page() -> str:
+    """The whole page."""
+    return "\n".join([HEAD, *_commands(), *_settings(), *_presets(), *_exit_codes()]).rstrip() + "\n"
+
+
+def _commands() -> Iterator[str]:
+    yield "## Commands\n"
+    group: Any = typer.main.get_command(app)
+    for name, command in group.commands.items():
+        yield f"### hineus {name}\n"
+        yield f"{inspect.cleandoc(command.help or '')}\n"
+        if not command.params:
+            continue
+        yield _row("parameter", "meaning", "default")
+        yield _row("---", "---", "---")
+        for parameter in command.params:
+            yield _row(_spelling(parameter), parameter.help or "", _default(parameter))
+        yield ""
+
+
+def _spelling(parameter: Any) -> str:
+    if parameter.param_type_name == "argument":
+        return f"`{parameter.name.upper()}`"
+    names = ", ".join(f"`{name}`" for name in parameter.opts)
+    return names if parameter.is_flag else f"{names} VALUE"
+
+
+def _default(parameter: Any) -> str:
+    if parameter.default in (None, False) or callable(parameter.default):
+        return ""
+    return f"`{parameter.default}`"
+
+
+def _settings() -> Iterator[str]:
+    yield "## Settings\n"
+    yield (
+        "Set them with `--set section.key=value`, or in a YAML file given with `--config`. The order is:\n"
+        "defaults, then the preset, then the file, then `--set`.\n"
+    )
+    settings = describe_settings()
+    for section, field in Config.model_fields.items():
+        yield f"### {section}\n"
+        yield f"{inspect.cleandoc(field.annotation.__doc__ or '').splitlines()[0]}\n"
+        yield _row("setting", "values", "bounds", "default", "meaning")
+        yield _row("---", "---", "---", "---", "---")
+        for setting in settings:
+            if setting.key.split(".")[0] == section:
+                yield _setting_row(setting)
+        yield ""
+
+
+def _setting_row(setting: Setting) -> str:
+    default = "none" if setting.default is None else f"`{_plain(setting.default)}`"
+    return _row(f"`{setting.key}`", setting.type, setting.bounds, default, setting.description)
+
+
+def _plain(value: Any) -> str:
+    return ", ".join(str(each) for each in value) if isinstance(value, tuple) else str(value)
+
+
+def _presets() -> Iterator[str]:
+    yield "## Presets\n"
+    for name in preset_names():
+        yield f"### {name}\n"
+        yield f"{preset_summary(name)}\n"
+        yield f"```yaml\n{preset_text(name).split(chr(10), 1)[1].strip()}\n```\n"
+
+
+def _exit_codes() -> Iterator[str]:
+    yield "## Exit codes\n"
+    yield _row("code", "meaning")
+    yield _row("---", "---")
+    yield _row("0", "All went well.")
+    kinds = [kind for kind in vars(errors).values() if inspect.isclass(kind) and issubclass(kind, HineusError)]
+    for kind in sorted(kinds, key=lambda kind: kind.exit_code):
+        meaning = "An error that nobody foresaw." if kind is HineusError else inspect.cleandoc(kind.__doc__ or "")
+        yield _row(str(kind.exit_code), meaning)
+    yield _row("130", "Stopped by Ctrl-C.")
+
+
+def _row(*cells: str) -> str:
+    return f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |"
+
+
+if __name__ == "__main__":
+    PAGE.write_text(page(), encoding="utf-8")

@@ -1,0 +1,49 @@
+"""Who may import whom, and what `hineus --help` may import."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+HEAVY = ("torch", "open3d", "pycolmap", "cv2", "trimesh", "pymeshlab", "numba", "xatlas", "scipy", "PIL", "jinja2")
+
+
+def test_import_contracts_hold():
+    pytest.importorskip("importlinter")
+    done = subprocess.run(
+        [sys.executable, "-c", "from importlinter.cli import lint_imports_command; lint_imports_command()"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert " 0 broken" in done.stdout
+
+
+def test_the_command_line_loads_nothing_heavy():
+    script = f"import hineus_cli.app, sys; print([name for name in {HEAVY!r} if name in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_no_drawer_modules():
+    """A module is named after what it does."""
+    names = {path.stem for folder in ("hineus_cli", "stages", "configs") for path in (ROOT / folder).rglob("*.py")}
+    assert not names & {"utils", "common", "helpers", "misc"}
+
+
+def test_stages_do_not_import_each_other():
+    """import-linter allows siblings in one layer only where they are independent; this says it in plain words."""
+    from stages.pipeline import PIPELINE
+
+    names = [stage.name for stage in PIPELINE]
+    for name in names:
+        source = (ROOT / "stages" / f"{name}.py").read_text(encoding="utf-8")
+        for other in set(names) - {name}:
+            assert f"from stages.{other} " not in source
+            assert f"import stages.{other}\n" not in source

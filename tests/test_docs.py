@@ -1,0 +1,182 @@
+"""The documentation is held against the code."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import re
+import sys
+from pathlib import Path
+
+import pytest
+import typer.main
+
+from configs.load import describe_settings, load_config, preset_names
+from configs.params import Config
+
+ROOT = Path(__file__).parent.parent
+DOCS = ROOT / "docs"
+PAGES = sorted([*ROOT.glob("*.md"), *DOCS.rglob("*.md")])
+
+
+def _commands():
+    from hineus_cli.app import app
+
+    return typer.main.get_command(app).commands
+
+
+def _make_reference():
+    spec = importlib.util.spec_from_file_location("make_reference", DOCS / "make_reference.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+# ---------------------------------------------------------------- reference
+def test_reference_is_up_to_date():
+    written = (DOCS / "reference.md").read_text(encoding="utf-8")
+    assert written == _make_reference().page(), "run `make docs`"
+
+
+def test_every_setting_is_in_the_reference_with_a_description():
+    written = (DOCS / "reference.md").read_text(encoding="utf-8")
+    settings = describe_settings()
+    assert len(settings) > 40
+    for setting in settings:
+        assert f"| `{setting.key}` |" in written
+        assert len(setting.description) > 5, f"{setting.key} has no description"
+
+
+def test_every_command_and_option_says_what_it_does():
+    written = (DOCS / "reference.md").read_text(encoding="utf-8")
+    commands = _commands()
+    assert {"run", "status", "doctor", "demo", "ingest", "train", "report"} <= set(commands)
+    for name, command in commands.items():
+        assert f"### hineus {name}\n" in written
+        assert command.help, f"hineus {name} has no help"
+        for parameter in command.params:
+            assert parameter.help, f"hineus {name} {parameter.name} has no help"
+
+
+@pytest.mark.parametrize("name", preset_names())
+def test_every_preset_is_valid_and_states_only_what_differs(name):
+    config = load_config(name)
+    assert f"### {name}\n" in (DOCS / "reference.md").read_text(encoding="utf-8")
+    import yaml
+
+    from configs.load import preset_text
+
+    stated = yaml.safe_load(preset_text(name)) or {}
+    assert isinstance(config, Config)
+    for section, values in stated.items():
+        assert values, f"section {section} of preset {name} is empty"
+
+
+# ---------------------------------------------------------------- math
+def _math_rows():
+    rows = []
+    for line in (DOCS / "math.md").read_text(encoding="utf-8").splitlines():
+        cells = [cell.strip() for cell in line.strip().strip("|").split("|")]
+        if line.startswith("|") and cells[0] not in ("equation", "---"):
+            rows.append(cells)
+    return rows
+
+
+@pytest.mark.parametrize("row", _math_rows(), ids=lambda row: row[0])
+def test_every_row_of_the_math_page_names_a_real_function(row):
+    assert len(row) == 5, f"five columns are expected: {row}"
+    found = re.fullmatch(r"`([\w.]+)`", row[1])
+    assert found, f"one function in backticks is expected: {row[1]}"
+    module, function = found[1].rsplit(".", 1)
+    assert callable(getattr(importlib.import_module(module), function))
+    assert all(row[2:]), f"an empty cell: {row}"
+
+
+def test_every_loss_has_a_row_on_the_math_page():
+    losses = importlib.import_module("stages.neural.losses")
+    named = {row[1].strip("`") for row in _math_rows()}
+    public = [
+        name
+        for name, value in vars(losses).items()
+        if callable(value) and not name.startswith("_") and value.__module__ == losses.__name__
+    ]
+    assert public
+    for name in public:
+        assert f"{losses.__name__}.{name}" in named
+
+
+# ---------------------------------------------------------------- benchmarks
+def test_every_table_of_the_benchmarks_has_its_command_above():
+    """Between a heading and its table stands the command that makes it."""
+    for section in (DOCS / "benchmarks.md").read_text(encoding="utf-8").split("\n## ")[1:]:
+        if "<!-- table" in section or "\n|" in section:
+            above = re.split(r"<!-- table|\n\|", section)[0]
+            assert re.search(r"```\n(.*\n)*?(python -m benchmarks|hineus|make) ?.*\n(.*\n)*?```", above), section[:80]
+
+
+def test_the_benchmark_tables_are_those_of_the_result_files():
+    from benchmarks.run_sets import load_results, with_tables
+
+    page = (DOCS / "benchmarks.md").read_text(encoding="utf-8")
+    assert page == with_tables(page, load_results()), "run `make docs`"
+
+
+# ---------------------------------------------------------------- all pages
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_links_between_pages_lead_somewhere(page):
+    for target in re.findall(r"\]\(([^)#\s]+)", page.read_text(encoding="utf-8")):
+        if not target.startswith(("http:", "https:")) and not target.endswith(".png"):
+            assert (page.parent / target).exists(), f"{page.name} links to {target}"
+
+
+def _shell_lines(page):
+    for block in re.findall(r"```\n(.*?)```", page.read_text(encoding="utf-8"), flags=re.S):
+        yield from block.splitlines()
+    yield from re.findall(r"`(hineus [^`]+)`", page.read_text(encoding="utf-8"))
+
+
+@pytest.mark.parametrize("page", [p for p in PAGES if p.name != "reference.md"], ids=lambda p: str(p.relative_to(ROOT)))
+def test_commands_on_the_pages_exist(page):
+    """Every `hineus ...` names a command and options it has; every --set names a setting and takes its value."""
+    commands = _commands()
+    for line in _shell_lines(page):
+        words = line.split("#")[0].split("|")[0].split()
+        if len(words) < 2 or words[0] != "hineus" or not words[1].isalpha():
+            continue
+        assert words[1] in commands, line
+        options = {option for parameter in commands[words[1]].params for option in parameter.opts}
+        for word in words[2:]:
+            if word.startswith("-"):
+                assert word in options, line
+
+
+@pytest.mark.parametrize("page", [p for p in PAGES if p.name != "reference.md"], ids=lambda p: str(p.relative_to(ROOT)))
+def test_settings_on_the_pages_are_valid(page):
+    for setting in re.findall(r"--set ([a-z_]+\.[a-z_]+=[^\s`)]+)", page.read_text(encoding="utf-8")):
+        load_config(sets=[setting])
+
+
+@pytest.mark.parametrize("page", [DOCS / "howto.md", ROOT / "README.md", DOCS / "tutorial.md"], ids=lambda p: p.name)
+def test_presets_and_settings_named_on_the_pages_exist(page):
+    text = page.read_text(encoding="utf-8")
+    keys = {setting.key for setting in describe_settings()}
+    sections = set(Config.model_fields)
+    for name in re.findall(r"--preset ([a-z]+)", text):
+        assert name in preset_names()
+    for key in re.findall(r"`([a-z]+\.[a-z_]+)`", text):
+        if key.split(".")[0] in sections:
+            assert key in keys
+
+
+def test_the_make_targets_on_the_pages_exist():
+    targets = set(re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), flags=re.M))
+    for page in PAGES:
+        for line in _shell_lines(page):
+            if found := re.match(r"make ([a-z]+)", line):
+                assert found[1] in targets, f"{page.name}: {line}"
+
+
+def test_the_reference_generator_is_importable_without_side_effects():
+    before = set(sys.modules)
+    _make_reference()
+    assert not {"torch", "open3d"} & (set(sys.modules) - before)
