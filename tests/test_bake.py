@@ -43,9 +43,7 @@ def quad(center, right, up, half, cells, cell_uv, atlas_cells):
     normals = np.broadcast_to(np.cross(right, up), vertices.shape)
     i = np.arange(cells)[:, None] * (cells + 1) + np.arange(cells)[None]
     i = i.ravel()
-    faces = np.concatenate(
-        [np.stack([i, i + 1, i + cells + 2], 1), np.stack([i, i + cells + 2, i + cells + 1], 1)]
-    )
+    faces = np.concatenate([np.stack([i, i + 1, i + cells + 2], 1), np.stack([i, i + cells + 2, i + cells + 1], 1)])
     return vertices, normals, uvs, faces
 
 
@@ -123,9 +121,7 @@ def ring(count=8, elevations=(0.5,), distance=2.6, side=160) -> PinholeCameras:
 
 
 def first(cameras: PinholeCameras) -> PinholeCameras:
-    return PinholeCameras(
-        cameras.names[:1], cameras.sizes[:1], cameras.intrinsics[:1], cameras.cam_from_scene[:1]
-    )
+    return PinholeCameras(cameras.names[:1], cameras.sizes[:1], cameras.intrinsics[:1], cameras.cam_from_scene[:1])
 
 
 def constant_field(points, normals, view_dirs):
@@ -308,10 +304,7 @@ def test_an_occluder_leaves_no_trace_behind_it():
     views = [look_at(np.array(e), np.zeros(3), Z, 160, 160, 40) for e in eyes]
     cameras = PinholeCameras(
         tuple(map(str, range(len(views)))),
-        *(
-            np.concatenate([getattr(v, key) for v in views])
-            for key in ("sizes", "intrinsics", "cam_from_scene")
-        ),
+        *(np.concatenate([getattr(v, key) for v in views]) for key in ("sizes", "intrinsics", "cam_from_scene")),
     )
     photos = [photograph(mesh, cameras, i, paint) for i in range(len(cameras))]
     result = bake(mesh, cameras, photos)
@@ -365,9 +358,7 @@ def test_pixels_outside_the_mask_are_not_used(capture):
     masks = [np.zeros(p.shape[:2], bool) for p in photos]
     masks[0][:] = True
     result = bake(mesh, cameras, photos, masks)
-    alone = bake(
-        mesh, PinholeCameras(*(getattr(cameras, k)[:1] for k in cameras.__dataclass_fields__)), photos[:1]
-    )
+    alone = bake(mesh, PinholeCameras(*(getattr(cameras, k)[:1] for k in cameras.__dataclass_fields__)), photos[:1])
     assert (result.provenance == alone.provenance).all()
     assert 0.05 < result.numbers["seen_share"] < 0.6
     assert result.numbers["mean_views"] == 1
@@ -400,6 +391,17 @@ def test_gains_ignore_a_minority_of_highlights():
     colors[:80, 0] = 240
     gains = solve_gains(colors, np.ones((400, 3)))
     np.testing.assert_allclose(gains, np.tile(true_gain[:, None], 3), rtol=0.02)
+
+
+def test_sheen_is_not_taken_for_gain():
+    """Photo 1 brightens half of its points, by up to 40 %: sheen. Photo 2 brightens all by 20 %: exposure."""
+    rng = np.random.default_rng(2)
+    colors = np.repeat(rng.uniform(40, 150, (500, 1, 1)), 6, axis=1).repeat(3, axis=2)
+    colors[:, 1] *= 1 + 0.8 * np.maximum(rng.random((500, 1)) - 0.5, 0)
+    colors[:, 2] *= 1.2
+    gains = solve_gains(colors, np.ones((500, 6)))
+    np.testing.assert_allclose(gains[2] / gains[0], 1 / 1.2, rtol=0.03)
+    np.testing.assert_allclose(gains[1] / gains[0], 1, atol=0.03)
 
 
 def test_labels_prefer_smoothness_over_a_slightly_better_photo():
@@ -456,9 +458,7 @@ def test_padding_fills_everything_and_leaves_charts_alone():
 def test_renderer_shows_the_texture(capture, baked):
     mesh, cameras, photos = capture
     one = PinholeCameras(*(getattr(cameras, k)[:1] for k in cameras.__dataclass_fields__))
-    picture = render_textured(
-        mesh.vertices, mesh.faces, mesh.uvs, baked.base_color, one, background=(255, 0, 255)
-    )
+    picture = render_textured(mesh.vertices, mesh.faces, mesh.uvs, baked.base_color, one, background=(255, 0, 255))
     assert np.median(np.abs(picture.astype(int) - photos[0])) <= 2
 
 

@@ -20,7 +20,7 @@ def solve_gains(colors: np.ndarray, weights: np.ndarray) -> np.ndarray:
     colours m.
 
     Per channel, by iteratively reweighted least squares (ρ: Geman-McClure) on the normal equations with m
-    eliminated, regularised to g = 1 and fixed to a geometric mean of 1.
+    eliminated, regularised to g = 1 and fixed to a geometric mean of 1; then shrunk to 1 by `trust`.
 
     Args:
         colors: [P, N, 3] colour of point p in photo i, 0..255.
@@ -56,10 +56,34 @@ def solve_gains(colors: np.ndarray, weights: np.ndarray) -> np.ndarray:
             robust = base / (1 + ((adjusted - center) / scale) ** 2) ** 2
             scale = max(ROBUST_SCALE, 0.6 * scale)
         seen = robust.sum(0) > 0
-        log_gains[seen] -= log_gains[seen].mean()
+        log_gains -= np.median(log_gains[seen])  # most photos share one exposure: judge the others against it
         log_gains[~seen] = 0
+        log_gains *= trust(log_gains, _spreads(logs + log_gains, base))
+        log_gains[seen] -= log_gains[seen].mean()
         gains[:, channel] = np.exp(np.clip(log_gains, -np.log(LIMIT), np.log(LIMIT)))
     return gains
+
+
+def trust(log_gains: np.ndarray, spreads: np.ndarray) -> np.ndarray:
+    """Part of each log gain to keep: g² / (g² + s²), s being the photo's residual spread once gains are
+    applied.
+
+    A change of exposure moves all of a photo's points alike: g stands out from s. Sheen moves them
+    differently,
+    by no more than their spread: it is not a gain and must not be "corrected".
+    """
+    return log_gains**2 / np.maximum(log_gains**2 + spreads**2, 1e-20)
+
+
+def _spreads(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """[N] robust standard deviation of each column's distance from its row's median."""
+    off = np.abs(values - _weighted_median(values, weights))
+    return np.array(
+        [
+            1.4826 * np.median(column[seen]) if seen.any() else 0.0
+            for column, seen in zip(off.T, weights.T > 0, strict=True)
+        ]
+    )
 
 
 def _weighted_median(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
