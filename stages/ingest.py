@@ -125,9 +125,7 @@ def _list_photos(folder: Path, masks_folder: Path | None) -> tuple[list[str], li
     if not folder.is_dir():
         raise InputError(f"{folder} is a file; a folder of photos is needed.", f"hineus run {folder.parent}")
     if masks_folder is not None and not masks_folder.is_dir():
-        raise InputError(
-            f"The mask folder {masks_folder} does not exist.", "Check the path given to --masks."
-        )
+        raise InputError(f"The mask folder {masks_folder} does not exist.", "Check the path given to --masks.")
     inside_masks = masks_folder.resolve() if masks_folder else None
     photos, skipped = [], []
     for path in sorted(folder.rglob("*")):
@@ -142,13 +140,9 @@ def _list_photos(folder: Path, masks_folder: Path | None) -> tuple[list[str], li
         elif suffix in VIDEO_SUFFIXES:
             skipped.append(SkippedImage(relative.as_posix(), "a video; extract frames from it first"))
         elif suffix in RAW_SUFFIXES:
-            skipped.append(
-                SkippedImage(relative.as_posix(), "a camera raw file; develop it to JPEG or TIFF first")
-            )
+            skipped.append(SkippedImage(relative.as_posix(), "a camera raw file; develop it to JPEG or TIFF first"))
         else:
-            skipped.append(
-                SkippedImage(relative.as_posix(), f"not an image ({suffix or 'no file extension'})")
-            )
+            skipped.append(SkippedImage(relative.as_posix(), f"not an image ({suffix or 'no file extension'})"))
     return photos, skipped
 
 
@@ -255,9 +249,7 @@ def _take_photo(
     unchanged = image is photo and photo.mode == "RGB" and not sixteen_bit and scale == 1.0
     keep = unchanged and file.suffix.lower() in COLMAP_SUFFIXES and photo.format != "WEBP"
     if scale < 1:
-        rgb = rgb.resize(
-            (max(1, round(width * scale)), max(1, round(height * scale))), Image.Resampling.LANCZOS
-        )
+        rgb = rgb.resize((max(1, round(width * scale)), max(1, round(height * scale))), Image.Resampling.LANCZOS)
     suffix = None if keep else _encoded_suffix(file, lossy)
     name = names.target(source, suffix)
 
@@ -424,9 +416,7 @@ def _read_mask(
             channel = image.convert("RGBA") if image.mode in ("RGBA", "LA", "PA") else None
             values = np.asarray(image.convert("L"))
     except Exception as error:  # Pillow's decoders raise nearly anything on a damaged file
-        raise InputError(
-            f"The mask {file} cannot be read ({error}).", "Write it again as an 8-bit PNG."
-        ) from error
+        raise InputError(f"The mask {file} cannot be read ({error}).", "Write it again as an 8-bit PNG.") from error
     if found != size:
         raise InputError(
             f"The mask {file.name} is {found[0]} x {found[1]} pixels, {photo} is {size[0]} x {size[1]}.",
@@ -445,9 +435,7 @@ def _write_mask(mask: np.ndarray, target: Path, size: tuple[int, int]) -> None:
 
     values = mask.astype(np.uint8) * 255
     if values.shape[::-1] != size:
-        values = np.where(cv2.resize(values, size, interpolation=cv2.INTER_AREA) > 127, 255, 0).astype(
-            np.uint8
-        )
+        values = np.where(cv2.resize(values, size, interpolation=cv2.INTER_AREA) > 127, 255, 0).astype(np.uint8)
     target.parent.mkdir(parents=True, exist_ok=True)
     from PIL import Image
 

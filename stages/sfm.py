@@ -12,7 +12,7 @@ from typing import Any
 from stages import artifacts
 from stages.artifacts import ImageSet
 from stages.engine.stage import Stage, StageContext
-from stages.errors import ReconstructionError
+from stages.errors import InputError, ReconstructionError
 
 log = logging.getLogger(__name__)
 
@@ -164,12 +164,17 @@ def _choose_matcher(params: Any, database_path: Path, num_images: int) -> str:
     """auto: all pairs of small sets, neighbours in space where most photos carry GPS, else in name."""
     import pycolmap
 
+    with pycolmap.Database.open(database_path) as database:
+        located = database.num_pose_priors()
+    if params.matcher == "spatial" and located == 0:
+        raise InputError(
+            f"None of the {num_images} photos carries a GPS position, which spatial matching needs.",
+            "Try `--set sfm.matcher=sequential`, or exhaustive.",
+        )
     if params.matcher != "auto":
         return params.matcher
     if num_images <= params.exhaustive_max:
         return "exhaustive"
-    with pycolmap.Database.open(database_path) as database:
-        located = database.num_pose_priors()
     return "spatial" if located > 0.9 * num_images else "sequential"
 
 

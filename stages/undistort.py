@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -187,9 +188,10 @@ def _write(path: Path, pixels: np.ndarray) -> None:
 def _png_names(names: list[str]) -> list[str]:
     """The names with .png as suffix; the whole name is kept where two would become one."""
     plain = [PurePosixPath(name).with_suffix(".png").as_posix() for name in names]
-    return [
-        short if plain.count(short) == 1 else f"{name}.png" for name, short in zip(names, plain, strict=True)
-    ]
+    # case-insensitive file systems must not merge two images
+    counts = Counter(short.lower() for short in plain)
+    mixed = [s if counts[s.lower()] == 1 else f"{name}.png" for name, s in zip(names, plain, strict=True)]
+    return mixed if len({name.lower() for name in mixed}) == len(names) else [f"{name}.png" for name in names]
 
 
 # ---------------------------------------------------------------- the scene

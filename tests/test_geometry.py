@@ -68,8 +68,6 @@ def test_similarity_inverse_compose_and_matrix_agree(seed: int, scale: float):
     first, second = similarity(seed, scale), similarity(seed + 100, 0.7)
     points = np.random.default_rng(seed).normal(size=(5, 3))
     np.testing.assert_allclose(first.inverse().apply(first.apply(points)), points, atol=1e-8)
-    np.testing.assert_allclose(
-        first.compose(second).apply(points), first.apply(second.apply(points)), atol=1e-8
-    )
+    np.testing.assert_allclose(first.compose(second).apply(points), first.apply(second.apply(points)), atol=1e-8)
     homogeneous = np.concatenate([points, np.ones((5, 1))], 1) @ first.matrix().T
     np.testing.assert_allclose(homogeneous[:, :3], first.apply(points), atol=1e-8)

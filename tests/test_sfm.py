@@ -1,0 +1,181 @@
+"""Poses: a small rendered capture against its true cameras, and the sentences for photos that give none."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from configs.params import SfmParams
+from stages import artifacts
+from stages.artifacts import ImageRecord, ImageSet
+from stages.engine.stage import StageContext
+from stages.errors import InputError, ReconstructionError
+from stages.sfm import SFM, _camera_params, _Evidence
+
+WIDTH, HEIGHT, FOCAL = 320, 240, 350.0
+BOX = np.array([0.5, 0.35, 0.45])  # half sides; it stands on the floor z = 0
+
+
+def texture(seed: int) -> np.ndarray:
+    """[256, 256] float32 grey with detail at all scales, so that SIFT finds corners at any distance."""
+    generator = np.random.default_rng(seed)
+    layers = [
+        cv2.resize(generator.uniform(0, 1, (n, n)).astype(np.float32), (256, 256), interpolation=cv2.INTER_CUBIC)
+        for n in (8, 16, 32, 64, 128)
+    ]
+    mixed = sum(layers) / len(layers)
+    return np.clip((mixed - 0.5) * 3 + 0.5, 0, 1) * 255
+
+
+TEXTURES = [texture(seed) for seed in range(4)]  # floor, and the faces across x, y, z
+
+
+def render(cam_from_world: np.ndarray, seed: int) -> np.ndarray:
+    """[H, W] uint8 photo of a printed box on a printed floor, by intersecting every pixel's ray, with noise."""
+    x, y = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
+    in_cam = np.stack([(x - WIDTH / 2) / FOCAL, (y - HEIGHT / 2) / FOCAL, np.ones_like(x)], -1).reshape(-1, 3)
+    rotation = cam_from_world[:, :3]
+    origin, rays = -rotation.T @ cam_from_world[:, 3], in_cam @ rotation
+    with np.errstate(divide="ignore"):
+        floor = np.where(rays[:, 2] < 0, -origin[2] / rays[:, 2], np.inf)
+        slabs = np.stack([(sign * BOX + [0, 0, BOX[2]] - origin) / rays for sign in (-1, 1)])
+    near, far = slabs.min(0), slabs.max(0)
+    axis, enter = near.argmax(1), near.max(1)
+    hits_box = (enter < far.min(1)) & (enter > 0) & (enter < floor)
+    distance = np.where(hits_box, enter, floor)
+    surface = np.where(hits_box, axis + 1, 0)
+    points = origin + np.where(np.isfinite(distance), distance, 0)[:, None] * rays
+    photo = np.full((HEIGHT, WIDTH), 128.0, np.float32)
+    across = {0: (0, 1), 1: (1, 2), 2: (0, 2), 3: (0, 1)}
+    for index, plane in across.items():
+        chosen = (surface == index) & np.isfinite(distance)
+        scale = 40.0 if index == 0 else 120.0  # texels a unit
+        at = np.where(chosen[:, None], points[:, plane] * scale, 0).astype(np.float32).reshape(HEIGHT, WIDTH, 2)
+        printed = cv2.remap(TEXTURES[index], at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
+        photo = np.where(chosen.reshape(HEIGHT, WIDTH), printed, photo)
+    noise = np.random.default_rng(seed).normal(0, 1.5, photo.shape)
+    return np.clip(photo + noise, 0, 255).astype(np.uint8)
+
+
+def look_at(center: np.ndarray, target: np.ndarray) -> np.ndarray:
+    z = (target - center) / np.linalg.norm(target - center)
+    x = np.cross(z, [0, 0, 1])
+    x /= np.linalg.norm(x)
+    rotation = np.stack([x, np.cross(z, x), z])
+    return np.concatenate([rotation, -(rotation @ center)[:, None]], 1)
+
+
+def ingested(folder: Path, photos: list[np.ndarray], focal: float | None = None) -> Path:
+    records = []
+    for i, photo in enumerate(photos):
+        name = f"{i:03d}.png"
+        path = artifacts.image_path(folder, name)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(path), cv2.cvtColor(photo, cv2.COLOR_GRAY2BGR))
+        height, width = photo.shape
+        records.append(ImageRecord(name, name, width, height, focal, f"{width} x {height}", 1.0, False, str(i)))
+    artifacts.save_image_set(folder, ImageSet(tuple(records)))
+    return folder
+
+
+def run_sfm(ingest: Path, root: Path, **params: object) -> tuple[dict[str, object], Path]:
+    out, scratch = root / "sfm", root / "scratch"
+    out.mkdir()
+    scratch.mkdir()
+    context = StageContext({"ingest": ingest}, {}, out, scratch, SfmParams(**params), workers=2)  # type: ignore[arg-type]
+    return SFM.run(context), out
+
+
+def test_rendered_capture_gives_back_its_cameras(tmp_path: Path):
+    import pycolmap
+
+    angles = np.radians(np.arange(0, 120, 12))
+    centers = [np.array([2.6 * np.cos(a), 2.6 * np.sin(a), 1.5 + 0.3 * (i % 2)]) for i, a in enumerate(angles)]
+    poses = [look_at(center, np.array([0, 0, 0.35])) for center in centers]
+    photos = [render(pose, i) for i, pose in enumerate(poses)]
+    # one photo of something else, which cannot be placed
+    photos.append(cv2.resize(texture(99), (WIDTH, HEIGHT)).astype(np.uint8))
+    numbers, out = run_sfm(ingested(tmp_path / "ingest", photos, FOCAL), tmp_path, deterministic=True)
+
+    assert numbers["registered"] == len(poses)
+    registration = artifacts.load_registration(out)
+    assert registration["matcher"] == "exhaustive"
+    assert [item["name"] for item in registration["unregistered"]] == [f"{len(poses):03d}.png"]
+    assert "matches no other photo" in registration["unregistered"][0]["reason"]
+    assert registration["mean_reprojection_error_px"] < 1.0
+
+    model = pycolmap.Reconstruction(str(artifacts.model_path(out)))
+    found = {image.name: image.cam_from_world().matrix() for image in model.images.values()}
+    names = sorted(found)
+    estimated = np.array([-found[n][:, :3].T @ found[n][:, 3] for n in names])
+    true_from_found = pycolmap.estimate_sim3d(estimated, np.array(centers))
+    aligned = true_from_found.scale * estimated @ true_from_found.rotation.matrix().T + true_from_found.translation
+    assert np.linalg.norm(aligned - centers, axis=1).max() < 0.03
+    for name, pose in zip(names, poses, strict=True):
+        difference = found[name][:, :3] @ true_from_found.rotation.matrix().T @ pose[:, :3].T
+        assert np.degrees(np.arccos(np.clip((np.trace(difference) - 1) / 2, -1, 1))) < 1.0
+
+
+def test_photos_of_plain_walls(tmp_path: Path):
+    photos = [np.full((120, 160), 100 + 20 * i, np.uint8) for i in range(4)]
+    with pytest.raises(ReconstructionError) as caught:
+        run_sfm(ingested(tmp_path / "ingest", photos), tmp_path)
+    assert "None of the 4 photos could be registered" in caught.value.message
+    assert "the best pair shares 0 matches, need 15 (median 0 features a photo)" in caught.value.message
+    assert "printed" in caught.value.hint
+
+
+def test_spatial_matching_without_gps_positions(tmp_path: Path):
+    photos = [texture(50 + i)[:120, :160].astype(np.uint8) for i in range(3)]
+    with pytest.raises(InputError, match="None of the 3 photos carries a GPS position") as caught:
+        run_sfm(ingested(tmp_path / "ingest", photos), tmp_path, matcher="spatial")
+    assert "sfm.matcher=sequential" in caught.value.hint
+
+
+def test_photos_that_show_different_things(tmp_path: Path):
+    photos = [texture(50 + i)[:120, :160].astype(np.uint8) for i in range(3)]
+    with pytest.raises(ReconstructionError, match="None of the 3 photos could be registered") as caught:
+        run_sfm(ingested(tmp_path / "ingest", photos), tmp_path)
+    assert "median 0 features" not in caught.value.message
+
+
+def test_too_few_registered_photos_are_an_error_with_numbers_and_a_command():
+    from stages.sfm import _check_enough
+
+    names = [f"{i}.jpg" for i in range(40)]
+    left_out = [{"name": name, "reason": "blurred"} for name in names[7:]]
+    with pytest.raises(ReconstructionError) as caught:
+        _check_enough(names[:7], left_out, names, "sequential", SfmParams(min_registered_ratio=0.5))
+    assert caught.value.message == (
+        "Only 7 of 40 photos were registered (need 20). E.g. 7.jpg: blurred; 8.jpg: blurred."
+    )
+    assert "--set sfm.matcher=exhaustive" in caught.value.hint
+    _check_enough(names[:20], left_out, names, "sequential", SfmParams(min_registered_ratio=0.5))
+
+
+def test_every_reason_for_a_photo_left_out():
+    evidence = _Evidence.__new__(_Evidence)
+    evidence.features = {"dark": 12, "lone": 900, "far": 900, "weak": 900, "pair": 900, "in": 900}
+    evidence.pairs = {
+        "dark": {}, "lone": {"in": 9}, "far": {"pair": 40}, "weak": {"in": 22}, "pair": {"far": 40}, "in": {"weak": 22},
+    }  # fmt: skip
+    registered, others = {"in"}, [{"far", "x", "y"}]
+    assert "12 found, about 50 needed" in evidence.reason("dark", registered, others)
+    assert "best pair has 9 verified matches, need 15" in evidence.reason("lone", registered, others)
+    assert "another component of 3 photos" in evidence.reason("far", registered, others)
+    assert "left out too (best pair: 40" in evidence.reason("pair", registered, others)
+    assert "could not be placed: 1 registered" in evidence.reason("weak", registered, others)
+    assert evidence.best_pair == 40
+
+
+@pytest.mark.parametrize("model", ["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"])
+def test_camera_parameters_are_what_colmap_expects(model: str):
+    import pycolmap
+
+    camera = pycolmap.Camera.create_from_model_name(1, model, 500.0, 320, 240)
+    assert camera.set_params_from_string(_camera_params(model, 444.0, 320, 240))
+    assert camera.mean_focal_length() == pytest.approx(444.0)
+    assert (camera.principal_point_x, camera.principal_point_y) == (160, 120)

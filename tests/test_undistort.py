@@ -1,0 +1,215 @@
+"""Undistorted images, masks and the scene, on a capture whose projections are known exactly."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from configs.params import UndistortParams
+from stages import artifacts
+from stages.artifacts import ImageRecord, ImageSet
+from stages.engine.stage import StageContext
+from stages.geometry.cameras import PinholeCameras, PosedScene
+from stages.undistort import UNDISTORT, _png_names
+
+WIDTH, HEIGHT, FOCAL = 320, 240, 300.0
+CENTER, UP = np.array([2.0, -1.0, 0.5]), np.array([0.0, -1.0, 0.0])  # COLMAP's world often has y down
+BALL = 0.6  # radius of the ball the masks show
+DOTS = CENTER + np.array([[0, 0, 0], [0.4, 0, 0], [0, 0.4, 0], [0, 0, -0.4], [-0.3, -0.3, 0], [0.2, -0.4, 0.3]])
+NUM_CAMERAS = 8
+
+
+def cam_from_world(index: int) -> np.ndarray:
+    angle = 2 * np.pi * index / NUM_CAMERAS
+    offset = np.array([3.0 * np.cos(angle), -1.2, 3.0 * np.sin(angle)])
+    z = -offset / np.linalg.norm(offset)
+    x = np.cross(z, UP)
+    x /= np.linalg.norm(x)
+    rotation = np.stack([x, np.cross(z, x), z])
+    return np.concatenate([rotation, -(rotation @ (CENTER + offset))[:, None]], 1)
+
+
+def write_capture(root: Path, model_name: str, parameters: list[float], masks: bool) -> dict[str, Path]:
+    """Ingest and sfm folders: black photos with a white dot where each point projects, and masks of the ball."""
+    import pycolmap
+
+    ingest, sfm = root / "ingest", root / "sfm"
+    camera = pycolmap.Camera.create_from_model_name(1, model_name, FOCAL, WIDTH, HEIGHT)
+    camera.camera_id = 1
+    camera.params = parameters
+    model = pycolmap.Reconstruction()
+    model.add_camera_with_trivial_rig(camera)
+
+    x, y = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
+    pixels = np.stack([x.ravel(), y.ravel()], 1)
+    rays = np.concatenate([np.asarray(camera.cam_from_img(pixels)), np.ones((len(pixels), 1))], 1)
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    records = []
+    for i in range(NUM_CAMERAS):
+        pose, name = cam_from_world(i), f"photo_{i}.jpg"
+        at = np.asarray(camera.img_from_cam(DOTS @ pose[:, :3].T + pose[:, 3]))
+        photo = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+        for dot in at:
+            distance = np.hypot(x - dot[0], y - dot[1])
+            photo = np.maximum(photo, (255 * np.clip(3.5 - distance, 0, 1))[..., None].astype(np.uint8))
+        path = artifacts.image_path(ingest, name)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        assert cv2.imwrite(str(path), photo, [cv2.IMWRITE_JPEG_QUALITY, 100])
+        if masks:
+            center = pose[:, :3] @ CENTER + pose[:, 3]
+            miss = np.linalg.norm(center - (rays @ center)[:, None] * rays, axis=1)
+            path = artifacts.mask_path(ingest, name)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            assert cv2.imwrite(str(path), (miss < BALL).reshape(HEIGHT, WIDTH).astype(np.uint8) * 255)
+        records.append(ImageRecord(name, name, WIDTH, HEIGHT, None, "camera", 1.0, masks, str(i)))
+        image = pycolmap.Image(name, pycolmap.Point2DList([pycolmap.Point2D(p) for p in at]), 1, i + 1)
+        pose3d = pycolmap.Rigid3d(pycolmap.Rotation3d(pose[:, :3]), pose[:, 3])
+        model.add_image_with_trivial_frame(image, pose3d)
+    for k, dot in enumerate(DOTS):
+        track = pycolmap.Track()
+        for i in range(NUM_CAMERAS):
+            track.add_element(i + 1, k)
+        model.add_point3D(dot, track, np.zeros(3, np.uint8))
+    artifacts.save_image_set(ingest, ImageSet(tuple(records)))
+    folder = artifacts.model_path(sfm)
+    folder.mkdir(parents=True)
+    model.write(str(folder))
+    return {"ingest": ingest, "sfm": sfm}
+
+
+def undistort(inputs: dict[str, Path], root: Path, **params: object) -> tuple[PosedScene, Path, dict[str, object]]:
+    out = root / "undistort"
+    out.mkdir()
+    context = StageContext(inputs, {}, out, root, UndistortParams(**params), workers=2)  # type: ignore[arg-type]
+    numbers = UNDISTORT.run(context)
+    return artifacts.load_scene(out), out, numbers
+
+
+def dots_seen(photo: np.ndarray, expected: np.ndarray) -> np.ndarray:
+    """Centroid of the white pixels around each expected position [P, 2] (pixel centres at .5)."""
+    found = []
+    for u, v in expected:
+        x0, y0 = int(u) - 6, int(v) - 6
+        patch = photo[y0 : y0 + 13, x0 : x0 + 13].astype(float)
+        patch[patch < 20] = 0
+        y, x = np.mgrid[: patch.shape[0], : patch.shape[1]]
+        found.append([x0 + 0.5 + (x * patch).sum() / patch.sum(), y0 + 0.5 + (y * patch).sum() / patch.sum()])
+    return np.array(found)
+
+
+MODELS = [
+    ("SIMPLE_PINHOLE", [FOCAL, WIDTH / 2, HEIGHT / 2]),
+    ("SIMPLE_RADIAL", [FOCAL, WIDTH / 2, HEIGHT / 2, -0.15]),
+    ("SIMPLE_RADIAL", [FOCAL, WIDTH / 2, HEIGHT / 2, 0.12]),
+    ("OPENCV", [FOCAL, 1.02 * FOCAL, WIDTH / 2 + 6, HEIGHT / 2 - 4, -0.1, 0.02, 0.002, -0.001]),
+]
+
+
+@pytest.mark.parametrize(("model_name", "parameters"), MODELS)
+@pytest.mark.parametrize("max_side", [1600, 200])
+def test_points_appear_where_the_scene_cameras_project_them(
+    tmp_path: Path, model_name: str, parameters: list[float], max_side: int
+):
+    inputs = write_capture(tmp_path, model_name, parameters, masks=False)
+    scene, out, numbers = undistort(inputs, tmp_path, max_side=max_side)
+    assert numbers["images"] == NUM_CAMERAS
+    assert scene.cameras.sizes.max() <= max_side
+    np.testing.assert_allclose(scene.world_from_scene.apply(scene.points.astype(float)), DOTS, atol=1e-5)
+    for i, name in enumerate(scene.cameras.names):
+        photo = cv2.imread(str(artifacts.image_path(out, name)), cv2.IMREAD_GRAYSCALE)
+        assert photo.shape[::-1] == tuple(scene.cameras.sizes[i])
+        pixels, depth = scene.cameras.project(i, scene.points)
+        assert depth.min() > 0
+        apart = np.linalg.norm(pixels[:, None] - pixels[None], axis=2) + 1e9 * np.eye(len(pixels))
+        alone = (apart.min(1) > 14) & np.all((pixels > 8) & (pixels < scene.cameras.sizes[i] - 8), axis=1)
+        assert alone.sum() >= 2
+        found = dots_seen(photo, pixels[alone])
+        np.testing.assert_allclose(found, pixels[alone], atol=0.15)
+
+
+def test_image_pixels_all_come_from_the_photo(tmp_path: Path):
+    inputs = write_capture(tmp_path, *MODELS[1], masks=False)
+    white = np.full((HEIGHT, WIDTH, 3), 255, np.uint8)
+    for i in range(NUM_CAMERAS):
+        cv2.imwrite(str(artifacts.image_path(inputs["ingest"], f"photo_{i}.jpg")), white)
+    scene, out, _ = undistort(inputs, tmp_path)
+    for name in scene.cameras.names:
+        assert cv2.imread(str(artifacts.image_path(out, name))).min() == 255
+
+
+@pytest.mark.parametrize(("model_name", "parameters"), MODELS[1:3])
+@pytest.mark.parametrize("max_side", [1600, 200])
+def test_masks_are_warped_by_the_same_maps(tmp_path: Path, model_name: str, parameters: list[float], max_side: int):
+    inputs = write_capture(tmp_path, model_name, parameters, masks=True)
+    scene, out, numbers = undistort(inputs, tmp_path, mask_erode=0, max_side=max_side)
+    assert numbers["masks"] == NUM_CAMERAS
+    center = scene.world_from_scene.inverse().apply(CENTER)
+    radius = BALL / scene.world_from_scene.scale
+    for i, name in enumerate(scene.cameras.names):
+        mask = cv2.imread(str(artifacts.mask_path(out, name)), cv2.IMREAD_UNCHANGED)
+        assert mask.shape[::-1] == tuple(scene.cameras.sizes[i])
+        assert set(np.unique(mask)) == {0, 255}
+        expected = ball_mask(scene.cameras, i, center, radius)
+        assert ((mask > 0) != expected).sum() < 0.05 * expected.sum()
+
+
+def ball_mask(cameras: PinholeCameras, index: int, center: np.ndarray, radius: float) -> np.ndarray:
+    width, height = cameras.sizes[index]
+    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    origins, rays = cameras.rays(index, np.stack([x.ravel(), y.ravel()], 1))
+    to_ball = center - origins
+    along = np.einsum("ni,ni->n", to_ball, rays)
+    return (np.linalg.norm(to_ball - along[:, None] * rays, axis=1) < radius).reshape(height, width)
+
+
+def test_masks_set_the_region_and_shrink_by_the_erosion(tmp_path: Path):
+    inputs = write_capture(tmp_path, *MODELS[1], masks=True)
+    scene, out, numbers = undistort(inputs, tmp_path, mask_erode=3)
+    assert numbers["region_from"] == "the visual hull of the masks"
+    assert 0.6 < BALL / scene.world_from_scene.scale < 0.95
+    assert np.linalg.norm(scene.world_from_scene.inverse().apply(CENTER)) < 0.1
+    i, name = 0, scene.cameras.names[0]
+    mask = cv2.imread(str(artifacts.mask_path(out, name)), cv2.IMREAD_UNCHANGED) > 0
+    full = ball_mask(
+        scene.cameras, i, scene.world_from_scene.inverse().apply(CENTER), BALL / scene.world_from_scene.scale
+    )
+    loss = np.sqrt(full.sum() / np.pi) - np.sqrt(mask.sum() / np.pi)
+    assert loss == pytest.approx(3.0, abs=0.7)
+
+
+def test_scene_frame_has_z_up_and_the_object_at_the_origin(tmp_path: Path):
+    inputs = write_capture(tmp_path, *MODELS[0], masks=False)
+    scene, _, numbers = undistort(inputs, tmp_path)
+    assert scene.kind == numbers["kind"] == "object"
+    np.testing.assert_allclose(scene.world_from_scene.rotation @ [0, 0, 1], UP, atol=1e-6)
+    np.testing.assert_allclose(scene.world_from_scene.translation, CENTER, atol=1e-6)
+    np.testing.assert_array_equal(scene.up, [0, 0, 1])
+    assert (scene.cameras.centers[:, 2] > 0).all()
+
+
+def test_observations_name_the_image_and_the_point(tmp_path: Path):
+    inputs = write_capture(tmp_path, *MODELS[0], masks=False)
+    scene, _, _ = undistort(inputs, tmp_path)
+    expected = [[i, k] for i in range(NUM_CAMERAS) for k in range(len(DOTS))]
+    np.testing.assert_array_equal(scene.observations, expected)
+    assert scene.points.dtype == np.float32
+    assert scene.observations.dtype == np.int32
+
+
+def test_up_axis_and_region_size_can_be_set(tmp_path: Path):
+    inputs = write_capture(tmp_path, *MODELS[0], masks=False)
+    (tmp_path / "a").mkdir()
+    (tmp_path / "b").mkdir()
+    plain, _, _ = undistort(inputs, tmp_path / "a")
+    turned, _, _ = undistort(inputs, tmp_path / "b", up="-x", roi_scale=1.5)
+    np.testing.assert_allclose(turned.world_from_scene.rotation @ [0, 0, 1], [-1, 0, 0], atol=1e-9)
+    assert turned.world_from_scene.scale == pytest.approx(1.5 * plain.world_from_scene.scale)
+
+
+def test_png_names_stay_unique():
+    assert _png_names(["a.jpg", "b.png", "c/a.jpg"]) == ["a.png", "b.png", "c/a.png"]
+    assert _png_names(["a.jpg", "a.png", "b.jpg"]) == ["a.jpg.png", "a.png.png", "b.png"]
+    assert _png_names(["a.jpg", "a.png", "a.jpg.png"]) == ["a.jpg.png", "a.png.png", "a.jpg.png.png"]
