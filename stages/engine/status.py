@@ -71,9 +71,9 @@ def stage_status(
             identity.sources,
         )
         reasons += now.changes_since(before, stage.params)
+        reasons += [f"input stage {status.name} is {status.state}" for status in waiting]
     elif not damage:
         reasons.append("not made yet")
-    reasons += [f"input stage {status.name} is {status.state}" for status in waiting]
     known = None if waiting else identity
     if not reasons:
         return StageStatus(stage.name, "fresh", (), manifest, known)
