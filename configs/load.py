@@ -83,9 +83,7 @@ def load_config(
 def preset_names() -> list[str]:
     """Names of the presets that come with the program, sorted."""
     folder = resources.files("configs") / "presets"
-    return sorted(
-        entry.name.removesuffix(".yaml") for entry in folder.iterdir() if entry.name.endswith(".yaml")
-    )
+    return sorted(entry.name.removesuffix(".yaml") for entry in folder.iterdir() if entry.name.endswith(".yaml"))
 
 
 def preset_text(name: str) -> str:
@@ -226,9 +224,7 @@ def _parse_set(text: str) -> dict[str, Any]:
     key, equals, raw = text.partition("=")
     parts = key.strip().split(".")
     if not equals or not all(parts):
-        raise ConfigError(
-            f"--set {text} is not of the form section.key=value.", "For example `--set sfm.seed=1`."
-        )
+        raise ConfigError(f"--set {text} is not of the form section.key=value.", "For example `--set sfm.seed=1`.")
     try:
         value = _yaml(raw)
     except yaml.YAMLError as error:
@@ -316,18 +312,12 @@ def _refusal(error: ValidationError, schema: type[BaseModel], origins: Mapping[s
     key = ".".join(path)
     while key and key not in known and "." in key:  # inside a list or one arm of a union
         key = key.rpartition(".")[0]
-    origin = origins.get(key) or next(
-        (origins[part] for part in _ancestors(key) if part in origins), "the settings"
-    )
+    origin = origins.get(key) or next((origins[part] for part in _ancestors(key) if part in origins), "the settings")
     field = known.get(key)
     if field is None:
-        return ConfigError(
-            f"{detail['msg']} (in {origin}).", "`hineus config --describe` lists all settings."
-        )
+        return ConfigError(f"{detail['msg']} (in {origin}).", "`hineus config --describe` lists all settings.")
     bounds = _bounds(field)
-    problem = (
-        "is out of bounds: it must be" if detail["type"] in _BOUND_ERRORS else "is no valid value: it must be"
-    )
+    problem = "is out of bounds: it must be" if detail["type"] in _BOUND_ERRORS else "is no valid value: it must be"
     wanted = bounds if detail["type"] in _BOUND_ERRORS else f"{_type_name(field.annotation)} {bounds}".strip()
     return ConfigError(
         f"`{key}` = {detail['input']!r} in {origin} {problem} {wanted}.",

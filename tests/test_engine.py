@@ -342,9 +342,7 @@ def test_read_only_workspace_is_told(bench: Bench, monkeypatch: pytest.MonkeyPat
 
     bench.run()
     monkeypatch.setattr(workspace_module.os, "open", refuse)
-    with pytest.raises(
-        WorkspaceError, match="cannot be written while opening the workspace: Read-only file system"
-    ):
+    with pytest.raises(WorkspaceError, match="cannot be written while opening the workspace: Read-only file system"):
         bench.run()
 
 
@@ -375,9 +373,7 @@ def test_full_disk_while_publishing_loses_nothing(bench: Bench, monkeypatch: pyt
         (lambda: RuntimeError("PytorchStreamWriter failed writing file"), 1000),
     ],
 )
-def test_full_disk_while_a_stage_writes(
-    bench: Bench, monkeypatch: pytest.MonkeyPatch, error: Any, free: int
-) -> None:
+def test_full_disk_while_a_stage_writes(bench: Bench, monkeypatch: pytest.MonkeyPatch, error: Any, free: int) -> None:
     monkeypatch.setattr(workspace_module, "free_bytes", lambda root: free)
     with pytest.raises(WorkspaceError, match="The disk is full while running 'sfm'"):
         bench.run(with_stage("sfm", run=failing(error)))
@@ -472,9 +468,7 @@ def test_settings_are_kept_and_can_be_fed_back(bench: Bench) -> None:
 def test_manifest_round_trip_and_tampering() -> None:
     from stages.engine.fingerprint import Identity
 
-    identity = Identity(
-        "sfm", 1, {"a": 1.5, "b": [1, 2]}, {"ingest": "x"}, {"photos": {"a.jpg": "h"}, "masks": None}
-    )
+    identity = Identity("sfm", 1, {"a": 1.5, "b": [1, 2]}, {"ingest": "x"}, {"photos": {"a.jpg": "h"}, "masks": None})
     manifest = Manifest(identity, {"f": OutputFile(3, "s")}, {"n": 1})
     assert Manifest.from_json(manifest.to_json()) == manifest
     with pytest.raises(ManifestDamaged):

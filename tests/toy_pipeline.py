@@ -41,9 +41,7 @@ def sfm(context: StageContext) -> dict[str, Any]:
             os.kill(os.getpid(), signal.SIGKILL)
     time.sleep(float(os.environ.get("TOY_SLEEP", "0")))
     (context.out / "model").mkdir()
-    (context.out / "model" / "poses.txt").write_text(
-        (context.inputs["ingest"] / "letters.txt").read_text() * end
-    )
+    (context.out / "model" / "poses.txt").write_text((context.inputs["ingest"] / "letters.txt").read_text() * end)
     return {"started_at": start, "ended_at": end}
 
 
@@ -71,9 +69,7 @@ def with_stage(name: str, **changes: Any) -> tuple[Stage, ...]:
     return tuple(replace(stage, **changes) if stage.name == name else stage for stage in TOY)
 
 
-def failing(
-    error: Callable[[], BaseException], after: str = "partial.txt"
-) -> Callable[[StageContext], dict[str, Any]]:
+def failing(error: Callable[[], BaseException], after: str = "partial.txt") -> Callable[[StageContext], dict[str, Any]]:
     """A stage's run that writes a file and then raises."""
 
     def run(context: StageContext) -> dict[str, Any]:

@@ -53,9 +53,7 @@ class Identity:
             "version": self.version,
             "params": digest(dict(self.params)),
             "inputs": dict(self.inputs),
-            "sources": {
-                name: None if files is None else digest(files) for name, files in self.sources.items()
-            },
+            "sources": {name: None if files is None else digest(files) for name, files in self.sources.items()},
         }
 
     @property

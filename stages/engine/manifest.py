@@ -100,9 +100,7 @@ class Manifest:
         try:
             data = json.loads(text)
             manifest = Manifest(
-                identity=Identity(
-                    data["stage"], data["version"], data["params"], data["inputs"], data["sources"]
-                ),
+                identity=Identity(data["stage"], data["version"], data["params"], data["inputs"], data["sources"]),
                 outputs={path: OutputFile(**file) for path, file in data["outputs"].items()},
                 numbers=data["numbers"],
                 wall_s=data["wall_s"],

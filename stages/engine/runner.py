@@ -137,14 +137,10 @@ def _select(
         if name is not None and name not in names:
             near = difflib.get_close_matches(name, names, 1)
             guess = f"Did you mean `{option} {near[0]}`? " if near else ""
-            raise ConfigError(
-                f"There is no stage '{name}' ({option}).", f"{guess}The stages are {', '.join(names)}."
-            )
+            raise ConfigError(f"There is no stage '{name}' ({option}).", f"{guess}The stages are {', '.join(names)}.")
     last = names.index(until) if until else len(names) - 1
     first = names.index(from_stage) if from_stage else len(names)
-    late = [
-        (option, name) for option, name in [("--from", from_stage), *(("--force", n) for n in force)] if name
-    ]
+    late = [(option, name) for option, name in [("--from", from_stage), *(("--force", n) for n in force)] if name]
     for option, name in late:
         if names.index(name) > last:
             raise ConfigError(
@@ -199,9 +195,7 @@ def _run_stage(
     return manifest
 
 
-def _call(
-    stage: Stage, context: StageContext, workspace: Workspace, status: StageStatus
-) -> Mapping[str, Any]:
+def _call(stage: Stage, context: StageContext, workspace: Workspace, status: StageStatus) -> Mapping[str, Any]:
     """Run the stage; tell of a full disk, a missing library or exhausted memory in the user's terms."""
     try:
         return stage.run(context) or {}
@@ -223,9 +217,7 @@ def _call(
         raise
 
 
-def _describe(
-    identity: Identity, out: Path, numbers: Mapping[str, Any], meter: Any, workspace: Workspace
-) -> Manifest:
+def _describe(identity: Identity, out: Path, numbers: Mapping[str, Any], meter: Any, workspace: Workspace) -> Manifest:
     with storage_errors(workspace.root, f"reading back '{identity.stage}'"):
         outputs = describe_outputs(out)
     return Manifest(
@@ -246,6 +238,4 @@ def _skipped(status: StageStatus) -> StageOutcome:
 
 
 def _outcome(action: Literal["ran", "skipped"], reason: str, name: str, manifest: Manifest) -> StageOutcome:
-    return StageOutcome(
-        name, action, reason, manifest.numbers, manifest.wall_s, manifest.cpu_s, manifest.peak_rss
-    )
+    return StageOutcome(name, action, reason, manifest.numbers, manifest.wall_s, manifest.cpu_s, manifest.peak_rss)

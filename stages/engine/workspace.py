@@ -44,9 +44,7 @@ DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
 NOT_WRITABLE = (errno.EROFS, errno.EACCES, errno.EPERM)
 LOCKS_UNSUPPORTED = (errno.ENOLCK, errno.ENOTSUP, errno.ENOSYS)
 
-NEARLY_FULL_BYTES = (
-    1 << 20
-)  # libraries hide "disk full" in errors of their own; less free than this gives it away
+NEARLY_FULL_BYTES = 1 << 20  # libraries hide "disk full" in errors of their own; less free than this gives it away
 
 
 @dataclass(frozen=True)
@@ -158,9 +156,7 @@ class Workspace:
             os.pwrite(descriptor, json.dumps(holder).encode(), 0)
 
     # ------------------------------------------------------------ record and settings
-    def remember(
-        self, sources: Mapping[str, Path | None], preset: str | None, config: Mapping[str, Any]
-    ) -> None:
+    def remember(self, sources: Mapping[str, Path | None], preset: str | None, config: Mapping[str, Any]) -> None:
         """Keep what this run is made from: workspace.json and config.yaml."""
         import yaml
 
@@ -170,9 +166,7 @@ class Workspace:
             hineus=_hineus_version(),
             created=self.record.created or now(),
         )
-        header = (
-            f"# The settings of the last run (preset: {preset or 'none'}). Use them again with --config.\n"
-        )
+        header = f"# The settings of the last run (preset: {preset or 'none'}). Use them again with --config.\n"
         with storage_errors(self.root, "keeping the settings"):
             _write(self.root / "workspace.json", json.dumps(asdict(self.record), indent=1) + "\n")
             _write(self.config_path, header + yaml.safe_dump(jsonable(config), sort_keys=False))
@@ -318,9 +312,7 @@ def _is_running(pid: int) -> bool:
 # ---------------------------------------------------------------- opening
 def _new_workspace(root: Path, create: bool) -> Workspace:
     if root.exists() and not root.is_dir():
-        raise WorkspaceError(
-            f"{root} is a file, not a workspace folder.", "Choose another one with `--workspace DIR`."
-        )
+        raise WorkspaceError(f"{root} is a file, not a workspace folder.", "Choose another one with `--workspace DIR`.")
     if not create:
         raise WorkspaceError(
             f"There is no workspace at {root}.", f"Make one with `hineus run PHOTOS --workspace {root}`."
