@@ -158,7 +158,7 @@ class TrainParams(Section):
     weight_exposure: float = Field(0.1, ge=0, description="weight that holds the photos' gains at 1")
 
     background: bool = Field(True, description="model what lies outside the region (never where masks exist)")
-    background_samples: int = Field(12, ge=1, description="samples per ray outside the region")
+    background_samples: int = Field(16, ge=1, description="samples per ray outside the region")
     background_log2_rows: int = Field(15, ge=8, le=24, description="rows per level of the background's encoding")
 
     cache_resolution: int = Field(96, ge=8, le=512, description="side of the SDF grid that guides sampling")

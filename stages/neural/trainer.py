@@ -21,8 +21,8 @@ from stages.neural.sampling import SdfCache, importance_distances
 
 # Samples that weigh less than this get no colour: together they change a pixel by less than one grey level.
 _COLOR_THRESHOLD = 2e-4
-# The background reaches to this many times the distance at which a ray leaves the region of interest.
-_BACKGROUND_NEAR_SHARE = 0.005
+# The background's last sample is this near to infinity, as a part of the contracted shell: 200 radii away.
+_BACKGROUND_REACH = 0.995
 
 
 @dataclass(frozen=True)
@@ -215,23 +215,25 @@ class Trainer:
     ) -> torch.Tensor:
         """Background colour [R, 3] weighted by the transmittance [R] that the surface leaves.
 
-        Samples are even in inverse distance from where the ray leaves the sphere to 200 times as far.
+        Samples are even in the inverse of their distance from the scene's centre, from the unit sphere outwards
+        (NeRF++), so that half of them look at what lies within twice the region's radius.
         """
         count = self.params.background_samples
         behind = torch.nonzero(transmittance.detach() > 0.01).squeeze(1)
-        leave, directions = batch.leave[behind], batch.directions[behind]
+        origins, directions = batch.origins[behind], batch.directions[behind]
         if generator is None:
             offset = torch.full((len(behind), count + 1), 0.5, device=self.device)
         else:
             offset = torch.rand(len(behind), count + 1, generator=generator, device=self.device)
-        place = (torch.arange(count + 1, device=self.device) + offset) / (count + 1)
-        distances = leave[:, None] / (1 - place * (1 - _BACKGROUND_NEAR_SHARE))
-        points = batch.origins[behind, None] + distances[..., None] * directions[:, None]
-        middle = 0.5 * (points[:, 1:] + points[:, :-1])
-        contracted = _contracted_radius(points)
-        delta = (contracted[:, 1:] - contracted[:, :-1]).abs() + 1e-4
-        dirs = directions[:, None].expand_as(middle).reshape(-1, 3)
-        density, colors = self.fields.background(middle.reshape(-1, 3), dirs)
+        inverse = 1 - _BACKGROUND_REACH * (torch.arange(count + 1, device=self.device) + offset) / (count + 1)
+        middle = -(origins * directions).sum(1, keepdim=True)
+        closest_squared = (origins**2).sum(1, keepdim=True) - middle**2
+        distances = middle + (1 / inverse**2 - closest_squared).clamp(min=0).sqrt()
+        centers = 0.5 * (distances[:, 1:] + distances[:, :-1])
+        points = (origins[:, None] + centers[..., None] * directions[:, None]).reshape(-1, 3)
+        delta = inverse[:, :-1] - inverse[:, 1:]  # the contracted radius is 2 - inverse
+        dirs = directions[:, None].expand(-1, count, -1).reshape(-1, 3)
+        density, colors = self.fields.background(points, dirs)
         tau = density.view(len(behind), count) * delta
         weights, left = weights_from_optical_depth(tau)
         # What is left behind the last sample belongs to it: the background is opaque at infinity.
@@ -293,8 +295,3 @@ class Trainer:
         self.cache_step = state["cache_step"]
         self.generator.set_state(state["generator"].cpu())
         self.step_index = state["step_index"]
-
-
-def _contracted_radius(points: torch.Tensor) -> torch.Tensor:
-    """|contract(x)| [...] for points [..., 3] outside the unit ball: from 1 to 2."""
-    return 2 - 1 / torch.linalg.vector_norm(points, dim=-1).clamp(min=1.0)
