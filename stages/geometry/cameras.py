@@ -51,8 +51,9 @@ class PinholeCameras:
         safe = np.where(np.abs(depth) < 1e-12, 1e-12, depth)
         pixels = in_cam[:, :2] / safe[:, None]
         K = self.intrinsics[index]
-        return np.stack([K[0, 0] * pixels[:, 0] + K[0, 1] * pixels[:, 1] + K[0, 2],
-                         K[1, 1] * pixels[:, 1] + K[1, 2]], 1), depth
+        return np.stack(
+            [K[0, 0] * pixels[:, 0] + K[0, 1] * pixels[:, 1] + K[0, 2], K[1, 1] * pixels[:, 1] + K[1, 2]], 1
+        ), depth
 
     def rays(self, index: int, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Origins and unit directions [P, 3] in the scene frame of rays through pixel positions [P, 2]."""

@@ -14,7 +14,7 @@ import torch
 from configs.params import TrainParams
 from stages.neural import losses, schedules
 from stages.neural.encodings import HashGrid
-from stages.neural.fields import Fields, FieldShape
+from stages.neural.fields import BackgroundNetwork, Fields, FieldShape
 from stages.neural.photos import Photos, RayBatch
 from stages.neural.rendering import composite, sample_optical_depths, weights_from_optical_depth
 from stages.neural.sampling import SdfCache, importance_distances
@@ -204,14 +204,18 @@ class Trainer:
             0, ray, weights.view(-1)[seen, None] * sample_colors
         )
         if self.fields.background is not None:
-            colors = colors + self._background(batch, transmittance, generator)
+            colors = colors + self._background(self.fields.background, batch, transmittance, generator)
         return Rendered(
             colors, 1 - transmittance, weights, gradients[:num_points],
             sdf[num_points:], gradients[num_points:],
         )  # fmt: skip
 
     def _background(
-        self, batch: RayBatch, transmittance: torch.Tensor, generator: torch.Generator | None
+        self,
+        background: BackgroundNetwork,
+        batch: RayBatch,
+        transmittance: torch.Tensor,
+        generator: torch.Generator | None,
     ) -> torch.Tensor:
         """Background colour [R, 3] weighted by the transmittance [R] that the surface leaves.
 
@@ -233,7 +237,7 @@ class Trainer:
         points = (origins[:, None] + centers[..., None] * directions[:, None]).reshape(-1, 3)
         delta = inverse[:, :-1] - inverse[:, 1:]  # the contracted radius is 2 - inverse
         dirs = directions[:, None].expand(-1, count, -1).reshape(-1, 3)
-        density, colors = self.fields.background(points, dirs)
+        density, colors = background(points, dirs)
         tau = density.view(len(behind), count) * delta
         weights, left = weights_from_optical_depth(tau)
         # What is left behind the last sample belongs to it: the background is opaque at infinity.
