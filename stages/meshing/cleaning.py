@@ -152,9 +152,9 @@ def _fans(faces: np.ndarray, use: EdgeUse) -> np.ndarray:
 def repair_manifold(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """A 2-manifold from a mesh that nearly is one.
 
-    Drops degenerate and duplicate faces; at edges of more than two faces, the smallest faces until two are left;
-    where two faces at an edge are turned against each other, or several fans meet in one vertex, gives each fan its
-    own copy of the vertex. Unused vertices go.
+    Drops degenerate and duplicate faces; at edges of more than two faces, those with the most open edges, then the
+    smallest, until two are left; where two faces at an edge are turned against each other, or several fans meet in
+    one vertex, gives each fan its own copy of the vertex. Unused vertices go.
     """
     a, b, c = faces.T
     faces = faces[(a != b) & (b != c) & (c != a)]
@@ -167,11 +167,12 @@ def repair_manifold(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray
             break
         area = np.linalg.norm(face_normals(vertices, faces), axis=1)
         crowd_edge, crowd_face = use.edge[crowded], use.face[crowded]
-        order = np.lexsort((area[crowd_face], crowd_edge))
-        smallest = np.ones(len(order), dtype=bool)
-        smallest[1:] = crowd_edge[order][1:] != crowd_edge[order][:-1]
+        loose = np.bincount(use.face[use.counts[use.edge] == 1], minlength=len(faces))
+        order = np.lexsort((area[crowd_face], -loose[crowd_face], crowd_edge))
+        worst = np.ones(len(order), dtype=bool)
+        worst[1:] = crowd_edge[order][1:] != crowd_edge[order][:-1]
         keep = np.ones(len(faces), dtype=bool)
-        keep[crowd_face[order][smallest]] = False
+        keep[crowd_face[order][worst]] = False
         faces = faces[keep]
     fans = _fans(faces, use)
     _, first, corner = np.unique(fans, return_index=True, return_inverse=True)

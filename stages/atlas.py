@@ -1,0 +1,61 @@
+"""Clean mesh to UV charts: no overlaps, padding between them."""
+
+from __future__ import annotations
+
+import logging
+from typing import Any
+
+import numpy as np
+
+from stages import artifacts
+from stages.engine.stage import Stage, StageContext
+from stages.errors import ReconstructionError
+
+logger = logging.getLogger(__name__)
+
+
+def run(context: StageContext) -> dict[str, Any]:
+    from stages.meshing import atlas
+
+    params = context.params
+    vertices, faces = artifacts.load_mesh(context.inputs["cleanup"])
+    context.progress(0, 1, f"charts for {len(faces)} faces")
+    method, why = "xatlas", ""
+    try:
+        layout = atlas.unwrap_xatlas(vertices, faces, params.texture_size, params.padding, params.time_limit)
+    except (atlas.AtlasTimeoutError, atlas.AtlasProcessError) as error:
+        method, why = "projected", str(error)
+        logger.warning("%s; projecting along the axes instead", error)
+        try:
+            layout = atlas.unwrap_projected(vertices, faces, params.texture_size, params.padding)
+        except ValueError as misfit:
+            raise ReconstructionError(
+                f"The charts do not fit the texture: {misfit}.",
+                f"Try `--set atlas.texture_size={2 * params.texture_size}`, or `--set cleanup.target_faces=20000`.",
+            ) from misfit
+    uvs = layout.texels / params.texture_size
+    artifacts.save_atlas(
+        context.out,
+        artifacts.AtlasMesh(
+            vertices=vertices[layout.source].astype(np.float32),
+            normals=atlas.smooth_normals(vertices, faces, layout.source),
+            uvs=np.clip(uvs, 0, 1).astype(np.float32),
+            faces=layout.faces,
+        ),
+    )
+    corners = uvs[layout.faces]
+    edges = corners[:, 1:] - corners[:, :1]
+    used = np.abs(edges[:, 0, 0] * edges[:, 1, 1] - edges[:, 0, 1] * edges[:, 1, 0]).sum() / 2
+    return {
+        "method": method,
+        "fallback_reason": why,
+        "charts": int(layout.charts.max()) + 1,
+        "faces": len(faces),
+        "vertices": len(layout.source),
+        "texture_used": round(float(used), 4),
+    }
+
+
+ATLAS = Stage(
+    name="atlas", version=1, needs=("cleanup",), params="atlas", run=run, summary="UV charts without overlaps"
+)

@@ -1,0 +1,293 @@
+"""What cleanup keeps and drops, on small meshes with known answers, and the stage on a small scene."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from configs.params import CleanupParams
+from stages import artifacts
+from stages.cleanup import CLEANUP
+from stages.engine.stage import StageContext
+from stages.errors import ReconstructionError
+from stages.geometry.cameras import PinholeCameras, PosedScene
+from stages.geometry.similarity import Similarity
+from stages.meshing import cleaning
+from stages.meshing.isosurface import extract_isosurface
+from stages.meshing.simplify import decimate
+
+SIZE = 160
+
+
+def ring_of_cameras(count=12, distance=2.5, elevations=(15, 45, 75)):
+    """Cameras around and above the origin, looking at it."""
+    extrinsics = []
+    for i in range(count):
+        turn, rise = 2 * np.pi * i / count, np.radians(elevations[i % len(elevations)])
+        center = distance * np.array([np.cos(turn) * np.cos(rise), np.sin(turn) * np.cos(rise), np.sin(rise)])
+        z = -center / distance
+        x = np.cross(z, [0, 0, 1.0])
+        x /= np.linalg.norm(x)
+        rotation = np.stack([x, np.cross(z, x), z])
+        extrinsics.append(np.column_stack([rotation, -rotation @ center]))
+    focal = 0.45 * SIZE * np.sqrt(distance**2 - 1)
+    K = np.array([[focal, 0, SIZE / 2], [0, focal, SIZE / 2], [0, 0, 1]])
+    return PinholeCameras(
+        names=tuple(f"{i:02d}.png" for i in range(count)),
+        sizes=np.full((count, 2), SIZE),
+        intrinsics=np.repeat(K[None], count, 0),
+        cam_from_scene=np.array(extrinsics),
+    )
+
+
+def ball(radius=0.5, center=(0, 0, 0), resolution=32):
+    surface = extract_isosurface(lambda p: np.linalg.norm(p - np.array(center), axis=1) - radius, resolution)
+    return surface.vertices, surface.faces
+
+
+def join(*meshes):
+    offsets = np.cumsum([0, *(len(v) for v, _ in meshes)])
+    vertices = np.concatenate([v for v, _ in meshes])
+    return vertices, np.concatenate([f + o for (_, f), o in zip(meshes, offsets, strict=False)])
+
+
+@pytest.fixture
+def stage(tmp_path):
+    """Runs cleanup on a mesh; returns its numbers, vertices and faces."""
+    undistort, extract, out = (tmp_path / name for name in ("undistort", "extract", "out"))
+
+    def run(vertices, faces, masks=None, **params):
+        for folder in (undistort, extract, out):
+            folder.mkdir()
+        cameras = ring_of_cameras()
+        empty = np.zeros((0, 2), dtype=np.int32)
+        scene = PosedScene(cameras, Similarity.identity(), np.zeros((0, 3)), np.zeros(0), empty, np.array([0, 0, 1.0]))
+        artifacts.save_scene(undistort, scene)
+        artifacts.save_mesh(extract, vertices, faces)
+        if masks is not None:
+            import cv2
+
+            for index, mask in masks(cameras):
+                path = artifacts.mask_path(undistort, cameras.names[index])
+                path.parent.mkdir(exist_ok=True)
+                cv2.imwrite(str(path), mask.astype(np.uint8) * 255)
+        context = StageContext(
+            inputs={"undistort": undistort, "extract": extract},
+            sources={},
+            out=out,
+            scratch=tmp_path,
+            params=CleanupParams(**params),
+        )
+        return CLEANUP.run(context), *artifacts.load_mesh(out)
+
+    return run
+
+
+def test_small_pieces_go_and_their_number_is_told():
+    vertices, faces = join(ball(), ball(0.06, (0.8, 0, 0)), ball(0.06, (-0.8, 0, 0)))
+    keep, dropped = cleaning.large_pieces(faces, 0.1)
+    assert dropped == 2
+    assert np.linalg.norm(vertices[faces[keep]], axis=2).max() < 0.55
+    assert cleaning.large_pieces(faces, 0.0) == (pytest.approx(np.ones(len(faces), bool)), 0)
+
+
+def test_views_of_a_ball_are_those_on_its_near_side():
+    vertices, faces = ball()
+    cameras = ring_of_cameras(count=1, elevations=(0,))  # at +x
+    seen = cleaning.count_views(vertices, faces, cameras, enough=1) > 0
+    horizon = 0.5**2 / 2.5  # the tangent cone touches the ball at x = r^2 / d
+    assert seen[vertices[:, 0] > horizon + 0.06].all()
+    assert not seen[vertices[:, 0] < horizon - 0.06].any()
+
+
+def test_views_are_counted_up_to_enough():
+    vertices, faces = ball()
+    cameras = ring_of_cameras()
+    top = vertices[:, 2].argmax()
+    assert cleaning.count_views(vertices, faces, cameras, enough=3)[top] == 3
+    assert cleaning.count_views(vertices, faces, cameras, enough=99)[top] == len(cameras)
+
+
+def test_what_lies_outside_the_image_is_not_seen():
+    vertices, faces = ball()
+    cameras = ring_of_cameras(count=1, elevations=(0,))
+    narrow = PinholeCameras(cameras.names, np.array([[SIZE // 2, SIZE]]), cameras.intrinsics, cameras.cam_from_scene)
+    seen = cleaning.count_views(vertices, faces, narrow, enough=1) > 0
+    pixels, _ = cameras.project(0, vertices)
+    assert seen.any()
+    assert not seen[pixels[:, 0] >= SIZE // 2].any()
+
+
+def test_small_unseen_gaps_are_kept_and_large_ones_dropped():
+    vertices, faces = ball()
+    middle = vertices[faces].mean(1)
+    small, large = middle[:, 2] > 0.48, middle[:, 2] < -0.1
+    keep = cleaning.fill_small_gaps(vertices, faces, ~small & ~large, max_area=0.2)
+    assert keep[small].all()
+    assert not keep[large].any()
+
+
+def test_unseen_islands_are_not_gaps():
+    vertices, faces = join(ball(), ball(0.06, (0.8, 0, 0)))
+    island = np.linalg.norm(vertices[faces].mean(1), axis=1) > 0.6
+    assert not cleaning.fill_small_gaps(vertices, faces, ~island, max_area=10)[island].any()
+
+
+def test_smoothing_a_selection_fills_notches_only():
+    vertices, faces = ball()
+    notch = np.zeros(len(faces), dtype=bool)
+    notch[np.flatnonzero(vertices[faces].mean(1)[:, 2] > 0)[0]] = True
+    assert cleaning.smooth_selection(faces, len(vertices), ~notch, 2).all()
+    half = vertices[faces].mean(1)[:, 2] > 0
+    smooth = cleaning.smooth_selection(faces, len(vertices), half, 2)
+    assert smooth[half].all()
+    assert vertices[faces[smooth]].mean(1)[:, 2].min() > -0.15
+
+
+def bow_tie():
+    """Two tetrahedra that share one vertex."""
+    tetrahedron = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
+    other = np.where(tetrahedron == 0, 0, tetrahedron + 3)
+    vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [-1, 0, 0], [0, -1, 0], [0, 0, -1]], float)
+    return vertices, np.concatenate([tetrahedron, other])
+
+
+def test_mesh_state_counts_what_is_wrong():
+    _, faces = ball()
+    assert cleaning.mesh_state(faces) == cleaning.MeshState(0, 0, 0)
+    assert cleaning.mesh_state(faces[1:]).open_edges == 3
+    assert cleaning.mesh_state(np.concatenate([faces, faces[:1]])).bad_edges == 3
+    turned = faces.copy()
+    turned[0] = turned[0, ::-1]
+    assert cleaning.mesh_state(turned).bad_edges == 3
+    assert cleaning.mesh_state(bow_tie()[1]).bad_vertices == 1
+    assert not cleaning.mesh_state(bow_tie()[1]).manifold
+
+
+def test_repair_splits_a_vertex_where_two_fans_meet():
+    vertices, faces = cleaning.repair_manifold(*bow_tie())
+    assert len(vertices) == 8
+    assert len(faces) == 8
+    state = cleaning.mesh_state(faces)
+    assert state.manifold
+    assert state.watertight
+    np.testing.assert_array_equal(vertices[faces], bow_tie()[0][bow_tie()[1]])
+
+
+def test_repair_drops_duplicates_slivers_and_fins_and_leaves_the_rest_alone():
+    vertices, faces = ball()
+    fin = np.array([[faces[0, 1], faces[0, 0], len(vertices)]])
+    point = vertices[faces[0, 0]] + 1e-3
+    spoiled = np.concatenate([faces, faces[:2], [[5, 5, 9]], fin])
+    repaired, new_faces = cleaning.repair_manifold(np.concatenate([vertices, point[None]]), spoiled)
+    np.testing.assert_array_equal(new_faces, faces)
+    np.testing.assert_array_equal(repaired, vertices)
+
+
+def test_decimation_keeps_shape_and_closedness():
+    vertices, faces = ball(resolution=64)
+    light, kept = decimate(vertices, faces, 1000)
+    assert 900 <= len(kept) <= 1000
+    state = cleaning.mesh_state(kept)
+    assert state.manifold
+    assert state.watertight
+    assert np.abs(np.linalg.norm(light, axis=1) - 0.5).max() < 0.01
+    same = decimate(vertices, faces, len(faces))
+    np.testing.assert_array_equal(same[1], faces)
+
+
+def test_decimation_falls_back_where_the_fast_one_breaks_the_mesh(monkeypatch):
+    import fast_simplification
+
+    vertices, faces = ball(resolution=24)
+    broken = np.concatenate([faces, [[faces[0, 0], faces[0, 1], 50]]]).astype(np.int32)
+    monkeypatch.setattr(fast_simplification, "simplify", lambda *a, **k: (vertices, broken))
+    _, kept = decimate(vertices, faces, 400)
+    assert len(kept) <= 400
+    assert cleaning.mesh_state(kept).manifold
+    assert cleaning.mesh_state(kept).watertight
+
+
+def test_decimation_refuses_an_impossible_target():
+    with pytest.raises(ValueError, match="target_faces >= 4"):
+        decimate(*ball(), 3)
+
+
+def test_hull_drops_what_most_masks_exclude_but_trusts_no_single_mask():
+    cameras = ring_of_cameras()
+    points = np.array([[0, 0, 0], [0.8, 0, 0.0], [0, 0, 0.3]])
+    disk = silhouettes(cameras)
+    assert cleaning.outside_hull(points, cameras, disk, 0.1).tolist() == [False, True, False]
+    one_bad = [(i, mask if i else np.zeros_like(mask)) for i, mask in disk]
+    assert cleaning.outside_hull(points, cameras, one_bad, 0.05).tolist() == [False, True, False]
+    assert not cleaning.outside_hull(points, cameras, [], 0.1).any()
+
+
+def silhouettes(cameras, radius=0.5):
+    """Masks [H, W] of a ball at the origin."""
+    masks = []
+    grid = np.stack(np.meshgrid(np.arange(SIZE) + 0.5, np.arange(SIZE) + 0.5), axis=2).reshape(-1, 2)
+    for i in range(len(cameras)):
+        origins, directions = cameras.rays(i, grid)
+        closest = np.linalg.norm(np.cross(origins, directions), axis=1)
+        masks.append((i, (closest < radius).reshape(SIZE, SIZE)))
+    return masks
+
+
+def test_stage_drops_floaters_inner_and_outer_shells(stage):
+    thing = ball(0.5, resolution=64)
+    inner = ball(0.3, resolution=64)
+    v, f = ball(0.95, resolution=64)
+    cap = f[(v[f][:, :, 2] < -0.7).all(1)]  # background shell behind the object, turned away from the cameras above
+    floater = ball(0.05, (0.75, 0, 0.3), resolution=64)
+    specks = ball(0.995, resolution=64)  # beyond the region of interest
+    vertices, faces = join(thing, inner, (v, cap), floater, (specks[0], specks[1][:2000]))
+    numbers, vertices, faces = stage(vertices, faces)
+    radii = np.linalg.norm(vertices, axis=1)
+    assert radii.min() > 0.48
+    assert radii.max() < 0.52
+    assert numbers["manifold"]
+    assert numbers["unseen_faces"] > len(inner[1])
+    assert numbers["outside_region"] == 2000
+    assert numbers["pieces_dropped"] + numbers["specks_dropped"] >= 1
+    assert numbers["faces"] == len(faces)
+    # The part that cameras above see is kept, the underside is not.
+    assert vertices[:, 2].max() > 0.48
+    assert -0.48 < vertices[:, 2].min() < -0.1
+    assert not numbers["watertight"]
+
+
+def test_stage_can_keep_the_unseen_underside(stage):
+    numbers, vertices, _ = stage(*join(ball(0.5, resolution=48), ball(0.3, resolution=48)), keep_closed=True)
+    assert numbers["watertight"]
+    assert numbers["manifold"]
+    assert np.linalg.norm(vertices, axis=1).min() > 0.47
+
+
+def test_stage_cuts_to_the_masks(stage):
+    surface = extract_isosurface(
+        lambda p: np.minimum(np.linalg.norm(p, axis=1) - 0.5, np.abs(p[:, 2] + 0.3) - 0.03), 64
+    )
+    numbers, vertices, _ = stage(surface.vertices, surface.faces, masks=silhouettes)
+    assert numbers["outside_masks"] > 1000
+    assert np.linalg.norm(vertices[:, :2], axis=1).max() < 0.62
+    assert vertices[:, 2].max() > 0.48
+
+
+def test_stage_without_masks_keeps_the_table(stage):
+    surface = extract_isosurface(
+        lambda p: np.minimum(np.linalg.norm(p, axis=1) - 0.5, np.abs(p[:, 2] + 0.3) - 0.03), 64
+    )
+    numbers, vertices, faces = stage(surface.vertices, surface.faces, target_faces=3000)
+    assert np.linalg.norm(vertices[:, :2], axis=1).max() > 0.85
+    assert vertices[:, 2].min() > -0.31 - 0.01  # its underside is gone
+    assert len(faces) <= 3000
+    assert numbers["manifold"]
+
+
+def test_stage_says_when_nothing_is_left(stage):
+    empty = lambda cameras: [(i, np.zeros((SIZE, SIZE), bool)) for i in range(len(cameras))]  # noqa: E731
+    with pytest.raises(ReconstructionError) as caught:
+        stage(*ball(), masks=empty)
+    assert "outside_masks" in caught.value.message
+    assert "--set cleanup.mask_hull=false" in caught.value.hint

@@ -1,0 +1,68 @@
+"""The extract stage with an analytic field in place of a trained one."""
+
+from __future__ import annotations
+
+import sys
+import types
+
+import numpy as np
+import pytest
+from test_cleanup import ring_of_cameras
+
+from configs.params import ExtractParams
+from stages import artifacts
+from stages.engine.stage import StageContext
+from stages.errors import ReconstructionError
+from stages.extract import EXTRACT, supported_resolution
+from stages.geometry.cameras import PosedScene
+from stages.geometry.similarity import Similarity
+
+
+@pytest.fixture
+def stage(tmp_path, monkeypatch):
+    undistort, train, out = (tmp_path / name for name in ("undistort", "train", "out"))
+
+    def run(sdf, **params):
+        for folder in (undistort, train, out):
+            folder.mkdir()
+        stand_in = types.ModuleType("stages.neural.field")
+        stand_in.load_field = lambda path, device: types.SimpleNamespace(sdf=sdf)
+        monkeypatch.setitem(sys.modules, "stages.neural.field", stand_in)
+        empty = np.zeros((0, 2), dtype=np.int32)
+        up = np.array([0, 0, 1.0])
+        scene = PosedScene(ring_of_cameras(), Similarity.identity(), np.zeros((0, 3)), np.zeros(0), empty, up)
+        artifacts.save_scene(undistort, scene)
+        seen = []
+        context = StageContext(
+            inputs={"undistort": undistort, "train": train},
+            sources={},
+            out=out,
+            scratch=tmp_path,
+            params=ExtractParams(**params),
+            progress=lambda done, total, note="": seen.append((done, total)),
+        )
+        return EXTRACT.run(context), *artifacts.load_mesh(out), seen
+
+    return run
+
+
+def test_mesh_and_numbers(stage):
+    numbers, vertices, faces, progress = stage(lambda p: np.linalg.norm(p, axis=1) - 0.5, resolution=48, block=16)
+    assert numbers["resolution"] == 48
+    assert numbers["faces"] == len(faces)
+    assert np.abs(np.linalg.norm(vertices, axis=1) - 0.5).max() < 2e-3
+    assert progress[-1][0] == progress[-1][1]
+
+
+def test_no_finer_than_the_photos(stage):
+    numbers, *_ = stage(lambda p: np.linalg.norm(p, axis=1) - 0.5, resolution=512)
+    assert numbers["resolution"] == numbers["supported_resolution"] == supported_resolution(ring_of_cameras())
+    # The unit sphere fills 90 % of the images' 160 pixels; a pixel at its centre is a bit larger than at its front.
+    assert 110 < numbers["resolution"] < 160
+
+
+def test_empty_field_is_an_error_with_a_next_step(stage):
+    with pytest.raises(ReconstructionError) as caught:
+        stage(lambda p: np.ones(len(p), np.float32), resolution=32)
+    assert "0 faces at 32^3" in caught.value.message
+    assert "--set train.steps" in caught.value.hint
