@@ -81,7 +81,7 @@ install_torch() {
         index=(--index-url "$TORCH_CPU_INDEX") # the default index has the CUDA build: gigabytes that a CPU cannot use
     fi
     say "installing $TORCH ${index[*]}"
-    "$VENV/bin/python" -m pip install --quiet "${index[@]}" "$TORCH"
+    "$VENV/bin/python" -m pip install -qq "${index[@]}" "$TORCH"
 }
 
 wanted=$(cat pyproject.toml .ci/setup_env.sh | cksum)
@@ -94,6 +94,6 @@ system_libraries
 make_venv "$python"
 install_torch
 say "installing the project and its tools"
-"$VENV/bin/python" -m pip install --quiet --editable '.[dev]'
+"$VENV/bin/python" -m pip install -qq --editable '.[dev]'
 echo "$wanted" >"$STAMP"
 say "ready in $((SECONDS - started)) s"
