@@ -257,10 +257,11 @@ def make_environment(rng: np.random.Generator, height: int = 128) -> np.ndarray:
         x, w = int(rng.integers(width)), int(rng.integers(width // 30, width // 10))
         top = int(height * rng.uniform(0.30, 0.45))
         cv2.rectangle(environment, (x, top), (x + w, int(0.55 * height)), (rng.uniform(0.05, 0.3, 3)).tolist(), -1)
-    for x, top, w, h, strength in ((0.10, 0.14, 0.13, 0.20, 9.0), (0.62, 0.20, 0.10, 0.16, 4.0)):
-        a = (int(x * width), int(top * height))
-        b = (int((x + w) * width), int((top + h) * height))
-        cv2.rectangle(environment, a, b, (strength, 0.96 * strength, 0.88 * strength), -1)
+    windows = ((0.10, 0.14, 0.13, 0.20, 9.0), (0.62, 0.20, 0.10, 0.16, 4.0))  # left, top, width, height, radiance
+    for left, upper, wide, high, radiance in windows:
+        corner = (int(left * width), int(upper * height))
+        opposite = (int((left + wide) * width), int((upper + high) * height))
+        cv2.rectangle(environment, corner, opposite, (radiance, 0.96 * radiance, 0.88 * radiance), -1)
     return environment
 
 
