@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import os
 import shutil
 import time
@@ -14,6 +15,8 @@ import numpy as np
 from stages import artifacts
 from stages.engine.stage import Stage, StageContext
 from stages.errors import ReconstructionError
+
+log = logging.getLogger(__name__)
 
 LOG_EVERY = 50  # steps between metric lines
 
@@ -38,17 +41,17 @@ def run(context: StageContext) -> dict[str, Any]:
     spent = _resume(trainer, checkpoint, metrics)
     started = saved = time.monotonic()
     previewed = _progress(trainer.step_index, spent, params)
-    with metrics.open("a", encoding="utf-8") as log:
+    with metrics.open("a", encoding="utf-8") as lines:
         while (progress := _progress(trainer.step_index, spent + time.monotonic() - started, params)) < 1:
             numbers = trainer.step(progress)
             if trainer.step_index % LOG_EVERY == 0:
                 numbers_out = {key: float(value) for key, value in numbers.items()}
-                _log(log, trainer, progress, numbers_out)
+                _write_metrics(lines, trainer, progress, numbers_out)
                 context.progress(progress, 1.0, f"PSNR {numbers_out['psnr']:.1f} dB")
                 _check(numbers_out, trainer.step_index)
             now = time.monotonic()
             if now - saved > params.checkpoint_every:
-                log.flush()
+                lines.flush()
                 _save(trainer, checkpoint, spent + now - started)
                 saved = now
             if progress - previewed >= params.preview_every:
@@ -79,7 +82,7 @@ def _use_threads(context: StageContext) -> None:
 
 
 def _load_images(folder: Path, names: tuple[str, ...]) -> tuple[list[np.ndarray], list[np.ndarray] | None]:
-    """RGB images [H, W, 3] uint8 and masks [H, W] uint8, or None when no photo has a mask."""
+    """RGB images [H, W, 3] uint8 and masks [H, W] uint8, or None unless every photo has a mask."""
     from PIL import Image
 
     images, masks = [], []
@@ -90,6 +93,8 @@ def _load_images(folder: Path, names: tuple[str, ...]) -> tuple[list[np.ndarray]
         if mask.exists():
             with Image.open(mask) as image:
                 masks.append(np.asarray(image.convert("L")))
+    if 0 < len(masks) < len(images):
+        log.warning("only %d of %d photos have a mask: training goes without masks", len(masks), len(images))
     return images, masks if len(masks) == len(images) else None
 
 
@@ -98,7 +103,7 @@ def _progress(step: int, seconds: float, params: Any) -> float:
     return seconds / (60 * params.minutes) if params.minutes else step / params.steps
 
 
-def _log(log: IO[str], trainer: Any, progress: float, numbers: dict[str, float]) -> None:
+def _write_metrics(lines: IO[str], trainer: Any, progress: float, numbers: dict[str, float]) -> None:
     record = {
         "step": trainer.step_index,
         "progress": round(progress, 5),
@@ -106,7 +111,7 @@ def _log(log: IO[str], trainer: Any, progress: float, numbers: dict[str, float])
         "scale": round(trainer.scale(progress), 6),
         "levels": trainer.levels(progress),
     }
-    log.write(json.dumps(record) + "\n")
+    lines.write(json.dumps(record) + "\n")
 
 
 def _check(numbers: dict[str, float], step: int) -> None:

@@ -13,6 +13,8 @@ from sphere_scene import RADIUS, render, ring_of_cameras, sphere_scene, write_un
 from configs.params import TrainParams
 from stages import artifacts, train
 from stages.engine.stage import StageContext
+from stages.neural import encodings
+from stages.neural import fields as fields_module
 from stages.neural.field import load_field
 from stages.neural.fields import contract
 from stages.neural.photos import Photos
@@ -79,6 +81,29 @@ def test_every_term_reaches_the_networks():
     for name, parameter in trainer.fields.named_parameters():
         assert parameter.grad is not None, name
         assert parameter.grad.abs().max() > 0, name
+
+
+def test_the_reference_encoding_trains_like_the_kernels(monkeypatch):
+    """The path that CUDA takes, on the CPU: same loss, same gradients."""
+    kernels, reference = make_trainer(), make_trainer()
+    expected = kernels.step(0.3)
+    monkeypatch.setattr(fields_module, "encode", encodings.encode_reference)
+    monkeypatch.setattr(fields_module, "encode_features", encodings._reference_features)
+    numbers = reference.step(0.3)
+    for key, value in expected.items():
+        assert float(numbers[key]) == pytest.approx(float(value), rel=1e-3, abs=1e-5), key
+    for (name, a), b in zip(kernels.fields.named_parameters(), reference.fields.parameters(), strict=True):
+        torch.testing.assert_close(b.grad, a.grad, rtol=1e-2, atol=1e-4 * float(a.grad.abs().max()) + 1e-9, msg=name)
+
+
+def test_masks_for_some_photos_are_said_to_be_ignored(tmp_path, caplog):
+    folder = tmp_path / "undistort"
+    cameras = ring_of_cameras()
+    write_undistorted(folder, cameras, masks=True)
+    assert len(train._load_images(folder, cameras.names)[1]) == 8
+    artifacts.mask_path(folder, cameras.names[0]).unlink()
+    assert train._load_images(folder, cameras.names)[1] is None
+    assert "only 7 of 8 photos have a mask" in caplog.text
 
 
 def test_masks_switch_the_background_off_and_pull_the_opacity():
