@@ -233,7 +233,7 @@ class AtlasMesh:
     normals: np.ndarray
     uvs: np.ndarray
     faces: np.ndarray
-    texture_size: int = 2048
+    texture_size: int
 
 
 def save_atlas(folder: Path, atlas: AtlasMesh) -> None:

@@ -41,6 +41,7 @@ def run(context: StageContext) -> dict[str, Any]:
             normals=atlas.smooth_normals(vertices, faces, layout.source),
             uvs=np.clip(uvs, 0, 1).astype(np.float32),
             faces=layout.faces,
+            texture_size=params.texture_size,
         ),
     )
     corners = uvs[layout.faces]

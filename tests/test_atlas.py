@@ -215,6 +215,7 @@ def run_stage(tmp_path, mesh, **params):
 
 def test_stage_uses_xatlas(tmp_path, mesh):
     numbers, saved = run_stage(tmp_path, mesh, texture_size=TEXTURE)
+    assert saved.texture_size == TEXTURE
     assert numbers["method"] == "xatlas"
     assert numbers["texture_used"] > 0.4
     np.testing.assert_allclose(saved.vertices[saved.faces], mesh[0][mesh[1]])

@@ -200,11 +200,11 @@ def _move_overlaps(layout: UvLayout, pairs: np.ndarray, texture_size: int, paddi
     split = _split_along_seams(layout.faces, charts)
     texels = layout.texels[split.source]
 
-    taken = np.zeros((texture_size, texture_size), dtype=np.uint8)
+    taken: np.ndarray = np.zeros((texture_size, texture_size), dtype=np.uint8)
     for triangle in np.floor(corners[layer == 0]).astype(np.int32):
         cv2.fillConvexPoly(taken, triangle, 1)
     grow = 2 * (padding + 1) + 1
-    taken = cv2.dilate(taken, np.ones((grow, grow), dtype=np.uint8))
+    cv2.dilate(taken, np.ones((grow, grow), dtype=np.uint8), dst=taken)
     border = padding // 2
     taken[:border] = taken[:, :border] = 1
     taken[texture_size - border :] = taken[:, texture_size - border :] = 1

@@ -342,7 +342,8 @@ class _Grid:
                 shift[face // 2] = 1 if face % 2 else -1
                 to = cells[tables.mixed_faces[pattern, face]] + shift
                 outside = (to < 0).any(1) | (to >= self.block).any(1)
-                neighbour = tuple(int(n) for n in np.array(key) + shift)
+                x, y, z = (np.array(key) + shift).tolist()
+                neighbour = (x, y, z)
                 if outside.any() and min(neighbour) >= 0 and max(neighbour) < self.blocks:
                     wanted.setdefault(neighbour, []).append(to[outside] - shift * self.block)
                 to = to[~outside]
