@@ -81,9 +81,9 @@ class CleanupParams(Section):
         0.98, gt=0, le=1, description="faces farther from the centre are dropped, in radii of the region of interest"
     )
     mask_hull: bool = Field(True, description="where masks exist, drop faces that lie outside them")
-    mask_margin: int = Field(5, ge=0, description="masks grow by this many pixels before faces outside them are dropped")
+    mask_margin: int = Field(6, ge=0, description="masks grow by this many pixels before faces outside them are dropped")
     mask_outside: float = Field(
-        0.1, ge=0, le=1, description="a face is outside if it lies off the mask in more than this part of the photos"
+        0.15, ge=0, le=1, description="a face is outside if it lies off the mask in more than this part of the photos"
     )
 
 

@@ -14,6 +14,8 @@ import numpy as np
 
 # xatlas takes the resolution as a wish and mostly exceeds it, by a tenth with some hundred charts.
 FIRST_WISH = 0.9
+# Twice xatlas's own: a fifth fewer charts, and so less padding, on bumpy surfaces in the same time.
+MAX_COST = 4.0
 # Attempts at charts that fit the texture.
 MAX_PACKINGS = 5
 
@@ -30,6 +32,7 @@ def main(source: Path, target: Path) -> None:
         atlas.add_mesh(job["vertices"].astype(np.float32), job["faces"].astype(np.uint32))
         charts = xatlas.ChartOptions()
         charts.max_chart_area = float(job["max_chart_area"])
+        charts.max_cost = MAX_COST
         pack = xatlas.PackOptions()
         pack.resolution = request
         pack.padding = int(job["padding"])
