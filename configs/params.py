@@ -1,6 +1,7 @@
 """Every setting there is: typed, bounded, described with its unit. `load.py` fills them from presets and the user.
 
-Device, worker count, paths and verbosity are not settings: they never change a result, so they never enter a fingerprint.
+Device, worker count, paths and verbosity are not settings: they never change a result, so they never enter a
+fingerprint.
 """
 
 from __future__ import annotations
@@ -40,7 +41,9 @@ class SfmParams(Section):
     min_registered_ratio: float = Field(
         0.3, ge=0, le=1, description="registering a smaller part of the photos than this is an error"
     )
-    deterministic: bool = Field(False, description="single-threaded matching and mapping: same result every time, slower")
+    deterministic: bool = Field(
+        False, description="single-threaded matching and mapping: same result every time, slower"
+    )
     seed: int = Field(0, ge=0, description="random seed")
 
 
@@ -81,7 +84,9 @@ class CleanupParams(Section):
         0.98, gt=0, le=1, description="faces farther from the centre are dropped, in radii of the region of interest"
     )
     mask_hull: bool = Field(True, description="where masks exist, drop faces that lie outside them")
-    mask_margin: int = Field(6, ge=0, description="masks grow by this many pixels before faces outside them are dropped")
+    mask_margin: int = Field(
+        6, ge=0, description="masks grow by this many pixels before faces outside them are dropped"
+    )
     mask_outside: float = Field(
         0.15, ge=0, le=1, description="a face is outside if it lies off the mask in more than this part of the photos"
     )
@@ -126,7 +131,7 @@ class TrainParams(Section):
     seed: int = Field(0, ge=0, description="random seed")
     rays: int = Field(1024, ge=1, description="rays per step")
     samples: int = Field(16, ge=2, description="samples per ray inside the region of interest")
-    free_points: int = Field(1024, ge=0, description="points per step anywhere in the region, for the Eikonal term")
+    free_points: int = Field(512, ge=0, description="points per step anywhere in the region, for the Eikonal term")
 
     levels: int = Field(8, ge=1, le=24, description="levels of the SDF's hash encoding")
     level_features: int = Field(4, ge=1, le=8, description="features per level; CPU kernels exist for 4")
@@ -151,9 +156,12 @@ class TrainParams(Section):
 
     weight_eikonal: float = Field(0.1, ge=0, description="weight of the Eikonal term")
     weight_sparse: float = Field(1.0, ge=0, description="weight of the SfM points' term, faded out")
-    sparse_until: float = Field(0.6, ge=0, le=1, description="progress at which the SfM points' term is gone")
+    sparse_until: float = Field(0.8, ge=0, le=1, description="progress at which the SfM points' term is gone")
     sparse_tolerance: float = Field(0.005, gt=0, description="SfM points off by this count linearly, scene units")
-    sparse_batch: int = Field(512, ge=0, description="SfM points per step")
+    sparse_step: float = Field(
+        0.01, ge=0, description="the SDF must change sign this far before and behind SfM points, scene units"
+    )
+    sparse_batch: int = Field(384, ge=0, description="SfM points per step")
     weight_mask: float = Field(0.1, ge=0, description="weight of the mask term, where masks exist")
     weight_exposure: float = Field(0.1, ge=0, description="weight that holds the photos' gains at 1")
 

@@ -33,7 +33,7 @@ def run(context: StageContext) -> dict[str, Any]:
     folder, params = context.inputs["undistort"], context.params
     scene = artifacts.load_scene(folder)
     photos = Photos(scene.cameras, *_load_images(folder, scene.cameras.names), context.device)
-    sparse = SparsePoints.from_scene(scene.points, scene.point_errors, context.device)
+    sparse = SparsePoints.from_scene(scene, context.device)
     trainer = Trainer(photos, sparse, params, context.device)
 
     checkpoint = artifacts.checkpoint_path(context.scratch)

@@ -44,7 +44,7 @@ def sphere_scene(cameras: PinholeCameras) -> PosedScene:
         Similarity(2.0, np.eye(3), np.array([1.0, 2, 3])),
         points.astype(np.float32),
         np.full(200, 0.3, np.float32),
-        np.zeros((0, 2), np.int32),
+        np.argwhere(cameras.centers @ points.T > RADIUS**2).astype(np.int32),
         np.array([0.0, 0, 1]),
     )
 

@@ -32,7 +32,7 @@ def make_trainer(params: TrainParams = TINY, masks: bool = False) -> Trainer:
     views = [render(cameras, i) for i in range(len(cameras))]
     photos = Photos(cameras, [v[0] for v in views], [v[1] for v in views] if masks else None, "cpu")
     scene = sphere_scene(cameras)
-    return Trainer(photos, SparsePoints.from_scene(scene.points, scene.point_errors, "cpu"), params, "cpu")
+    return Trainer(photos, SparsePoints.from_scene(scene, "cpu"), params, "cpu")
 
 
 def test_rays_see_the_pixels_they_were_drawn_from():

@@ -38,6 +38,17 @@ def sparse_point_error(sdf: torch.Tensor, tolerance: float) -> torch.Tensor:
     return torch.where(distance < tolerance, distance**2 / (2 * tolerance), distance - 0.5 * tolerance)
 
 
+def sparse_crossing_error(sdf_front: torch.Tensor, sdf_behind: torch.Tensor, margin: float) -> torch.Tensor:
+    """How far f fails to change sign at SfM points [N], given f a step before and a step behind each, seen from the
+    cameras.
+
+    max(0, margin - f_front) + max(0, f_behind + margin), scene units. Zero where the front is free and what is behind
+    is solid. Without it f may touch zero at the points and stay positive behind them: a surface that is not there,
+    which the background model is free to paint.
+    """
+    return torch.relu(margin - sdf_front) + torch.relu(sdf_behind + margin)
+
+
 def mask_error(opacity: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
     """Binary cross-entropy per ray [R] between the rendered opacity and the mask, both in [0, 1] (NeuS, L_mask)."""
     return torch.nn.functional.binary_cross_entropy(opacity.clamp(1e-3, 1 - 1e-3), mask, reduction="none")

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from configs.params import TrainParams
+from stages.geometry.cameras import PosedScene
 from stages.neural import losses, schedules
 from stages.neural.encodings import HashGrid
 from stages.neural.fields import BackgroundNetwork, Fields, FieldShape
@@ -27,19 +28,30 @@ _BACKGROUND_REACH = 0.995
 
 @dataclass(frozen=True)
 class SparsePoints:
-    """SfM points inside the region of interest: positions [P, 3] and weights [P] in [0, 1]."""
+    """SfM points inside the region of interest.
+
+    Attributes:
+        positions: [P, 3].
+        directions: [P, 3] unit, mean direction in which the photos looked at the point; zero where nobody knows.
+        weights: [P] in [0, 1].
+    """
 
     positions: torch.Tensor
+    directions: torch.Tensor
     weights: torch.Tensor
 
     @staticmethod
-    def from_scene(points: np.ndarray, errors: np.ndarray, device: torch.device | str) -> SparsePoints:
+    def from_scene(scene: PosedScene, device: torch.device | str) -> SparsePoints:
         """Keep points inside the unit sphere; weight 1 / (1 + e^2), e the reprojection error in pixels."""
-        inside = np.linalg.norm(points, axis=1) < 0.98
-        weights = 1 / (1 + errors[inside] ** 2)
-        return SparsePoints(
-            torch.from_numpy(points[inside]).float().to(device), torch.from_numpy(weights).float().to(device)
-        )
+        image, point = scene.observations[:, 0], scene.observations[:, 1]
+        looks = scene.points[point] - scene.cameras.centers[image]
+        looks /= np.linalg.norm(looks, axis=1, keepdims=True)
+        directions = np.zeros_like(scene.points, dtype=np.float64)
+        np.add.at(directions, point, looks)
+        directions /= np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-9)
+        inside = np.linalg.norm(scene.points, axis=1) < 0.98
+        kept = (scene.points[inside], directions[inside], 1 / (1 + scene.point_errors[inside] ** 2))
+        return SparsePoints(*(torch.from_numpy(array).float().to(device) for array in kept))
 
 
 @dataclass(frozen=True)
@@ -120,11 +132,11 @@ class Trainer:
         self._refresh_cache(progress)
         batch = self.photos.draw(params.rays, self.generator)
         extra, sparse_weights = self._extra_points()
+        num_sparse = len(sparse_weights)
         rendered = self.render(batch, progress, extra, self.generator)
         exposed = rendered.colors * torch.exp(self.fields.log_gains[batch.images])
 
         photo_error = losses.rgb_error(exposed, batch.colors)
-        num_sparse = len(sparse_weights)
         if batch.masks is not None:  # outside the masks nothing is known of the colour
             photo_error = photo_error * batch.masks
             mask_loss = losses.mask_error(rendered.opacity, batch.masks).mean()
@@ -133,7 +145,9 @@ class Trainer:
         rgb_loss = photo_error.mean()
         gradients = torch.cat([rendered.gradients, rendered.extra_gradients])
         eikonal_loss = losses.eikonal_error(gradients).mean()
-        sparse_error = losses.sparse_point_error(rendered.extra_sdf[:num_sparse], params.sparse_tolerance)
+        on_point, front, behind = rendered.extra_sdf[: 3 * num_sparse].view(3, num_sparse)
+        sparse_error = losses.sparse_point_error(on_point, params.sparse_tolerance)
+        sparse_error = sparse_error + losses.sparse_crossing_error(front, behind, 0.25 * params.sparse_step)
         sparse_loss = (sparse_weights * sparse_error).sum() / max(num_sparse, 1)
         exposure_loss = losses.exposure_error(self.fields.log_gains).mean()
 
@@ -165,15 +179,16 @@ class Trainer:
             }
 
     def _extra_points(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Points [E, 3] evaluated beside the rays': first a draw of sparse points, then some anywhere in the ball.
+        """Points [3 S + A, 3] evaluated beside the rays' samples, and the weights [S] of the sparse ones.
 
-        Returns the sparse points' weights too.
+        S sparse points, the same a step towards the cameras, the same a step behind; then A anywhere in the cube.
         """
         params = self.params
         count = min(params.sparse_batch, len(self.sparse.weights))
         chosen = torch.randint(max(len(self.sparse.weights), 1), (count,), generator=self.generator, device=self.device)
+        on_point, step = self.sparse.positions[chosen], params.sparse_step * self.sparse.directions[chosen]
         anywhere = torch.rand(params.free_points, 3, generator=self.generator, device=self.device) * 2 - 1
-        return torch.cat([self.sparse.positions[chosen], anywhere]), self.sparse.weights[chosen]
+        return torch.cat([on_point, on_point - step, on_point + step, anywhere]), self.sparse.weights[chosen]
 
     # ------------------------------------------------------------------ rendering
     def render(
