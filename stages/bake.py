@@ -47,9 +47,7 @@ def run(context: StageContext) -> dict[str, Any]:
     return baked.numbers
 
 
-def load_photo(
-    undistorted: Path, cameras: PinholeCameras, index: int
-) -> tuple[np.ndarray, np.ndarray | None]:
+def load_photo(undistorted: Path, cameras: PinholeCameras, index: int) -> tuple[np.ndarray, np.ndarray | None]:
     """Undistorted photo [H, W, 3] uint8 RGB and its mask [H, W] bool, or None where there is no mask."""
     import cv2
 

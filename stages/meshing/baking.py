@@ -176,9 +176,7 @@ def _prepare(atlas: AtlasMesh, cameras: PinholeCameras, load_photo: LoadPhoto, i
     return prepare_view(cameras, index, photo, mask, atlas.vertices, atlas.faces)
 
 
-def _prefetch(
-    pool: ThreadPoolExecutor, prepare: Callable[[int], View], count: int, ahead: int
-) -> Iterator[View]:
+def _prefetch(pool: ThreadPoolExecutor, prepare: Callable[[int], View], count: int, ahead: int) -> Iterator[View]:
     """Views 0..count-1 in order, `ahead` of them being made in the background."""
     waiting: list[Future[View]] = []
     submitted = 0
@@ -270,8 +268,9 @@ def _blend(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Colours [T, 3] float32 (0..255) and the number of photos that see each texel [T]."""
     count = len(points)
-    best_weights = np.zeros((count, keep), dtype=np.float32)
-    best_lows = np.zeros((count, keep, 3), dtype=np.uint16)
+    # One view more than is blended: the others' weights are measured against it.
+    best_weights = np.zeros((count, keep + 1), dtype=np.float32)
+    best_lows = np.zeros((count, keep + 1, 3), dtype=np.uint16)
     seen_by = np.zeros(count, dtype=np.uint16)
     detail_rank = np.zeros(count, dtype=np.float32)
     details = np.zeros((count, 3), dtype=np.int16)

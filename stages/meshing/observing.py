@@ -20,9 +20,7 @@ NOISE_FLOOR = 3.0
 
 
 @njit(nogil=True, cache=True)
-def observe(
-    px, py, pz, nx, ny, nz, matrix, center, focal, inverse_depth, confidence
-):  # pragma: no cover - compiled
+def observe(px, py, pz, nx, ny, nz, matrix, center, focal, inverse_depth, confidence):  # pragma: no cover - compiled
     """Weight with which a photo sees a point, and the pixel; weight 0: it does not.
 
     weight = confidence · (focal cos θ / depth)² cos θ: pixels on a unit of surface, times a further fall-off
@@ -133,11 +131,14 @@ def blend_texels(
 ):  # pragma: no cover - compiled
     """Fill colors [T, 3] (0..255 float32) from the buffers of `gather_texels`.
 
-    Low band: weighted mean of the views within robust_sigma · 1.4826 · MAD of the weighted median. The high
-    band is added, faded by exp(-(d / ghost_levels)²) where its view's low band lies d off the robust mean: a
-    highlight or a misplaced surface there, whose detail belongs elsewhere.
+    Low band: mean of all kept views but the last, whose weight is taken off the others', so that a view fades out
+    before it leaves the set and no seam shows where it does. Views at d = robust_sigma · 1.4826 · MAD from the
+    weighted median and beyond count nothing, nearer ones (1 - (·/d)²)² (Tukey's biweight).
+
+    The high band is added, faded by exp(-(d / ghost_levels)²) where its view's low band lies d off the robust
+    mean: a highlight or a misplaced surface there, whose detail belongs elsewhere.
     """
-    keep = best_weights.shape[1]
+    keep = best_weights.shape[1] - 1
     values = np.empty((keep, 3))
     weights = np.empty(keep)
     deviations = np.empty(keep)
@@ -162,11 +163,14 @@ def blend_texels(
         total = 0.0
         mean0, mean1, mean2 = 0.0, 0.0, 0.0
         for k in range(count):
-            if deviations[k] <= robust_sigma * spread:
-                total += weights[k]
-                mean0 += weights[k] * values[k, 0]
-                mean1 += weights[k] * values[k, 1]
-                mean2 += weights[k] * values[k, 2]
+            near = 1.0 - (deviations[k] / (robust_sigma * spread)) ** 2
+            if near > 0:
+                # A little of each weight stays: with equal ones, nothing would be left.
+                weight = (1.001 * weights[k] - best_weights[i, keep]) * near * near
+                total += weight
+                mean0 += weight * values[k, 0]
+                mean1 += weight * values[k, 1]
+                mean2 += weight * values[k, 2]
         if total > 0:
             median[0], median[1], median[2] = mean0 / total, mean1 / total, mean2 / total
         off = 0.0

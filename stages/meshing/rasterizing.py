@@ -131,9 +131,7 @@ def texel_positions(uvs: np.ndarray, size: int) -> np.ndarray:
     return np.stack([uvs[:, 0] * size, (1.0 - uvs[:, 1]) * size], 1)
 
 
-def rasterize_atlas(
-    uvs: np.ndarray, faces: np.ndarray, size: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def rasterize_atlas(uvs: np.ndarray, faces: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The texels whose centres lie in a chart.
 
     Args:

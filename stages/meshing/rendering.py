@@ -51,9 +51,7 @@ def turntable(
     elevation = np.radians(elevation_deg)
     views = []
     for angle in np.linspace(0, 2 * np.pi, count, endpoint=False):
-        direction = (
-            np.cos(elevation) * (np.cos(angle) * side + np.sin(angle) * ahead) + np.sin(elevation) * up
-        )
+        direction = np.cos(elevation) * (np.cos(angle) * side + np.sin(angle) * ahead) + np.sin(elevation) * up
         views.append(look_at(center + distance * direction, center, up, width, height, fov_deg))
     return views
 
@@ -116,7 +114,5 @@ def render_textured(
             facing = np.abs((shading * towards).sum(1, keepdims=True))
             colors = colors * (0.35 + 0.65 * facing)
         image[hit] = colors
-    image = image.reshape(height // supersample, supersample, width // supersample, supersample, 3).mean(
-        (1, 3)
-    )
+    image = image.reshape(height // supersample, supersample, width // supersample, supersample, 3).mean((1, 3))
     return np.clip(image + 0.5, 0, 255).astype(np.uint8)

@@ -72,13 +72,9 @@ def prepare_view(
 
     width, height = (int(side) for side in cameras.sizes[index])
     if photo.shape != (height, width, 3):
-        raise ValueError(
-            f"photo {cameras.names[index]}: expected shape {(height, width, 3)}, got {photo.shape}"
-        )
+        raise ValueError(f"photo {cameras.names[index]}: expected shape {(height, width, 3)}, got {photo.shape}")
     if mask is not None and mask.shape != (height, width):
-        raise ValueError(
-            f"mask of {cameras.names[index]}: expected shape {(height, width)}, got {mask.shape}"
-        )
+        raise ValueError(f"mask of {cameras.names[index]}: expected shape {(height, width)}, got {mask.shape}")
     K = cameras.intrinsics[index]
     focal = float(np.sqrt(K[0, 0] * K[1, 1]))
     _, inverse_depth = depth_map(cameras, index, vertices, faces)
@@ -87,9 +83,7 @@ def prepare_view(
         on_object &= mask
     linked_left, linked_up = surface_links(np.where(on_object, inverse_depth, 0).astype(np.float32), focal)
     interior = np.zeros((height, width), dtype=np.uint8)
-    interior[1:-1, 1:-1] = (
-        linked_left[1:-1, 1:-1] & linked_left[1:-1, 2:] & linked_up[1:-1, 1:-1] & linked_up[2:, 1:-1]
-    )
+    interior[1:-1, 1:-1] = linked_left[1:-1, 1:-1] & linked_left[1:-1, 2:] & linked_up[1:-1, 1:-1] & linked_up[2:, 1:-1]
     from_edge = cv2.distanceTransform(interior, cv2.DIST_L2, 3)
     confidence = np.clip((from_edge - UNSAFE_PIXELS) / FADE_PIXELS, FAINT, 1.0)
     confidence[~on_object] = 0

@@ -1,0 +1,108 @@
+"""The bake stage on files: what it reads, what it writes, what it says when something is wrong."""
+
+from __future__ import annotations
+
+import sys
+from types import ModuleType, SimpleNamespace
+
+import numpy as np
+import pytest
+
+from configs.params import BakeParams
+from stages import artifacts
+from stages.artifacts import AtlasMesh
+from stages.bake import BAKE, load_photo, write_png
+from stages.engine.stage import StageContext
+from stages.errors import ReconstructionError, WorkspaceError
+from stages.geometry.cameras import PinholeCameras, PosedScene
+from stages.geometry.similarity import Similarity
+from stages.meshing.baking import Provenance
+from stages.meshing.rendering import look_at
+
+SKY = np.array([90, 160, 210], np.uint8)
+
+
+@pytest.fixture
+def context(tmp_path, monkeypatch) -> StageContext:
+    """A square seen from the front by two cameras; its back is another square nobody sees."""
+    fake = ModuleType("stages.neural.field")
+    fake.load_field = lambda path, device: SimpleNamespace(  # type: ignore[attr-defined]
+        color=lambda points, normals, view_dirs: np.full(points.shape, 0.5, np.float32)
+    )
+    monkeypatch.setitem(sys.modules, "stages.neural.field", fake)
+    folders = {name: tmp_path / name for name in (*BAKE.needs, "out", "scratch")}
+    for folder in folders.values():
+        folder.mkdir()
+    square = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * 0.5
+    front = np.stack([square[:, 0], np.zeros(4), square[:, 1]], 1)  # faces -y
+    normals = np.tile([0.0, -1, 0], (4, 1))
+    uvs = (square + 0.5) * [0.4, 0.8] + [0.05, 0.1]
+    faces = np.array([[0, 1, 2], [0, 2, 3]])
+    atlas = AtlasMesh(
+        np.concatenate([front, front]).astype(np.float32),
+        np.concatenate([normals, -normals]).astype(np.float32),
+        np.concatenate([uvs, uvs + np.array([0.5, 0])]).astype(np.float32),
+        np.concatenate([faces, faces[:, ::-1] + 4]).astype(np.int32),
+        64,
+    )
+    artifacts.save_atlas(folders["atlas"], atlas)
+    up = np.array([0.0, 0, 1])
+    views = [look_at(np.array([x, -2.5, 0.2]), np.zeros(3), up, 48, 40, 40) for x in (-0.5, 0.6)]
+    cameras = PinholeCameras(
+        ("one.png", "sub/two.png"),
+        np.concatenate([view.sizes for view in views]),
+        np.concatenate([view.intrinsics for view in views]),
+        np.concatenate([view.cam_from_scene for view in views]),
+    )
+    scene = PosedScene(cameras, Similarity.identity(), np.zeros((1, 3)), np.zeros(1), np.zeros((1, 2)), up)
+    artifacts.save_scene(folders["undistort"], scene)
+    for name in cameras.names:
+        path = artifacts.image_path(folders["undistort"], name)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_png(path, np.broadcast_to(SKY, (40, 48, 3)).copy())
+    return StageContext(
+        inputs={name: folders[name] for name in BAKE.needs},
+        sources={},
+        out=folders["out"],
+        scratch=folders["scratch"],
+        params=BakeParams(),
+    )
+
+
+def test_files_and_numbers(context):
+    import cv2
+
+    numbers = BAKE.run(context)
+    color = cv2.imread(str(artifacts.base_color_path(context.out)))[..., ::-1]
+    kinds = cv2.imread(str(artifacts.provenance_path(context.out)), cv2.IMREAD_GRAYSCALE)
+    assert color.shape == (64, 64, 3)
+    assert np.abs(color[kinds == Provenance.PHOTO].astype(int) - SKY).max() <= 1  # red stays red
+    assert (kinds[10:50, :28] == Provenance.PHOTO).mean() > 0.8
+    assert not (kinds[:, 34:] == Provenance.PHOTO).any()
+    assert (kinds == Provenance.FIELD).sum() > 1000
+    assert numbers["seen_share"] == pytest.approx(0.5, abs=0.06)  # the rim of a photo's silhouette is not used
+    assert numbers["mean_views"] == pytest.approx(2, abs=0.1)
+
+
+def test_a_mask_hides_what_lies_outside_it(context):
+    for name in ("one.png", "sub/two.png"):
+        path = artifacts.mask_path(context.inputs["undistort"], name)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_png(path, np.zeros((40, 48), np.uint8))
+    cameras = artifacts.load_scene(context.inputs["undistort"]).cameras
+    _, mask = load_photo(context.inputs["undistort"], cameras, 1)
+    assert mask is not None
+    assert not mask.any()
+    assert BAKE.run(context)["seen_share"] == 0
+
+
+def test_an_image_that_cannot_be_read_is_named(context):
+    artifacts.image_path(context.inputs["undistort"], "sub/two.png").write_bytes(b"")
+    with pytest.raises(WorkspaceError, match=r"sub/two\.png cannot be read"):
+        BAKE.run(context)
+
+
+def test_an_image_of_the_wrong_size_is_explained(context):
+    write_png(artifacts.image_path(context.inputs["undistort"], "one.png"), np.zeros((10, 10, 3), np.uint8))
+    with pytest.raises(ReconstructionError, match=r"photo one\.png: expected shape \(40, 48, 3\)"):
+        BAKE.run(context)
