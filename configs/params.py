@@ -103,7 +103,7 @@ class AtlasParams(Section):
 class BakeParams(Section):
     """Photos to texture."""
 
-    views: int = Field(5, ge=1, le=32, description="photos blended for the low band, the best ones for each texel")
+    views: int = Field(8, ge=1, le=32, description="photos blended for the low band, the best ones for each texel")
     detail: bool = Field(True, description="add the high band of the single best photo")
     gain: bool = Field(True, description="compensate brightness between photos")
     robust_sigma: float = Field(

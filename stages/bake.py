@@ -74,7 +74,7 @@ def write_png(path: Path, image: np.ndarray) -> None:
 
 BAKE = Stage(
     name="bake",
-    version=1,
+    version=2,
     needs=("undistort", "train", "atlas"),
     params="bake",
     run=run,

@@ -299,7 +299,7 @@ def describe_photos(ingest: Path, sfm: Path, most: int) -> dict[str, Any]:
 
 # ---------------------------------------------------------------- training
 def training_charts(path: Path) -> list[dict[str, str]]:
-    """A small curve for each number of `CURVES` that was logged."""
+    """A small curve for each number of `CURVES` that was logged and changed."""
     records = []
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
@@ -319,7 +319,7 @@ def training_charts(path: Path) -> list[dict[str, str]]:
             for position, record in enumerate(records)
             if isinstance(record.get(key), (int, float)) and math.isfinite(record[key])
         ]
-        if len(points) >= 2:
+        if len({value for _, value in points}) >= 2:
             charts.append({"label": key, "last": f"{points[-1][1]:.4g}", "svg": line_chart(points)})
     return charts
 
@@ -365,7 +365,7 @@ def training_previews(folder: Path) -> list[dict[str, str]]:
 
 REPORT = Stage(
     name="report",
-    version=1,
+    version=2,
     needs=("ingest", "sfm", "undistort", "train", "extract", "cleanup", "atlas", "bake", "export"),
     params="report",
     run=run,

@@ -87,7 +87,7 @@ def full(context) -> StageContext:
             "unregistered": [{"name": "b <odd>.png", "reason": "only 3 matches"}],
         },
     )
-    lines = [{"step": 10 * i, "psnr": 10 + i, "loss": 0.5 / (i + 1), "rgb": None} for i in range(50)]
+    lines = [{"step": 10 * i, "psnr": 10 + i, "loss": 0.5 / (i + 1), "rgb": None, "mask": 0.0} for i in range(50)]
     text = "\n".join(json.dumps(line) for line in lines) + '\n{"step": 500, "psn'
     artifacts.metrics_path(inputs["train"]).write_text(text)
     preview = artifacts.preview_path(inputs["train"], 100)
@@ -158,7 +158,7 @@ def test_the_page_says_it_all_and_refers_to_nothing_outside(full):
         "75.0 %",
     ):
         assert text in html, text
-    assert html.count("<polyline") == 2  # psnr and loss; rgb is never a number
+    assert html.count("<polyline") == 2  # psnr and loss; rgb is never a number, mask never changes
 
 
 def test_photos_left_out_come_first_and_the_number_is_capped(full):

@@ -82,7 +82,7 @@ def bake_texture(
     load_photo: LoadPhoto,
     color_field: ColorField,
     texture_size: int,
-    views: int = 5,
+    views: int = 8,
     detail: bool = True,
     gain: bool = True,
     robust_sigma: float = 2.5,
