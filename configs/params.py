@@ -155,13 +155,13 @@ class TrainParams(Section):
     lr_final: float = Field(0.03, ge=0, le=1, description="rate at the end as a part of the peak")
 
     weight_eikonal: float = Field(0.1, ge=0, description="weight of the Eikonal term")
-    weight_sparse: float = Field(1.0, ge=0, description="weight of the SfM points' term, faded out")
+    weight_sparse: float = Field(1.0, ge=0, description="weight of the SfM points' terms, faded out")
     sparse_until: float = Field(0.8, ge=0, le=1, description="progress at which the SfM points' term is gone")
     sparse_tolerance: float = Field(0.005, gt=0, description="SfM points off by this count linearly, scene units")
     sparse_step: float = Field(
-        0.01, ge=0, description="the SDF must change sign this far before and behind SfM points, scene units"
+        0.01, ge=0, description="the SDF must have changed sign this far before and behind SfM points, scene units"
     )
-    sparse_batch: int = Field(384, ge=0, description="SfM points per step")
+    sparse_batch: int = Field(384, ge=0, description="sightings of SfM points per step")
     weight_mask: float = Field(0.1, ge=0, description="weight of the mask term, where masks exist")
     weight_exposure: float = Field(0.1, ge=0, description="weight that holds the photos' gains at 1")
 

@@ -1,1 +1,1 @@
-"""The pipeline from photos to a textured mesh, usable without the command line. `pipeline.py` is its table of contents."""
+"""The pipeline from photos to a textured mesh, usable without the command line. `pipeline.py` is its contents page."""

@@ -27,14 +27,14 @@ def run(context: StageContext) -> dict[str, Any]:
 
     from stages.neural.field import field_state
     from stages.neural.photos import Photos
-    from stages.neural.trainer import SparsePoints, Trainer
+    from stages.neural.trainer import Sightings, Trainer
 
     _use_threads(context)
     folder, params = context.inputs["undistort"], context.params
     scene = artifacts.load_scene(folder)
     photos = Photos(scene.cameras, *_load_images(folder, scene.cameras.names), context.device)
-    sparse = SparsePoints.from_scene(scene, context.device)
-    trainer = Trainer(photos, sparse, params, context.device)
+    sightings = Sightings.from_scene(scene, context.device)
+    trainer = Trainer(photos, sightings, params, context.device)
 
     checkpoint = artifacts.checkpoint_path(context.scratch)
     metrics = artifacts.metrics_path(context.scratch)
@@ -67,7 +67,7 @@ def run(context: StageContext) -> dict[str, Any]:
         "train_seconds": round(seconds, 1),
         "rays_per_second": round(trainer.step_index * params.rays / max(seconds, 1e-9)),
         "photos": len(photos),
-        "sparse_points": len(sparse.weights),
+        "sightings": len(sightings.weights),
         **_last_numbers(artifacts.metrics_path(context.out)),
     }
 

@@ -38,14 +38,16 @@ def test_sparse_points_pull_evenly_beyond_the_tolerance():
     assert sdf.grad.tolist() == pytest.approx([0, 0.1, -1, 1])
 
 
-def test_crossing_error_wants_free_space_before_and_solid_behind():
-    front = torch.tensor([0.02, 0.0, -0.01], requires_grad=True)
-    behind = torch.tensor([-0.02, 0.01, -0.02], requires_grad=True)
-    error = losses.sparse_crossing_error(front, behind, 0.005)
-    assert error.tolist() == pytest.approx([0, 0.02, 0.015])
-    error.sum().backward()
-    assert front.grad.tolist() == [0, -1, -1]
-    assert behind.grad.tolist() == [0, 1, 0]
+def test_free_and_solid_places_are_pushed_to_their_side_of_the_surface():
+    sdf = torch.tensor([0.02, 0.0, -0.01], requires_grad=True)
+    outside, inside = losses.outside_error(sdf, 0.005), losses.inside_error(sdf, 0.005)
+    assert outside.tolist() == pytest.approx([0, 0.005, 0.015])
+    assert inside.tolist() == pytest.approx([0.025, 0.005, 0])
+    outside.sum().backward()
+    assert sdf.grad.tolist() == [0, -1, -1]
+    sdf.grad = None
+    inside.sum().backward()
+    assert sdf.grad.tolist() == [1, 1, 0]
 
 
 def test_mask_error_pulls_the_opacity_towards_the_mask():

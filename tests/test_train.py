@@ -18,7 +18,7 @@ from stages.neural import fields as fields_module
 from stages.neural.field import load_field
 from stages.neural.fields import contract
 from stages.neural.photos import Photos
-from stages.neural.trainer import SparsePoints, Trainer
+from stages.neural.trainer import Sightings, Trainer
 
 TINY = TrainParams(
     steps=60, rays=128, samples=12, levels=4, log2_rows=10, coarsest=8, finest=32, hidden=16, start_levels=2,
@@ -32,7 +32,7 @@ def make_trainer(params: TrainParams = TINY, masks: bool = False) -> Trainer:
     views = [render(cameras, i) for i in range(len(cameras))]
     photos = Photos(cameras, [v[0] for v in views], [v[1] for v in views] if masks else None, "cpu")
     scene = sphere_scene(cameras)
-    return Trainer(photos, SparsePoints.from_scene(scene, "cpu"), params, "cpu")
+    return Trainer(photos, Sightings.from_scene(scene, "cpu"), params, "cpu")
 
 
 def test_rays_see_the_pixels_they_were_drawn_from():
@@ -47,6 +47,16 @@ def test_rays_see_the_pixels_they_were_drawn_from():
         assert np.allclose(pixel[0] % 1, 0.5, atol=1e-3)
         expected = render(cameras, image)[0][y, x] / 255
         assert np.allclose(batch.colors[row].numpy(), expected, atol=1e-6)
+
+
+def test_sightings_end_at_their_points_and_are_free_before():
+    sightings = make_trainer().sightings
+    assert len(sightings.weights) > 200
+    assert torch.allclose(sightings.points.norm(dim=1), torch.tensor(RADIUS), atol=1e-5)
+    for share in (0.1, 0.5, 1.0):
+        places = sightings.points - share * sightings.free[:, None] * sightings.directions
+        assert (places.norm(dim=1) > RADIUS).all()
+    assert torch.allclose(places.norm(dim=1), torch.tensor(1.0), atol=1e-4)  # the whole length ends on the sphere
 
 
 def test_the_field_is_a_sphere_before_training():

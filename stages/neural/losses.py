@@ -38,15 +38,21 @@ def sparse_point_error(sdf: torch.Tensor, tolerance: float) -> torch.Tensor:
     return torch.where(distance < tolerance, distance**2 / (2 * tolerance), distance - 0.5 * tolerance)
 
 
-def sparse_crossing_error(sdf_front: torch.Tensor, sdf_behind: torch.Tensor, margin: float) -> torch.Tensor:
-    """How far f fails to change sign at SfM points [N], given f a step before and a step behind each, seen from the
-    cameras.
+def outside_error(sdf: torch.Tensor, margin: float) -> torch.Tensor:
+    """max(0, margin - f) per point [N] that is known to be free, scene units; zero from the margin on.
 
-    max(0, margin - f_front) + max(0, f_behind + margin), scene units. Zero where the front is free and what is behind
-    is solid. Without it f may touch zero at the points and stay positive behind them: a surface that is not there,
-    which the background model is free to paint.
+    A line of sight is free up to the SfM point at its end: what the first sphere covers of it must go.
     """
-    return torch.relu(margin - sdf_front) + torch.relu(sdf_behind + margin)
+    return torch.relu(margin - sdf)
+
+
+def inside_error(sdf: torch.Tensor, margin: float) -> torch.Tensor:
+    """max(0, f + margin) per point [N] that is known to be solid, scene units; zero below -margin.
+
+    Right behind an SfM point there is something. Without this f may touch zero at the points and stay positive behind
+    them: a surface that is not there, which the background model is free to paint.
+    """
+    return torch.relu(sdf + margin)
 
 
 def mask_error(opacity: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:

@@ -18,7 +18,7 @@ from stages.neural.encodings import HashGrid
 from stages.neural.fields import BackgroundNetwork, Fields, FieldShape
 from stages.neural.photos import Photos, RayBatch
 from stages.neural.rendering import composite, sample_optical_depths, weights_from_optical_depth
-from stages.neural.sampling import SdfCache, importance_distances
+from stages.neural.sampling import SdfCache, importance_distances, intersect_unit_sphere
 
 # Samples that weigh less than this get no colour: together they change a pixel by less than one grey level.
 _COLOR_THRESHOLD = 2e-4
@@ -27,31 +27,34 @@ _BACKGROUND_REACH = 0.995
 
 
 @dataclass(frozen=True)
-class SparsePoints:
-    """SfM points inside the region of interest.
+class Sightings:
+    """Which photo saw which SfM point: M lines of sight that are free up to the surface at their end.
 
     Attributes:
-        positions: [P, 3].
-        directions: [P, 3] unit, mean direction in which the photos looked at the point; zero where nobody knows.
-        weights: [P] in [0, 1].
+        points: [M, 3] the SfM point at the end of each line, inside the region of interest.
+        directions: [M, 3] unit, from the camera to the point.
+        free: [M] length of the line inside the unit sphere before the point.
+        weights: [M] in [0, 1].
     """
 
-    positions: torch.Tensor
+    points: torch.Tensor
     directions: torch.Tensor
+    free: torch.Tensor
     weights: torch.Tensor
 
     @staticmethod
-    def from_scene(scene: PosedScene, device: torch.device | str) -> SparsePoints:
-        """Keep points inside the unit sphere; weight 1 / (1 + e^2), e the reprojection error in pixels."""
-        image, point = scene.observations[:, 0], scene.observations[:, 1]
-        looks = scene.points[point] - scene.cameras.centers[image]
-        looks /= np.linalg.norm(looks, axis=1, keepdims=True)
-        directions = np.zeros_like(scene.points, dtype=np.float64)
-        np.add.at(directions, point, looks)
-        directions /= np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-9)
+    def from_scene(scene: PosedScene, device: torch.device | str) -> Sightings:
+        """Sightings of points inside the unit sphere; weight 1 / (1 + e^2), e the reprojection error in pixels."""
         inside = np.linalg.norm(scene.points, axis=1) < 0.98
-        kept = (scene.points[inside], directions[inside], 1 / (1 + scene.point_errors[inside] ** 2))
-        return SparsePoints(*(torch.from_numpy(array).float().to(device) for array in kept))
+        image, point = scene.observations[inside[scene.observations[:, 1]]].T
+        points = torch.from_numpy(scene.points[point]).float()
+        origins = torch.from_numpy(scene.cameras.centers[image]).float()
+        distances = torch.linalg.vector_norm(points - origins, dim=1)
+        directions = (points - origins) / distances[:, None]
+        entry, _, _ = intersect_unit_sphere(origins, directions)
+        weights = torch.from_numpy(1 / (1 + scene.point_errors[point] ** 2)).float()
+        kept = (points, directions, (distances - entry).clamp(min=0), weights)
+        return Sightings(*(tensor.to(device) for tensor in kept))
 
 
 @dataclass(frozen=True)
@@ -91,8 +94,8 @@ def field_shape(params: TrainParams, num_images: int, background: bool) -> Field
 class Trainer:
     """Networks, optimiser, sampler and random state: all that a checkpoint must hold."""
 
-    def __init__(self, photos: Photos, sparse: SparsePoints, params: TrainParams, device: torch.device | str) -> None:
-        self.photos, self.sparse, self.params = photos, sparse, params
+    def __init__(self, photos: Photos, sightings: Sightings, params: TrainParams, device: torch.device | str) -> None:
+        self.photos, self.sightings, self.params = photos, sightings, params
         self.device = torch.device(device)
         background = params.background and photos.masks is None
         self.fields = Fields(field_shape(params, len(photos), background), params.seed).to(device)
@@ -145,9 +148,14 @@ class Trainer:
         rgb_loss = photo_error.mean()
         gradients = torch.cat([rendered.gradients, rendered.extra_gradients])
         eikonal_loss = losses.eikonal_error(gradients).mean()
-        on_point, front, behind = rendered.extra_sdf[: 3 * num_sparse].view(3, num_sparse)
-        sparse_error = losses.sparse_point_error(on_point, params.sparse_tolerance)
-        sparse_error = sparse_error + losses.sparse_crossing_error(front, behind, 0.25 * params.sparse_step)
+        on_point, behind, front, free = rendered.extra_sdf[: 4 * num_sparse].view(4, num_sparse)
+        margin = 0.25 * params.sparse_step
+        sparse_error = (
+            losses.sparse_point_error(on_point, params.sparse_tolerance)
+            + losses.inside_error(behind, margin)
+            + losses.outside_error(front, margin)
+            + losses.outside_error(free, margin)
+        )
         sparse_loss = (sparse_weights * sparse_error).sum() / max(num_sparse, 1)
         exposure_loss = losses.exposure_error(self.fields.log_gains).mean()
 
@@ -179,16 +187,22 @@ class Trainer:
             }
 
     def _extra_points(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Points [3 S + A, 3] evaluated beside the rays' samples, and the weights [S] of the sparse ones.
+        """Points [4 S + A, 3] evaluated beside the rays' samples, and the weights [S] of the sightings among them.
 
-        S sparse points, the same a step towards the cameras, the same a step behind; then A anywhere in the cube.
+        Of S sightings the points, then places a step behind them, a step before them, and somewhere on the free line
+        of sight; last A places anywhere in the cube.
         """
-        params = self.params
-        count = min(params.sparse_batch, len(self.sparse.weights))
-        chosen = torch.randint(max(len(self.sparse.weights), 1), (count,), generator=self.generator, device=self.device)
-        on_point, step = self.sparse.positions[chosen], params.sparse_step * self.sparse.directions[chosen]
+        params, sightings = self.params, self.sightings
+        total = len(sightings.weights)
+        count = min(params.sparse_batch, total)
+        chosen = torch.randint(max(total, 1), (count,), generator=self.generator, device=self.device)
+        along = torch.rand(count, generator=self.generator, device=self.device)
+        points, directions = sightings.points[chosen], sightings.directions[chosen]
+        step = params.sparse_step * directions
+        free = (along * sightings.free[chosen]).clamp(min=params.sparse_step)[:, None] * directions
         anywhere = torch.rand(params.free_points, 3, generator=self.generator, device=self.device) * 2 - 1
-        return torch.cat([on_point, on_point - step, on_point + step, anywhere]), self.sparse.weights[chosen]
+        places = torch.cat([points, points + step, points - step, points - free, anywhere])
+        return places, sightings.weights[chosen]
 
     # ------------------------------------------------------------------ rendering
     def render(
