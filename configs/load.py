@@ -125,6 +125,15 @@ def describe_settings(schema: type[BaseModel] = Config) -> list[Setting]:
     ]
 
 
+def show_value(value: Any) -> str:
+    """A setting's value the way YAML and `--set` spell it, lists without their brackets."""
+    if isinstance(value, tuple):
+        return ", ".join(show_value(each) for each in value)
+    if value is None:
+        return "null"
+    return str(value).lower() if isinstance(value, bool) else str(value)
+
+
 def _fields(schema: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, FieldInfo]]:
     for name, field in schema.model_fields.items():
         section = _section(field)
@@ -321,7 +330,7 @@ def _refusal(error: ValidationError, schema: type[BaseModel], origins: Mapping[s
     wanted = bounds if detail["type"] in _BOUND_ERRORS else f"{_type_name(field.annotation)} {bounds}".strip()
     return ConfigError(
         f"`{key}` = {detail['input']!r} in {origin} {problem} {wanted}.",
-        f"{key}: {field.description}. Default: {field.get_default(call_default_factory=True)}.",
+        f"{key}: {field.description}. Default: {show_value(field.get_default(call_default_factory=True))}.",
     )
 
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import typer.main
 
-from configs.load import Setting, describe_settings, preset_names, preset_summary, preset_text
+from configs.load import Setting, describe_settings, preset_names, preset_summary, preset_text, show_value
 from configs.params import Config
 from hineus_cli.app import app
 from stages import errors
@@ -78,12 +78,8 @@ def _settings() -> Iterator[str]:
 
 
 def _setting_row(setting: Setting) -> str:
-    default = "none" if setting.default is None else f"`{_plain(setting.default)}`"
+    default = f"`{show_value(setting.default)}`"
     return _row(f"`{setting.key}`", setting.type, setting.bounds, default, setting.description)
-
-
-def _plain(value: Any) -> str:
-    return ", ".join(str(each) for each in value) if isinstance(value, tuple) else str(value)
 
 
 def _presets() -> Iterator[str]:

@@ -219,7 +219,7 @@ def _show(result: Reconstruction, as_json: bool) -> None:
     from hineus_cli.console import outcome_table, people
 
     console = people()
-    console.print(outcome_table(result.outcomes))
+    console.print(outcome_table(result.outcomes, console.width))
     results = {"textured model": result.glb, "report": result.report, "workspace": result.workspace.root}
     for what, path in results.items():
         if path is not None:
@@ -264,7 +264,8 @@ def status(
     digests = SourceDigests(sources, opened.digest_cache)
     statuses = pipeline_status(session.pipeline, opened, config, digests, verify)
     if not as_json:
-        product().print(status_table(statuses))
+        console = product()
+        console.print(status_table(statuses, console.width))
         return
     stages = [
         {
@@ -328,16 +329,19 @@ def show_config(
     from rich.table import Table
     from rich.text import Text
 
-    from configs.load import config_yaml, describe_settings, load_config
+    from configs.load import config_yaml, describe_settings, load_config, show_value
     from hineus_cli.console import product
 
     if not describe:
         typer.echo(config_yaml(load_config(preset, config, sets or ())), nl=False)
         return
-    table = Table("setting", "values", "bounds", "default", "meaning", header_style="bold")
+    table = Table(header_style="bold")
+    table.add_column("setting", no_wrap=True)
+    table.add_column("default", overflow="fold", max_width=13)
+    table.add_column("meaning", overflow="fold")
     for setting in describe_settings():
-        cells = (setting.key, setting.type, setting.bounds, str(setting.default), setting.description)
-        table.add_row(*(Text(cell) for cell in cells))
+        values = f"{setting.type}, {setting.bounds}" if setting.bounds else setting.type
+        table.add_row(setting.key, show_value(setting.default), Text(f"{setting.description} ({values})"))
     product().print(table)
 
 
@@ -352,7 +356,7 @@ def presets() -> None:
 def demo(
     context: typer.Context,
     folder: Annotated[Path, typer.Option("--workspace", "-w", help="Where photos and results go.")] = Path("demo"),
-    preset: Preset = None,
+    preset: Annotated[str, typer.Option(help="See `hineus presets`.")] = "demo",
     device: Device = "auto",
     workers: Workers = None,
     as_json: Json = False,

@@ -30,6 +30,7 @@ TRACEBACKS = "hineus_cli.tracebacks"  # the logger whose records go to the log f
 PLAIN_WIDTH = 160  # columns where the output is a pipe or a file
 PLAIN_EVERY_S = 30.0  # seconds between progress lines there
 MAX_NUMBERS = 4  # numbers of a stage in the summary table
+WIDE = 110  # columns from which tables show everything; narrower ones keep what explains the result
 
 GIB = 1 << 30
 
@@ -193,19 +194,25 @@ class ProgressDisplay:
 
 
 # ---------------------------------------------------------------- tables
-def outcome_table(outcomes: Sequence[StageOutcome]) -> Table:
-    """Stage, what became of it and why, its cost, its key numbers. The total counts only what ran now."""
+def outcome_table(outcomes: Sequence[StageOutcome], width: int) -> Table:
+    """Stage, what became of it and why, its cost, where there is room its key numbers. The total is of what ran now."""
     from rich.table import Table
     from rich.text import Text
 
-    table = Table(title=None, header_style="bold")
-    for heading in ("stage", "what", "why"):
-        table.add_column(heading, overflow="fold")
+    table = Table(header_style="bold")
+    for heading in ("stage", "what"):
+        table.add_column(heading, no_wrap=True)
+    table.add_column("why", overflow="fold")
     for heading in ("wall s", "CPU s", "peak GiB"):
         table.add_column(heading, justify="right", no_wrap=True)
-    table.add_column("numbers", overflow="fold")
+    if width >= WIDE:
+        table.add_column("numbers", overflow="fold")
+
+    def add(*cells: str | Text, style: str | None = None) -> None:
+        table.add_row(*cells[: len(table.columns)], style=style)
+
     for outcome in outcomes:
-        table.add_row(
+        add(
             outcome.name,
             outcome.action,
             Text(outcome.reason),
@@ -217,47 +224,47 @@ def outcome_table(outcomes: Sequence[StageOutcome]) -> Table:
         )
     ran = [outcome for outcome in outcomes if outcome.action == "ran"]
     table.add_section()
-    table.add_row(
+    add(
         "total",
         f"{len(ran)} ran",
         "",
         f"{sum(outcome.wall_s for outcome in ran):.1f}",
         f"{sum(outcome.cpu_s for outcome in ran):.1f}",
         f"{max((outcome.peak_rss for outcome in ran), default=0) / GIB:.2f}",
-        "",
     )
     return table
 
 
-def status_table(statuses: Sequence[StageStatus]) -> Table:
-    """Stage, how it stands and why, what it holds and what it cost."""
+def status_table(statuses: Sequence[StageStatus], width: int) -> Table:
+    """Stage, how it stands and why, its size and time, where there is room what else it cost and its date."""
     from rich.table import Table
     from rich.text import Text
 
     from stages.engine.workspace import show_bytes
 
     table = Table(header_style="bold")
-    for heading in ("stage", "state", "why"):
-        table.add_column(heading, overflow="fold")
-    for heading in ("size", "wall s", "CPU s", "peak GiB"):
+    for heading in ("stage", "state"):
+        table.add_column(heading, no_wrap=True)
+    table.add_column("why", overflow="fold")
+    for heading in ("size", "wall s", *(("CPU s", "peak GiB", "made (UTC)") if width >= WIDE else ())):
         table.add_column(heading, justify="right", no_wrap=True)
-    table.add_column("made (UTC)", no_wrap=True)
     for status in statuses:
         made = status.manifest
-        cost = (
-            (show_bytes(made.size), f"{made.wall_s:.1f}", f"{made.cpu_s:.1f}", f"{made.peak_rss / GIB:.2f}")
-            if made
-            else ("", "", "", "")
-        )
-        created = made.created.replace("T", " ").removesuffix("+00:00") if made else ""
-        state = Text(status.state, style=_STATE_COLOURS[status.state])
-        table.add_row(status.name, state, Text(status.reason), *cost, created)
+        cells: list[str | Text] = [
+            status.name,
+            Text(status.state, style=_STATE_COLOURS[status.state]),
+            Text(status.reason),
+        ]
+        if made:
+            cells += [show_bytes(made.size), f"{made.wall_s:.1f}", f"{made.cpu_s:.1f}", f"{made.peak_rss / GIB:.2f}"]
+            cells.append(made.created.replace("T", " ").removesuffix("+00:00"))
+        table.add_row(*cells[: len(table.columns)])
     return table
 
 
 def key_numbers(numbers: Mapping[str, Any]) -> str:
     """The first few plain values of what a stage returned, in one line."""
-    plain = [(name, value) for name, value in numbers.items() if isinstance(value, (int, float, str))]
+    plain = [(name, value) for name, value in numbers.items() if isinstance(value, (int, float, str)) and value != ""]
     return ", ".join(f"{name.replace('_', ' ')} {_short(value)}" for name, value in plain[:MAX_NUMBERS])
 
 

@@ -17,7 +17,6 @@ from stages.errors import InputError
 
 log = logging.getLogger(__name__)
 
-PRESET = "demo"
 NUM_PHOTOS = 24
 PHOTO_SIZE = (640, 480)
 SEED = 0
@@ -25,13 +24,12 @@ WORKSPACE = "workspace"
 SCORE = "score.json"
 
 
-def run_demo(folder: Path, preset: str | None, device: str, workers: int | None) -> dict[str, Any]:
+def run_demo(folder: Path, preset: str, device: str, workers: int | None) -> dict[str, Any]:
     """Make the photos, reconstruct them, score the mesh; say where things lie.
 
     Args:
         folder: gets `photos/`, the truth (`gt_mesh.ply`, `transforms.json`), `workspace/` and `score.json`.
-        preset: of settings; None is the demo's own.
-        device, workers: see `reconstruct`.
+        preset, device, workers: see `reconstruct`.
 
     Returns:
         JSON-able: the score (percent of the object's largest extent), seconds, paths, and the stages' numbers.
@@ -45,7 +43,7 @@ def run_demo(folder: Path, preset: str | None, device: str, workers: int | None)
         photos=folder / PHOTOS,
         workspace=folder / WORKSPACE,
         no_masks=True,
-        preset=preset or PRESET,
+        preset=preset,
         device=device,
         workers=workers,
     )
@@ -53,7 +51,7 @@ def run_demo(folder: Path, preset: str | None, device: str, workers: int | None)
     ply = artifacts.ply_path(result.workspace.stage_folder("export"))
     if not ply.exists():
         raise InputError(
-            f"Preset {request.preset} writes no PLY file, which the score needs.",
+            f"Preset {preset} writes no PLY file, which the score needs.",
             "Try `hineus demo --preset demo`.",
         )
     score = score_mesh(ply, artifacts.model_path(result.workspace.stage_folder("sfm")), folder)
@@ -105,7 +103,7 @@ def run_pipeline_with_progress(request: Request) -> Reconstruction:
 def show(result: Reconstruction, score: dict[str, float], seconds: float) -> None:
     """The summary for people."""
     console = people()
-    console.print(outcome_table(result.outcomes))
+    console.print(outcome_table(result.outcomes, console.width))
     lines = [
         f"distance to the known surface: {score['mean']:.2f} % of the object's extent "
         f"(accuracy {score['accuracy']:.2f} %, completeness {score['completeness']:.2f} %; "

@@ -128,12 +128,17 @@ def choose_sources(request: Request, workspace: Workspace) -> tuple[Path, Path |
     """Photos and masks: those given, else those the workspace was last run with.
 
     Raises:
-        InputError: there are none, a given one does not exist, or the workspace lies inside the photos.
+        InputError: there are none, a given one is no folder, or the workspace lies inside the photos.
     """
     known = workspace.record.sources
     for name, given in (("photos", request.photos), ("masks", request.masks)):
         if given is not None and not given.exists():
             raise InputError(f"There is no {name} folder {given}.", "Check the path with `ls`.")
+        if given is not None and not given.is_dir():
+            raise InputError(
+                f"{given} is a file; a folder of {name} is needed.",
+                f"Name the folder it is in: {given.absolute().parent}",
+            )
     recorded = known.get("photos")
     photos = request.photos.resolve() if request.photos else Path(recorded) if recorded else None
     if photos is None:

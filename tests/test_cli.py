@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import subprocess
 import sys
@@ -9,13 +10,18 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from rich.console import Console
 from toy_pipeline import TOY, failing, with_stage
 from typer.testing import CliRunner, Result
 
+from configs.load import describe_settings
 from hineus_cli import doctor, reconstruct
 from hineus_cli.app import build_app
-from hineus_cli.console import key_numbers
+from hineus_cli.console import key_numbers, outcome_table, status_table
 from hineus_cli.doctor import Finding
+from stages.engine.runner import StageOutcome
+from stages.engine.status import StageStatus
+from stages.engine.workspace import Workspace
 from stages.errors import ConfigError, InputError, ReconstructionError
 
 REPOSITORY = Path(__file__).parents[1]
@@ -136,6 +142,7 @@ def test_wrong_times_are_refused(text: str) -> None:
     [
         (["run"], 2, ["Neither a folder of photos nor a workspace is given.", "Try `hineus run PHOTOS`"]),
         (["run", "nowhere"], 3, ["There is no photos folder nowhere."]),
+        (["run", "photos/0.jpg"], 3, ["0.jpg is a file; a folder of photos is needed."]),
         (["run", "photos", "--masks", "nowhere"], 3, ["There is no masks folder nowhere."]),
         (["run", "-w", "new"], 3, ["does not know its photos yet", "hineus run PHOTOS --workspace"]),
         (["run", "photos", "-w", "photos/ws"], 3, ["lies inside the photo folder"]),
@@ -279,7 +286,39 @@ def test_doctor_is_content_with_a_fit_machine(folder: Path, monkeypatch: pytest.
 
 
 def test_numbers_are_short() -> None:
-    assert key_numbers({"mean_error_px": 0.123456, "photos": 3, "names": ["a"]}) == "mean error px 0.1235, photos 3"
+    numbers = {"mean_error_px": 0.123456, "photos": 3, "names": ["a"], "why_not": ""}
+    assert key_numbers(numbers) == "mean error px 0.1235, photos 3"
+
+
+def _printed(table: Any, width: int) -> list[str]:
+    console = Console(width=width, file=io.StringIO())
+    console.print(table)
+    return console.file.getvalue().splitlines()
+
+
+@pytest.mark.parametrize("width", [80, 120])
+def test_tables_fit_the_terminal_and_keep_names_whole(folder: Path, width: int) -> None:
+    hineus("run", "photos")
+    workspace = Workspace.open(folder / "photos_hineus")
+    made = [(stage.name, workspace.published(stage.name)) for stage in TOY]
+    why = "; ".join(f"input stage {name} is stale" for name, _ in made)
+    outcomes = [StageOutcome(n, "skipped", why, m.numbers, 12345.6, 12345.6, 1 << 34) for n, m in made]
+    statuses = [StageStatus(n, "missing", (why,), m, None) for n, m in made]
+    for table in (outcome_table(outcomes, width), status_table(statuses, width)):
+        lines = _printed(table, width)
+        assert max(map(len, lines)) <= width
+        first_cells = [line.split("│")[1].strip() for line in lines if "│" in line]
+        assert {name for name, _ in made} <= set(first_cells)
+        assert len(lines) < 12 * len(made)
+    assert any("12345.6" in line and "16.00" in line for line in _printed(outcome_table(outcomes, width), width))
+
+
+def test_settings_are_described_whole_on_a_narrow_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("hineus_cli.console.PLAIN_WIDTH", 80)
+    described = hineus("config", "--describe").stdout
+    assert max(map(len, described.splitlines())) <= 80
+    for setting in describe_settings():
+        assert f" {setting.key} " in described
 
 
 # ---------------------------------------------------------------- the real command line

@@ -48,7 +48,7 @@ def stand_ins(monkeypatch):
 
 
 def test_demo_runs_on_its_own_photos_and_keeps_the_score(tmp_path, stand_ins):
-    result = demo.run_demo(tmp_path, preset=None, device="cpu", workers=2)
+    result = demo.run_demo(tmp_path, preset="demo", device="cpu", workers=2)
     photos, request = stand_ins.requests
     assert photos == "photos"
     assert request.photos == tmp_path / "photos"
@@ -67,7 +67,7 @@ def test_demo_takes_another_preset(tmp_path, stand_ins):
 def test_demo_without_a_ply_says_what_to_do(tmp_path, stand_ins):
     stand_ins.ply = False
     with pytest.raises(InputError, match="writes no PLY"):
-        demo.run_demo(tmp_path, preset=None, device="cpu", workers=None)
+        demo.run_demo(tmp_path, preset="demo", device="cpu", workers=None)
 
 
 def test_complete_photos_are_not_made_again(tmp_path, stand_ins, monkeypatch):
