@@ -242,9 +242,7 @@ def save_atlas(folder: Path, atlas: AtlasMesh) -> None:
 
 def load_atlas(folder: Path) -> AtlasMesh:
     with np.load(folder / ATLAS) as data:
-        return AtlasMesh(
-            data["vertices"], data["normals"], data["uvs"], data["faces"], int(data["texture_size"])
-        )
+        return AtlasMesh(data["vertices"], data["normals"], data["uvs"], data["faces"], int(data["texture_size"]))
 
 
 # ---------------------------------------------------------------- bake: base_color.png, provenance.png
