@@ -44,19 +44,13 @@ class Setting:
 
 
 # ---------------------------------------------------------------- loading
-def load_config(
-    preset: str | None = None,
-    file: Path | None = None,
-    sets: Sequence[str] = (),
-    schema: type[Config] = Config,
-) -> Config:
+def load_config(preset: str | None = None, file: Path | None = None, sets: Sequence[str] = ()) -> Config:
     """Layer the settings: defaults < `preset` < `file` < `sets`.
 
     Args:
         preset: name of a preset, see `preset_names`.
         file: a YAML file of the same shape as `Config`; it may hold any part of it.
         sets: "section.key=value" each, the value in YAML; later ones win.
-        schema: the model to fill.
 
     Raises:
         ConfigError: a file cannot be read or parsed, a key is unknown, a value is out of bounds.
@@ -71,13 +65,13 @@ def load_config(
     merged: dict[str, Any] = {}
     origins: dict[str, str] = {}
     for origin, layer in layers:
-        layer = _checked(layer, schema, origin)
+        layer = _checked(layer, origin)
         merged = _merge(merged, layer)
         origins.update({key: origin for key in _dotted(layer)})
     try:
-        return schema.model_validate(merged)
+        return Config.model_validate(merged)
     except ValidationError as error:
-        raise _refusal(error, schema, origins) from None
+        raise _refusal(error, origins) from None
 
 
 def preset_names() -> list[str]:
@@ -111,7 +105,7 @@ def config_yaml(config: BaseModel) -> str:
 
 
 # ---------------------------------------------------------------- describing
-def describe_settings(schema: type[BaseModel] = Config) -> list[Setting]:
+def describe_settings() -> list[Setting]:
     """Every setting there is, in the order of the schema."""
     return [
         Setting(
@@ -121,7 +115,7 @@ def describe_settings(schema: type[BaseModel] = Config) -> list[Setting]:
             bounds=_bounds(field),
             description=field.description or "",
         )
-        for key, field in _fields(schema)
+        for key, field in _fields()
     ]
 
 
@@ -134,7 +128,7 @@ def show_value(value: Any) -> str:
     return str(value).lower() if isinstance(value, bool) else str(value)
 
 
-def _fields(schema: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, FieldInfo]]:
+def _fields(schema: type[BaseModel] = Config, prefix: str = "") -> Iterator[tuple[str, FieldInfo]]:
     for name, field in schema.model_fields.items():
         section = _section(field)
         if section is not None:
@@ -268,25 +262,21 @@ def _dotted(layer: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
 _BOUND_ERRORS = ("greater_than", "greater_than_equal", "less_than", "less_than_equal")
 
 
-def _checked(layer: Mapping[str, Any], schema: type[BaseModel], origin: str) -> dict[str, Any]:
-    """The layer without its empty sections; unknown keys and values in the place of sections are refused."""
-    return _checked_section(layer, schema, origin, "", schema)
-
-
-def _checked_section(
-    layer: Mapping[str, Any], schema: type[BaseModel], origin: str, prefix: str, root: type[BaseModel]
+def _checked(
+    layer: Mapping[str, Any], origin: str, schema: type[BaseModel] = Config, prefix: str = ""
 ) -> dict[str, Any]:
+    """The layer without its empty sections; unknown keys and values in the place of sections are refused."""
     checked: dict[str, Any] = {}
     for key, value in layer.items():
         dotted = f"{prefix}{key}"
         field = schema.model_fields.get(str(key))
         if field is None:
-            raise ConfigError(f"Unknown setting `{dotted}` in {origin}.", _nearest(dotted, root))
+            raise ConfigError(f"Unknown setting `{dotted}` in {origin}.", _nearest(dotted))
         section = _section(field)
         if section is None:
             checked[str(key)] = value
         elif isinstance(value, Mapping):
-            checked[str(key)] = _checked_section(value, section, origin, f"{dotted}.", root)
+            checked[str(key)] = _checked(value, origin, section, f"{dotted}.")
         elif value is not None:  # a section with all its lines commented out is fine
             raise ConfigError(
                 f"`{dotted}` in {origin} is a section of settings, not a value ({value!r}).",
@@ -295,9 +285,9 @@ def _checked_section(
     return checked
 
 
-def _nearest(key: str, schema: type[BaseModel]) -> str:
-    known = [setting for setting, _ in _fields(schema)]
-    sections = list(schema.model_fields)
+def _nearest(key: str) -> str:
+    known = [setting for setting, _ in _fields()]
+    sections = list(Config.model_fields)
     # The right name in the wrong section, or in none, is nearer than a similar one elsewhere.
     name = key.rpartition(".")[2]
     same_name = [setting for setting in known if setting.rpartition(".")[2] == name]
@@ -313,10 +303,10 @@ def _did_you_mean(name: str, known: Sequence[str], form: str, otherwise: str) ->
     return f"Did you mean `{form.format(near[0])}`? {listed}" if near else listed
 
 
-def _refusal(error: ValidationError, schema: type[BaseModel], origins: Mapping[str, str]) -> ConfigError:
+def _refusal(error: ValidationError, origins: Mapping[str, str]) -> ConfigError:
     """The first thing pydantic found, in the user's terms."""
     detail = error.errors(include_url=False)[0]
-    known = dict(_fields(schema))
+    known = dict(_fields())
     path = [str(part) for part in detail["loc"]]
     key = ".".join(path)
     while key and key not in known and "." in key:  # inside a list or one arm of a union

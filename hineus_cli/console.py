@@ -34,7 +34,7 @@ WIDE = 110  # columns from which tables show everything; narrower ones keep what
 
 GIB = 1 << 30
 
-_STATE_COLOURS = {"ran": "green", "skipped": "dim", "fresh": "green", "stale": "yellow", "missing": "red"}
+_STATE_COLOURS = {"fresh": "green", "stale": "yellow", "missing": "red"}
 
 
 def people() -> Console:

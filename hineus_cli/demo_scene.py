@@ -18,10 +18,10 @@ from pathlib import Path
 
 import numpy as np
 
+from hineus_cli.scoring import TRUTH_CAMERAS, TRUTH_MESH
+
 SCENE_VERSION = 1  # raise it when the same seed would give other photos
 PHOTOS = "photos"
-TRUTH_MESH = "gt_mesh.ply"
-TRUTH_CAMERAS = "transforms.json"
 
 FOCAL_35MM = 50  # equivalent focal length written into EXIF and used exactly: f_px = 50 / 36 * width
 CLOTH_SIDE = 3.2

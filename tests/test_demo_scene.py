@@ -10,7 +10,6 @@ import pytest
 from hineus_cli.demo_scene import (
     CLOTH_SIDE,
     FOCAL_35MM,
-    TRUTH_CAMERAS,
     ValueNoise,
     camera_ring,
     figurine_distance,
@@ -20,6 +19,7 @@ from hineus_cli.demo_scene import (
     photos_are_complete,
     render,
 )
+from hineus_cli.scoring import TRUTH_CAMERAS
 
 SIZE = (96, 72)
 FOCAL = FOCAL_35MM / 36 * SIZE[0]
