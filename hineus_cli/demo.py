@@ -8,7 +8,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from hineus_cli.console import ProgressDisplay, outcome_table, people
+from hineus_cli.console import ProgressDisplay, outcome_table, people, progress_of
 from hineus_cli.demo_scene import PHOTOS, make_demo_photos, photos_are_complete
 from hineus_cli.reconstruct import Reconstruction, Request, reconstruct
 from hineus_cli.scoring import score_mesh
@@ -84,7 +84,8 @@ def make_photos(folder: Path) -> None:
         return
     log.info("photos: rendering %d into %s", NUM_PHOTOS, folder / PHOTOS)
     try:
-        make_demo_photos(folder, NUM_PHOTOS, PHOTO_SIZE, SEED)
+        with progress_of("photos") as progress:
+            make_demo_photos(folder, NUM_PHOTOS, PHOTO_SIZE, SEED, progress)
     except OSError as error:
         raise InputError(
             f"The demo's photos cannot be written to {folder}: {error.strerror}.",
