@@ -49,6 +49,17 @@ def _rows(x, y, z, resolution, dense, mask, offset):
     )  # fmt: skip
 
 
+@njit(**_OPTIONS)
+def _interleaved(index, levels):
+    """The level a backward pass takes at `index`: first the even ones, then the odd ones.
+
+    Threads take contiguous runs of indices. Coarse levels stay in cache and fine ones do not, so a run of neighbours
+    would leave one thread with all the slow ones.
+    """
+    half = (levels + 1) // 2
+    return 2 * index if index < half else 2 * (index - half) + 1
+
+
 @njit(parallel=True, **_OPTIONS)
 def encode_forward(points, table, resolutions, offsets, dense, active_levels, features, jacobian):
     """Fill features [N, C] and jacobian [N, 3, C]."""
@@ -90,7 +101,8 @@ def encode_forward(points, table, resolutions, offsets, dense, active_levels, fe
 def encode_backward(points, resolutions, offsets, dense, active_levels, grad_features, grad_jacobian, grad_table):
     """Add d loss / d table [rows, 4] given the gradients of features [N, C] and jacobian [N, 3, C]."""
     num_points = len(points)
-    for level in prange(active_levels):
+    for index in prange(active_levels):
+        level = _interleaved(index, active_levels)
         resolution, offset, is_dense = resolutions[level], offsets[level], dense[level]
         mask = uint32(offsets[level + 1] - offset - 1)
         scale = np.float32(0.5 * resolution)
@@ -156,7 +168,8 @@ def features_forward(points, table, resolutions, offsets, dense, active_levels, 
 def features_backward(points, resolutions, offsets, dense, active_levels, grad_features, grad_table):
     """Add d loss / d table [rows, 4] given the gradient of features [N, C]."""
     num_points = len(points)
-    for level in prange(active_levels):
+    for index in prange(active_levels):
+        level = _interleaved(index, active_levels)
         resolution, offset, is_dense = resolutions[level], offsets[level], dense[level]
         mask = uint32(offsets[level + 1] - offset - 1)
         one = np.float32(1)
