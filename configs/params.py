@@ -165,6 +165,9 @@ class TrainParams(Section):
     weight_mask: float = Field(0.1, ge=0, description="weight of the mask term, where masks exist")
     weight_exposure: float = Field(0.1, ge=0, description="weight that holds the photos' gains at 1")
 
+    ambiguity: bool = Field(False, description="trust photos less where the others that see a place disagree")
+    ambiguity_from: float = Field(0.2, ge=0, le=1, description="progress at which that begins")
+
     background: bool = Field(True, description="model what lies outside the region (never where masks exist)")
     background_samples: int = Field(16, ge=1, description="samples per ray outside the region")
     background_log2_rows: int = Field(15, ge=8, le=24, description="rows per level of the background's encoding")

@@ -213,3 +213,37 @@ def test_wrong_image_size_is_named():
     cameras = ring_of_cameras()
     with pytest.raises(ValueError, match=r"view_00\.png: got shape \(3, 3, 3\)"):
         Photos(cameras, [np.zeros((3, 3, 3), np.uint8)] * 8, None, "cpu")
+
+
+def test_the_ambiguity_weight_trusts_a_painted_ball_and_doubts_a_shifting_one():
+    """Every second photo shows other colours: rays on the ball are doubted there; the background keeps its weight."""
+    trainer = make_trainer(TINY.model_copy(update={"ambiguity": True, "sphere_radius": RADIUS, "scale_start": 0.01}))
+    trainer._refresh_cache(0.5)
+    batch = trainer.photos.draw(400, torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        rendered = trainer.render(batch, 0.5, torch.zeros(0, 3), None)
+    on_ball = rendered.opacity > 0.9
+    assert 50 < int(on_ball.sum()) < 350
+    consistent = trainer._trust(batch, rendered, 0.5)
+    assert consistent.mean().item() == pytest.approx(1)
+    assert torch.equal(trainer._trust(batch, rendered, 0.1), torch.ones(400))  # not yet
+
+    pixels = trainer.photos.pixels.view(8, -1, 3)
+    pixels[::2] = 255 - pixels[::2]
+    shifting = trainer._trust(batch, rendered, 0.5)
+    ratio = [weights[on_ball].mean() / weights[~on_ball].mean() for weights in (consistent, shifting)]
+    assert ratio[0] > 0.5  # the ball is painted finer than these small photos show
+    assert ratio[1] < 0.7 * ratio[0]
+
+
+def test_photos_show_a_place_where_it_projects():
+    trainer = make_trainer()
+    cameras = ring_of_cameras()
+    points = torch.tensor([[0.023, -0.031, 0.2], [0.3, 0.1, -0.2], [0, 0, 50.0]])
+    colors, inside = trainer.photos.observe(points)
+    assert inside[:2].all()
+    assert not inside[2].any()
+    for index in range(8):
+        pixel, _ = cameras.project(index, points[:2].double().numpy())
+        for row, (x, y) in enumerate(np.floor(pixel).astype(int)):
+            assert np.allclose(colors[row, index].numpy(), render(cameras, index)[0][y, x] / 255, atol=1e-6)

@@ -191,3 +191,52 @@ def features_backward(points, resolutions, offsets, dense, active_levels, grad_f
                 grad_table[r5, f] += fz * q10
                 grad_table[r6, f] += gz * q11
                 grad_table[r7, f] += fz * q11
+
+
+@njit(**_OPTIONS)
+def _trilinear(values, x, y, z):
+    """Cached f at a position in [-1, 1]^3; values [G, G, G] are indexed z, y, x."""
+    last = values.shape[0] - 1
+    ix, fx = _cell(x, last)
+    iy, fy = _cell(y, last)
+    iz, fz = _cell(z, last)
+    one = np.float32(1)
+    low = (one - fy) * ((one - fx) * values[iz, iy, ix] + fx * values[iz, iy, ix + 1]) + fy * (
+        (one - fx) * values[iz, iy + 1, ix] + fx * values[iz, iy + 1, ix + 1]
+    )
+    high = (one - fy) * ((one - fx) * values[iz + 1, iy, ix] + fx * values[iz + 1, iy, ix + 1]) + fy * (
+        (one - fx) * values[iz + 1, iy + 1, ix] + fx * values[iz + 1, iy + 1, ix + 1]
+    )
+    return (one - fz) * low + fz * high
+
+
+# A path is solid, and its walk over, once f falls below this: a visibility of 0 to the last digit (100 f + 3 < -7).
+_SOLID = np.float32(-0.1)
+
+
+@njit(parallel=True, **_OPTIONS)
+def smallest_on_paths(values, points, targets, start, smallest):
+    """Fill smallest [P] with the least cached f met by sphere tracing from points [P, 3] towards targets [P, 3].
+
+    A step is f long, or half a cell where f is smaller; the walk ends at the target, at the unit sphere, or inside.
+    """
+    num_points = len(points)
+    half_cell = np.float32(1.0 / (values.shape[0] - 1))
+    num_chunks = (num_points + CHUNK - 1) // CHUNK
+    for chunk in prange(num_chunks):
+        for p in range(chunk * CHUNK, min((chunk + 1) * CHUNK, num_points)):
+            x, y, z = points[p, 0], points[p, 1], points[p, 2]
+            dx, dy, dz = targets[p, 0] - x, targets[p, 1] - y, targets[p, 2] - z
+            length = np.sqrt(dx * dx + dy * dy + dz * dz)
+            dx, dy, dz = dx / length, dy / length, dz / length
+            t, least = start[p], np.float32(2)
+            while t < length:
+                px, py, pz = x + t * dx, y + t * dy, z + t * dz
+                if px * px + py * py + pz * pz > np.float32(1):
+                    break
+                f = _trilinear(values, px, py, pz)
+                least = min(least, f)
+                if f < _SOLID:
+                    break
+                t += max(f, half_cell)
+            smallest[p] = least

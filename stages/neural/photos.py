@@ -65,6 +65,7 @@ class Photos:
         inverse = np.linalg.inv(cameras.intrinsics)
         scene_from_pixel = np.einsum("nji,njk->nik", cameras.cam_from_scene[:, :, :3], inverse)
         self.scene_from_pixel = torch.from_numpy(scene_from_pixel).float().to(device)
+        self.pixel_from_scene = torch.linalg.inv(self.scene_from_pixel)
         self.boxes = torch.from_numpy(_sphere_boxes(cameras)).float().to(device)
 
     def __len__(self) -> int:
@@ -78,6 +79,18 @@ class Photos:
         low, high = self.boxes[images, :2], self.boxes[images, 2:]
         pixels = (low + place * (high - low)).floor()
         return self.rays(images, pixels, limit=num_rays)
+
+    def observe(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """What every photo shows at scene points [P, 3]: colours [P, I, 3] in [0, 1] and whether it is in frame [P, I].
+
+        The nearest pixel; its colour means nothing where the point is out of frame or behind the camera.
+        """
+        in_pixels = torch.einsum("iab,pib->pia", self.pixel_from_scene, points[:, None] - self.centers)
+        depth = in_pixels[..., 2]
+        pixels = (in_pixels[..., :2] / depth.clamp(min=1e-6).unsqueeze(2)).floor().long()
+        inside = (depth > 0) & (pixels >= 0).all(2) & (pixels < self.sizes).all(2)
+        rows = self.first + pixels[..., 1] * self.sizes[:, 0] + pixels[..., 0]
+        return self.pixels[rows.masked_fill(~inside, 0)].float() / 255, inside
 
     def rays(self, images: torch.Tensor, pixels: torch.Tensor, limit: int | None = None) -> RayBatch:
         """Rays through the centres of integer pixels [R, 2] (x, y) of photos [R]; those that miss are dropped."""

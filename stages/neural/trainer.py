@@ -19,6 +19,15 @@ from stages.neural.fields import BackgroundNetwork, Fields, FieldShape
 from stages.neural.photos import Photos, RayBatch
 from stages.neural.rendering import composite, sample_optical_depths, weights_from_optical_depth
 from stages.neural.sampling import SdfCache, importance_distances, intersect_unit_sphere
+from stages.neural.visibility import (
+    ambiguity,
+    color_precision,
+    mahalanobis,
+    path_margin,
+    sdf_visibility,
+    smallest_sdf_on_paths,
+    trust,
+)
 
 # Samples that weigh less than this get no colour: together they change a pixel by less than one grey level.
 _COLOR_THRESHOLD = 2e-4
@@ -64,7 +73,7 @@ class Rendered:
     Attributes:
         colors: [R, 3] sRGB with the background behind, before exposure.
         opacity: [R] of the surface alone.
-        weights: [R, K] rendering weights of the samples.
+        weights, distances: [R, K] rendering weights of the samples and where they lie on the ray.
         gradients: [N, 3] of the SDF at the samples.
         extra_sdf, extra_gradients: the same at the extra points that were asked for.
     """
@@ -72,6 +81,7 @@ class Rendered:
     colors: torch.Tensor
     opacity: torch.Tensor
     weights: torch.Tensor
+    distances: torch.Tensor
     gradients: torch.Tensor
     extra_sdf: torch.Tensor
     extra_gradients: torch.Tensor
@@ -114,6 +124,7 @@ class Trainer:
         )
         self.cache = SdfCache(params.cache_resolution, device)
         self.generator = torch.Generator(device=device).manual_seed(params.seed)
+        self.color_precision = color_precision(photos, torch.Generator(device=device).manual_seed(params.seed))
         self.step_index = 0
         self.cache_step = -(10**9)
 
@@ -139,7 +150,7 @@ class Trainer:
         rendered = self.render(batch, progress, extra, self.generator)
         exposed = rendered.colors * torch.exp(self.fields.log_gains[batch.images])
 
-        photo_error = losses.rgb_error(exposed, batch.colors)
+        photo_error = losses.rgb_error(exposed, batch.colors) * self._trust(batch, rendered, progress)
         if batch.masks is not None:  # outside the masks nothing is known of the colour
             photo_error = photo_error * batch.masks
             mask_loss = losses.mask_error(rendered.opacity, batch.masks).mean()
@@ -185,6 +196,38 @@ class Trainer:
                 "gradient_norm": torch.linalg.vector_norm(rendered.gradients, dim=1).mean(),
                 "opacity": rendered.opacity.detach().mean(),
             }
+
+    @torch.no_grad()
+    def _trust(self, batch: RayBatch, rendered: Rendered, progress: float) -> torch.Tensor:
+        """Weight [R] of each ray's colour error: 1 / (1 + lambda_ambiguity), mean 1 (paper eq. loss_without_ambiguity).
+
+        1 before `ambiguity_from`: early on, a pattern seen at a wrong depth would pass for a reflection.
+        """
+        num_rays = len(batch.leave)
+        if not self.params.ambiguity or progress < self.params.ambiguity_from:
+            return torch.ones(num_rays, device=self.device)
+        gains = torch.exp(self.fields.log_gains)
+        depth = (rendered.weights * rendered.distances).sum(1) / rendered.opacity.clamp(min=1e-3)
+        surface = batch.origins + depth[:, None] * batch.directions
+        gradients = rendered.gradients.view(*rendered.weights.shape, 3)
+        normals = torch.nn.functional.normalize(composite(rendered.weights, gradients), dim=1)
+
+        to_cameras = torch.nn.functional.normalize(self.photos.centers - surface[:, None], dim=2)
+        facing = torch.einsum("ra,ria->ri", normals, to_cameras)
+        colors, in_frame = self.photos.observe(surface)
+        others = torch.arange(len(self.photos), device=self.device) != batch.images[:, None]
+        ray, view = torch.nonzero(in_frame & others & (facing > 0) & (rendered.opacity > 0.5)[:, None], as_tuple=True)
+        margin = path_margin(facing[ray, view], self.scale(progress), max(self._voxel(progress), self.cache.cell / 2))
+        smallest = smallest_sdf_on_paths(self.cache, surface[ray], self.photos.centers[view], margin)
+        visibility = torch.zeros_like(facing)
+        visibility[ray, view] = sdf_visibility(smallest)
+        own = batch.colors / gains[batch.images]
+        distance = mahalanobis(own[:, None], colors / gains, self.color_precision)
+        return trust(ambiguity(visibility, distance))
+
+    def _voxel(self, progress: float) -> float:
+        """Side of the finest active cell of the encoding, scene units: the paper's h."""
+        return self.fields.shape.sdf_grid.voxel_size(self.levels(progress))
 
     def _extra_points(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Points [4 S + A, 3] evaluated beside the rays' samples, and the weights [S] of the sightings among them.
@@ -235,7 +278,7 @@ class Trainer:
         if self.fields.background is not None:
             colors = colors + self._background(self.fields.background, batch, transmittance, generator)
         return Rendered(
-            colors, 1 - transmittance, weights, gradients[:num_points],
+            colors, 1 - transmittance, weights, distances, gradients[:num_points],
             sdf[num_points:], gradients[num_points:],
         )  # fmt: skip
 
