@@ -168,6 +168,16 @@ class TrainParams(Section):
     ambiguity: bool = Field(False, description="trust photos less where the others that see a place disagree")
     ambiguity_from: float = Field(0.2, ge=0, le=1, description="progress at which that begins")
 
+    planar: bool = Field(False, description="hold the SDF to be linear around surface points of even appearance")
+    weight_planar: float = Field(1.0, ge=0, description="weight of the planar term at the end; a tenth at the start")
+    planar_radius: float = Field(
+        0.05, gt=0, description="reach of the planar term at the start, scene units; three voxels at the end"
+    )
+    planar_rays: int = Field(256, ge=1, description="rays per step that the planar term looks at")
+    planar_neighbors: int = Field(4, ge=1, description="places around each of their surface points")
+
+    relaxed_eikonal: bool = Field(False, description="relax the Eikonal term near surfaces whose photo is not met")
+
     background: bool = Field(True, description="model what lies outside the region (never where masks exist)")
     background_samples: int = Field(16, ge=1, description="samples per ray outside the region")
     background_log2_rows: int = Field(15, ge=8, le=24, description="rows per level of the background's encoding")

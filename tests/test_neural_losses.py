@@ -38,6 +38,42 @@ def test_sparse_points_pull_evenly_beyond_the_tolerance():
     assert sdf.grad.tolist() == pytest.approx([0, 0.1, -1, 1])
 
 
+def test_relaxation_is_one_on_met_photos_and_bounded_below():
+    error = torch.tensor([0.0, 0.1, 0.2, 5.0], requires_grad=True)
+    omega = losses.eikonal_relaxation(error)
+    expected = [1, 0.2 + 0.8 * math.exp(-0.5), *[0.2 + 0.8 * math.exp(-1)] * 2]
+    assert omega.tolist() == pytest.approx(expected)
+    assert not omega.requires_grad
+    assert losses.eikonal_relaxation(torch.zeros(1), planarity=0.0).item() == pytest.approx(0.6)
+
+
+def test_planar_error_is_zero_on_a_plane_at_any_distance_and_not_on_an_edge():
+    generator = torch.Generator().manual_seed(0)
+    offsets = 0.1 * (torch.rand(5, 8, 3, generator=generator) - 0.5)
+    normals = torch.nn.functional.normalize(torch.randn(5, 3, generator=generator), dim=1)
+    center = torch.full((5,), 0.003)
+    plane = center[:, None] + torch.einsum("qc,qkc->qk", normals, offsets)
+    assert losses.planar_error(plane, center, normals, offsets, 0.05).abs().max() < 1e-8
+    edge = plane + offsets[..., 0].abs()
+    assert losses.planar_error(edge, center, normals, offsets, 0.05).mean() > 1e-3
+
+
+def test_planar_error_pulls_the_neighbour_towards_the_plane():
+    sdf = torch.tensor([[0.02]], requires_grad=True)
+    offsets, normals = torch.tensor([[[0.04, 0, 0]]]), torch.tensor([[0.0, 0, 1]])
+    error = losses.planar_error(sdf, torch.zeros(1), normals, offsets, 0.05)
+    assert error.item() == pytest.approx(0.1 * (0.5 - 0.05))  # slope error 0.5, Huber with delta 0.1
+    error.sum().backward()
+    assert sdf.grad.item() == pytest.approx(0.1 / 0.04)
+
+
+def test_planarity_is_one_for_equal_features_and_half_at_the_median():
+    features = torch.tensor([[[0.0], [1.0], [3.0]]])
+    weight = losses.planarity(features.requires_grad_(), torch.zeros(1, 1))
+    assert weight[0].tolist() == pytest.approx([1, 0.5, 0.25])
+    assert not weight.requires_grad
+
+
 def test_free_and_solid_places_are_pushed_to_their_side_of_the_surface():
     sdf = torch.tensor([0.02, 0.0, -0.01], requires_grad=True)
     outside, inside = losses.outside_error(sdf, 0.005), losses.inside_error(sdf, 0.005)

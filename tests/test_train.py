@@ -247,3 +247,15 @@ def test_photos_show_a_place_where_it_projects():
         pixel, _ = cameras.project(index, points[:2].double().numpy())
         for row, (x, y) in enumerate(np.floor(pixel).astype(int)):
             assert np.allclose(colors[row, index].numpy(), render(cameras, index)[0][y, x] / 255, atol=1e-6)
+
+
+@pytest.mark.parametrize("term", ["planar", "relaxed_eikonal", "ambiguity"])
+def test_a_term_of_the_method_changes_the_gradients_when_switched_on(term):
+    base, with_term = (make_trainer(TINY.model_copy(update={term: on})) for on in (False, True))
+    for trainer in (base, with_term):  # a perfect sphere has no Eikonal error to weigh
+        table = trainer.fields.sdf.table
+        table.data += 0.02 * torch.randn(table.shape, generator=torch.Generator().manual_seed(0))
+    numbers = [trainer.step(0.5) for trainer in (base, with_term)]
+    assert (numbers[1]["planar"] > 0) == (term == "planar")
+    difference = (base.fields.sdf.table.grad - with_term.fields.sdf.table.grad).abs().max()
+    assert difference > 1e-3 * base.fields.sdf.table.grad.abs().max()

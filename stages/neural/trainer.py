@@ -31,6 +31,8 @@ from stages.neural.visibility import (
 
 # Samples that weigh less than this get no colour: together they change a pixel by less than one grey level.
 _COLOR_THRESHOLD = 2e-4
+# Samples that weigh more than this count as near the surface for the relaxed Eikonal term.
+_NEAR_SURFACE_WEIGHT = 0.01
 # The background's last sample is this near to infinity, as a part of the contracted shell: 200 radii away.
 _BACKGROUND_REACH = 0.995
 
@@ -85,6 +87,13 @@ class Rendered:
     gradients: torch.Tensor
     extra_sdf: torch.Tensor
     extra_gradients: torch.Tensor
+
+    def surface(self, batch: RayBatch) -> tuple[torch.Tensor, torch.Tensor]:
+        """Mean surface point and unit normal of each ray [R, 3]; mean something only where the ray is opaque."""
+        depth = (self.weights * self.distances).sum(1) / self.opacity.clamp(min=1e-3)
+        normals = composite(self.weights, self.gradients.view(*self.weights.shape, 3))
+        points = batch.origins + depth[:, None] * batch.directions
+        return points, torch.nn.functional.normalize(normals, dim=1)
 
 
 def field_shape(params: TrainParams, num_images: int, background: bool) -> FieldShape:
@@ -150,15 +159,21 @@ class Trainer:
         rendered = self.render(batch, progress, extra, self.generator)
         exposed = rendered.colors * torch.exp(self.fields.log_gains[batch.images])
 
-        photo_error = losses.rgb_error(exposed, batch.colors) * self._trust(batch, rendered, progress)
+        ray_error = losses.rgb_error(exposed, batch.colors)
+        photo_error = ray_error * self._trust(batch, rendered, progress)
         if batch.masks is not None:  # outside the masks nothing is known of the colour
             photo_error = photo_error * batch.masks
             mask_loss = losses.mask_error(rendered.opacity, batch.masks).mean()
         else:
             mask_loss = torch.zeros((), device=self.device)
         rgb_loss = photo_error.mean()
-        gradients = torch.cat([rendered.gradients, rendered.extra_gradients])
-        eikonal_loss = losses.eikonal_error(gradients).mean()
+        eikonal_loss = torch.cat(
+            [
+                self._relaxation(ray_error, rendered) * losses.eikonal_error(rendered.gradients),
+                losses.eikonal_error(rendered.extra_gradients),
+            ]
+        ).mean()
+        planar_loss = self._planar_loss(batch, rendered, progress)
         on_point, behind, front, free = rendered.extra_sdf[: 4 * num_sparse].view(4, num_sparse)
         margin = 0.25 * params.sparse_step
         sparse_error = (
@@ -173,6 +188,7 @@ class Trainer:
         loss = (
             rgb_loss
             + params.weight_eikonal * eikonal_loss
+            + params.weight_planar * schedules.exponential(progress, 0.1, 1.0) * planar_loss
             + params.weight_sparse * schedules.fade_out(progress, params.sparse_until) * sparse_loss
             + params.weight_mask * mask_loss
             + params.weight_exposure * exposure_loss
@@ -190,6 +206,7 @@ class Trainer:
                 "loss": loss.detach(),
                 "rgb": rgb_loss.detach(),
                 "eikonal": eikonal_loss.detach(),
+                "planar": planar_loss.detach(),
                 "sparse": sparse_loss.detach(),
                 "mask": mask_loss.detach(),
                 "psnr": -10 * torch.log10(mse.clamp(min=1e-10)),
@@ -207,11 +224,7 @@ class Trainer:
         if not self.params.ambiguity or progress < self.params.ambiguity_from:
             return torch.ones(num_rays, device=self.device)
         gains = torch.exp(self.fields.log_gains)
-        depth = (rendered.weights * rendered.distances).sum(1) / rendered.opacity.clamp(min=1e-3)
-        surface = batch.origins + depth[:, None] * batch.directions
-        gradients = rendered.gradients.view(*rendered.weights.shape, 3)
-        normals = torch.nn.functional.normalize(composite(rendered.weights, gradients), dim=1)
-
+        surface, normals = rendered.surface(batch)
         to_cameras = torch.nn.functional.normalize(self.photos.centers - surface[:, None], dim=2)
         facing = torch.einsum("ra,ria->ri", normals, to_cameras)
         colors, in_frame = self.photos.observe(surface)
@@ -224,6 +237,43 @@ class Trainer:
         own = batch.colors / gains[batch.images]
         distance = mahalanobis(own[:, None], colors / gains, self.color_precision)
         return trust(ambiguity(visibility, distance))
+
+    def _relaxation(self, ray_error: torch.Tensor, rendered: Rendered) -> torch.Tensor:
+        """Weight [N] of the Eikonal term at the rays' samples: below 1 near surfaces whose photo is not met yet."""
+        if not self.params.relaxed_eikonal:
+            return torch.ones_like(rendered.weights).view(-1)
+        near_surface = rendered.weights.detach() > _NEAR_SURFACE_WEIGHT
+        omega = losses.eikonal_relaxation(ray_error)[:, None].expand_as(rendered.weights)
+        return torch.where(near_surface, omega, torch.ones_like(omega)).reshape(-1)
+
+    def _planar_loss(self, batch: RayBatch, rendered: Rendered, progress: float) -> torch.Tensor:
+        """Mean planar error around the surface points of some of the rays, adaptively weighted (paper L_planar).
+
+        Half of the neighbours lie on the ray before the surface, as in the paper, half on a disk in its tangent plane.
+        """
+        params = self.params
+        chosen = torch.nonzero(rendered.opacity.detach() > 0.5).squeeze(1)[: params.planar_rays]
+        if not params.planar or len(chosen) == 0:
+            return torch.zeros((), device=self.device)
+        surface, normals = (part.detach()[chosen] for part in rendered.surface(batch))
+        radius = schedules.exponential(progress, params.planar_radius, 3 * self._voxel(1.0))
+        count = params.planar_neighbors
+        draws = torch.randn(len(chosen), count, 3, generator=self.generator, device=self.device)
+        tangent = draws - torch.einsum("qkc,qc->qk", draws, normals)[..., None] * normals[:, None]
+        disk = torch.nn.functional.normalize(tangent, dim=2)
+        on_ray = -batch.directions[chosen, None].expand_as(disk)
+        reach = radius * torch.rand(len(chosen), count, 1, generator=self.generator, device=self.device)
+        half = torch.arange(count, device=self.device) % 2 == 0
+        offsets = torch.where(half[None, :, None], on_ray * reach, disk * (reach * radius).sqrt())
+
+        neighbors = (surface[:, None] + offsets).reshape(-1, 3)
+        sdf, features, gradients = self.fields.sdf(torch.cat([surface, neighbors]), self.levels(progress))
+        center, center_features = sdf[: len(chosen)], features[: len(chosen)]
+        unit_normals = torch.nn.functional.normalize(gradients[: len(chosen)], dim=1)
+        shape = (len(chosen), count)
+        error = losses.planar_error(sdf[len(chosen) :].view(shape), center, unit_normals, offsets, radius)
+        flatness = losses.planarity(features[len(chosen) :].view(*shape, -1), center_features)
+        return (flatness * error).mean()
 
     def _voxel(self, progress: float) -> float:
         """Side of the finest active cell of the encoding, scene units: the paper's h."""
@@ -345,8 +395,7 @@ class Trainer:
             batch = self.photos.rays(torch.full_like(part, image), pixels[part])
             rendered = self.render(batch, progress, nothing, None)
             rows = part[batch.drawn].cpu()
-            gradients = rendered.gradients.view(*rendered.weights.shape, 3)
-            normals = torch.nn.functional.normalize(composite(rendered.weights, gradients), dim=1)
+            _, normals = rendered.surface(batch)
             photo[rows] = batch.colors.cpu()
             color[rows] = (rendered.colors * torch.exp(self.fields.log_gains[image])).clamp(0, 1).cpu()
             normal[rows] = (normals * 0.5 + 0.5).cpu()
