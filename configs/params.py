@@ -184,7 +184,6 @@ class TrainParams(Section):
 
     cache_resolution: int = Field(96, ge=8, le=512, description="side of the SDF grid that guides sampling")
     cache_every: int = Field(64, ge=1, description="steps between refreshes of that grid")
-    checkpoint_every: float = Field(60.0, gt=0, description="seconds between checkpoints")
     preview_every: float = Field(0.25, gt=0, le=1, description="progress between preview renders")
 
 

@@ -19,6 +19,7 @@ from stages.errors import ReconstructionError
 log = logging.getLogger(__name__)
 
 LOG_EVERY = 50  # steps between metric lines
+CHECKPOINT_EVERY = 60.0  # seconds
 
 
 def run(context: StageContext) -> dict[str, Any]:
@@ -50,7 +51,7 @@ def run(context: StageContext) -> dict[str, Any]:
                 context.progress(progress, 1.0, f"PSNR {numbers_out['psnr']:.1f} dB")
                 _check(numbers_out, trainer.step_index)
             now = time.monotonic()
-            if now - saved > params.checkpoint_every:
+            if now - saved > CHECKPOINT_EVERY:
                 lines.flush()
                 _save(trainer, checkpoint, spent + now - started)
                 saved = now
@@ -141,8 +142,10 @@ def _resume(trainer: Any, checkpoint: Path, metrics: Path) -> float:
     state = torch.load(checkpoint, map_location=trainer.device, weights_only=True)
     trainer.load_state(state["trainer"])
     lines = metrics.read_text(encoding="utf-8").splitlines() if metrics.exists() else []
-    kept = [line for line in lines if json.loads(line)["step"] <= trainer.step_index]
+    # The lines up to the checkpoint were flushed before it was written; a kill may have cut a later one in half.
+    kept = lines[: trainer.step_index // LOG_EVERY]
     metrics.write_text("".join(f"{line}\n" for line in kept), encoding="utf-8")
+    log.info("training goes on from step %d", trainer.step_index)
     return float(state["seconds"])
 
 

@@ -365,3 +365,13 @@ def test_photo_with_an_empty_mask_is_left_out(photos: Path):
     Image.fromarray(np.zeros(SIZE[::-1], np.uint8)).save(masks / "002.png")
     image_set, _, _ = ingest(photos, masks)
     assert reasons(image_set) == {"002.jpg": "its mask is empty (002.png)"}
+
+
+@pytest.mark.data
+@pytest.mark.parametrize(("name", "count", "with_focal"), [("banana", 16, 16), ("viking", 49, 0)])
+def test_real_photos_are_kept_with_the_focal_length_their_exif_gives(tmp_path, data_dir, name, count, with_focal):
+    out = tmp_path / "out"
+    out.mkdir()
+    context = StageContext({}, {"photos": data_dir / name / "images"}, out, tmp_path, IngestParams())
+    numbers = INGEST.run(context)
+    assert (numbers["images"], numbers["skipped"], numbers["with_focal"]) == (count, 0, with_focal)

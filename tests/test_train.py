@@ -158,7 +158,8 @@ def metric_lines(path: Path) -> list[dict]:
 
 def test_a_killed_run_goes_on_with_the_same_loss_curve(tmp_path, monkeypatch):
     monkeypatch.setattr(train, "LOG_EVERY", 5)
-    params = TINY.model_copy(update={"checkpoint_every": 1e-9, "preview_every": 1.0})
+    monkeypatch.setattr(train, "CHECKPOINT_EVERY", 0)
+    params = TINY.model_copy(update={"preview_every": 1.0})
     whole = context(tmp_path, "whole", params)
     numbers = train.run(whole)
     assert numbers["steps"] == TINY.steps
@@ -179,6 +180,8 @@ def test_a_killed_run_goes_on_with_the_same_loss_curve(tmp_path, monkeypatch):
         train.run(killed)
     monkeypatch.setattr(Trainer, "step", original)
     assert artifacts.checkpoint_path(killed.scratch).exists()
+    with artifacts.metrics_path(killed.scratch).open("a") as file:
+        file.write('{"step": 40, "progr')  # what a kill leaves of a line that was being written
     train.run(killed)
     curves = [metric_lines(artifacts.metrics_path(c.out)) for c in (whole, killed)]
     assert curves[0] == curves[1]
@@ -259,3 +262,21 @@ def test_a_term_of_the_method_changes_the_gradients_when_switched_on(term):
     assert (numbers[1]["planar"] > 0) == (term == "planar")
     difference = (base.fields.sdf.table.grad - with_term.fields.sdf.table.grad).abs().max()
     assert difference > 1e-3 * base.fields.sdf.table.grad.abs().max()
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+def test_a_step_on_cuda_matches_the_cpu():
+    cameras = ring_of_cameras()
+    scene = sphere_scene(cameras)
+    rendered = []
+    for device in ("cpu", "cuda"):
+        photos = Photos(cameras, [render(cameras, i)[0] for i in range(8)], None, device)
+        trainer = Trainer(photos, Sightings.from_scene(scene, device), TINY, device)
+        trainer._refresh_cache(0.3)
+        images = torch.arange(8, device=device).repeat(10)
+        pixels = torch.tensor([[24.0, 20.0]], device=device).repeat(80, 1)
+        batch = photos.rays(images, pixels)
+        rendered.append(trainer.render(batch, 0.3, torch.zeros(0, 3, device=device), None).colors.detach().cpu())
+        assert torch.isfinite(trainer.step(0.3)["loss"]).item()
+    torch.testing.assert_close(rendered[1], rendered[0], rtol=1e-3, atol=1e-3)

@@ -201,7 +201,11 @@ class Trainer:
         self.optimizer.step()
         self.step_index += 1
         with torch.no_grad():
-            mse = ((exposed - batch.colors) ** 2).mean()
+            squared = ((exposed - batch.colors) ** 2).mean(1)
+            if batch.masks is None:
+                mse = squared.mean()
+            else:
+                mse = (batch.masks * squared).sum() / batch.masks.sum().clamp(min=1)
             return {
                 "loss": loss.detach(),
                 "rgb": rgb_loss.detach(),
