@@ -70,7 +70,7 @@ class CleanupParams(Section):
 
     target_faces: int = Field(100_000, ge=100, description="faces after decimation")
     min_component: float = Field(
-        0.02, ge=0, le=1, description="pieces with fewer faces than this part of the largest piece are dropped"
+        0.002, ge=0, le=1, description="pieces with fewer faces than this part of the largest piece are dropped"
     )
     min_views: int = Field(1, ge=0, description="faces seen by fewer cameras than this count as unseen")
     keep_closed: bool = Field(False, description="keep unseen faces that close the surface (watertight where possible)")
