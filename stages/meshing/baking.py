@@ -48,6 +48,10 @@ GHOST_LEVELS = 25.0
 PADDING_REACH = 16
 # Texels handed to a thread at a time.
 _CHUNK = 250_000
+# Faces whose labels are priced at a time.
+_FACES = 10_000
+# Photos made ready ahead of use: each takes 23 bytes a pixel.
+_MAX_AHEAD = 8
 
 
 class Provenance(IntEnum):
@@ -177,8 +181,9 @@ def _prepare(atlas: AtlasMesh, cameras: PinholeCameras, load_photo: LoadPhoto, i
 
 
 def _prefetch(pool: ThreadPoolExecutor, prepare: Callable[[int], View], count: int, ahead: int) -> Iterator[View]:
-    """Views 0..count-1 in order, `ahead` of them being made in the background."""
+    """Views 0..count-1 in order, `ahead` of them (at most `_MAX_AHEAD`) being made in the background."""
     waiting: list[Future[View]] = []
+    ahead = min(ahead, _MAX_AHEAD)
     submitted = 0
     for _ in range(count):
         while submitted < count and len(waiting) <= ahead:
@@ -217,11 +222,14 @@ def _gains_and_labels(
     if gain:
         # From the photos themselves: their low bands mix neighbouring colours, more so in slanted views.
         gains = solve_gains(colors[:, num_faces:].transpose(1, 0, 2), weights[:, num_faces:].T)
-    face_weights = np.ascontiguousarray(weights[:, :num_faces].T)
-    face_colors = colors[:, :num_faces].transpose(1, 0, 2) * gains.astype(np.float32)
-    labels = choose_labels(
-        label_costs(face_weights, face_colors), face_neighbors(atlas.vertices, atlas.faces), SMOOTHNESS
-    )
+    costs = np.empty((num_faces, num_views), dtype=np.float32)
+    # A part of the faces at a time: the steps on the way need several times the memory of the colours.
+    for start in range(0, num_faces, _FACES):
+        part = slice(start, min(start + _FACES, num_faces))
+        part_colors = colors[:, part].transpose(1, 0, 2) * gains.astype(np.float32)
+        costs[part] = label_costs(np.ascontiguousarray(weights[:, part].T), part_colors)
+    del colors, weights
+    labels = choose_labels(costs, face_neighbors(atlas.vertices, atlas.faces), SMOOTHNESS)
     return gains, labels
 
 
