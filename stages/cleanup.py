@@ -29,13 +29,8 @@ def _masks(folder: Path, cameras: PinholeCameras, margin: int) -> Iterator[tuple
 
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * margin + 1, 2 * margin + 1))
     for index, name in enumerate(cameras.names):
-        path = artifacts.mask_path(folder, name)
-        if path.is_file():
-            mask = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-            if mask is None:
-                raise ReconstructionError(
-                    f"The mask of {name} cannot be read: {path}", "Try `--force undistort` to write it again."
-                )
+        mask = artifacts.load_mask(folder, name)
+        if mask is not None:
             yield index, cv2.dilate(mask, kernel) > 127
 
 

@@ -6,7 +6,8 @@ import logging
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from functools import lru_cache
+from pathlib import PurePosixPath
 from typing import Any
 
 import numpy as np
@@ -30,15 +31,11 @@ class _Warp:
         intrinsics: [3, 3] of the pinhole images.
         size: width, height of the pinhole images.
         shrink_to: width, height the photo is first reduced to (area filter), or None.
-        map_x, map_y: [height, width] float32 positions in the reduced photo, for cv2.remap (pixel centres at
-            integers).
     """
 
     intrinsics: np.ndarray
     size: tuple[int, int]
     shrink_to: tuple[int, int] | None
-    map_x: np.ndarray
-    map_y: np.ndarray
 
 
 def run(context: StageContext) -> dict[str, Any]:
@@ -48,27 +45,31 @@ def run(context: StageContext) -> dict[str, Any]:
 
     params, ingest = context.params, context.inputs["ingest"]
     model = pycolmap.Reconstruction(str(artifacts.model_path(context.inputs["sfm"])))
-    records = {record.name: record for record in artifacts.load_image_set(ingest).images}
     photos = sorted((model.images[i] for i in model.reg_image_ids()), key=lambda image: image.name)
     warps = {camera_id: _plan_warp(camera, params.max_side) for camera_id, camera in model.cameras.items()}
     names = _png_names([photo.name for photo in photos])
 
+    # Maps take 8 bytes a pixel, and where photos share no camera there is a pair for each of them: keep a few.
+    @lru_cache(maxsize=max(1, context.workers))
+    def maps_of(camera_id: int) -> tuple[np.ndarray, np.ndarray]:
+        return _warp_maps(model.cameras[camera_id], warps[camera_id])
+
     done = 0
 
     def warp(job: tuple[str, str, int]) -> np.ndarray | None:
-        """Writes one image (and mask) and returns the mask, small."""
+        """Writes one image (and its mask) and returns the mask."""
         nonlocal done
         source, name, camera_id = job
-        pixels = _warp_image(artifacts.image_path(ingest, source), warps[camera_id])
-        _write(artifacts.image_path(context.out, name), pixels)
-        small = None
-        if records[source].has_mask:
-            mask = _warp_mask(artifacts.mask_path(ingest, source), warps[camera_id], params.mask_erode)
-            _write(artifacts.mask_path(context.out, name), mask)
-            small = mask
+        maps = maps_of(camera_id)
+        pixels = _remap(artifacts.load_image(ingest, source), warps[camera_id], maps, cv2.INTER_CUBIC)
+        artifacts.write_png(artifacts.image_path(context.out, name), pixels, PNG_COMPRESSION)
+        mask = artifacts.load_mask(ingest, source)
+        if mask is not None:
+            mask = _warp_mask(mask, warps[camera_id], maps, params.mask_erode)
+            artifacts.write_png(artifacts.mask_path(context.out, name), mask, PNG_COMPRESSION)
         done += 1
         context.progress(done, len(photos) + 1, source)
-        return small
+        return mask
 
     before = cv2.getNumThreads()
     cv2.setNumThreads(1)  # the pool below is the parallelism
@@ -106,7 +107,7 @@ def run(context: StageContext) -> dict[str, Any]:
 
 # ---------------------------------------------------------------- pinhole images
 def _plan_warp(camera: Any, max_side: int) -> _Warp:
-    """The pinhole camera that shows only valid pixels of a COLMAP camera, and the maps to it."""
+    """The pinhole camera that shows only valid pixels of a COLMAP camera."""
     import pycolmap
 
     options = pycolmap.UndistortCameraOptions()
@@ -117,7 +118,18 @@ def _plan_warp(camera: Any, max_side: int) -> _Warp:
     intrinsics = np.array(pinhole.calibration_matrix())
     intrinsics[0] *= width / pinhole.width
     intrinsics[1] *= height / pinhole.height
+    shrink_to = None
+    if scale < 1:
+        shrink_to = max(1, round(camera.width * scale)), max(1, round(camera.height * scale))
+    return _Warp(intrinsics, (width, height), shrink_to)
 
+
+def _warp_maps(camera: Any, warp: _Warp) -> tuple[np.ndarray, np.ndarray]:
+    """Positions in the (reduced) photo of each pixel of the pinhole image, x and y [height, width] float32.
+
+    As cv2.remap wants them: pixel centres at integers.
+    """
+    (width, height), intrinsics = warp.size, warp.intrinsics
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     rays = np.stack(
         [
@@ -129,60 +141,30 @@ def _plan_warp(camera: Any, max_side: int) -> _Warp:
     ).reshape(-1, 3)
     positions = np.asarray(camera.img_from_cam(rays)).reshape(height, width, 2)
 
-    shrink_to = None
-    if scale < 1:
-        shrink_to = max(1, round(camera.width * scale)), max(1, round(camera.height * scale))
-        positions = positions * (np.array(shrink_to) / (camera.width, camera.height))
-    # cv2.remap counts pixel centres at integers
+    if warp.shrink_to is not None:
+        positions = positions * (np.array(warp.shrink_to) / (camera.width, camera.height))
     maps = (positions - 0.5).astype(np.float32)
-    return _Warp(
-        intrinsics,
-        (width, height),
-        shrink_to,
-        np.ascontiguousarray(maps[..., 0]),
-        np.ascontiguousarray(maps[..., 1]),
-    )
+    return np.ascontiguousarray(maps[..., 0]), np.ascontiguousarray(maps[..., 1])
 
 
-def _remap(pixels: np.ndarray, warp: _Warp, interpolation: int) -> np.ndarray:
+def _remap(pixels: np.ndarray, warp: _Warp, maps: tuple[np.ndarray, np.ndarray], interpolation: int) -> np.ndarray:
     import cv2
 
     if warp.shrink_to is not None:
         pixels = cv2.resize(pixels, warp.shrink_to, interpolation=cv2.INTER_AREA)
     # the outermost pixel centres may fall half a pixel outside the photo's own: repeat its border
-    return cv2.remap(pixels, warp.map_x, warp.map_y, interpolation, borderMode=cv2.BORDER_REPLICATE)
+    return cv2.remap(pixels, *maps, interpolation, borderMode=cv2.BORDER_REPLICATE)
 
 
-def _warp_image(path: Path, warp: _Warp) -> np.ndarray:
-    import cv2
-
-    # ingest wrote upright pixels; COLMAP and OpenCV must not turn them again
-    pixels = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-    if pixels is None:
-        raise ReconstructionError(f"The image {path} cannot be read.", "hineus run PHOTOS --force ingest")
-    return _remap(pixels, warp, cv2.INTER_CUBIC)
-
-
-def _warp_mask(path: Path, warp: _Warp, erode: int) -> np.ndarray:
+def _warp_mask(mask: np.ndarray, warp: _Warp, maps: tuple[np.ndarray, np.ndarray], erode: int) -> np.ndarray:
     """[H, W] uint8, 255 on the object, shrunk by `erode` pixels (not at the image's border)."""
     import cv2
 
-    mask = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-    if mask is None:
-        raise ReconstructionError(f"The mask {path} cannot be read.", "hineus run PHOTOS --force ingest")
-    mask = np.where(_remap(mask, warp, cv2.INTER_LINEAR) > 127, 255, 0).astype(np.uint8)
+    mask = np.where(_remap(mask, warp, maps, cv2.INTER_LINEAR) > 127, 255, 0).astype(np.uint8)
     if erode:
         kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * erode + 1, 2 * erode + 1))
         mask = cv2.erode(mask, kernel)
     return mask
-
-
-def _write(path: Path, pixels: np.ndarray) -> None:
-    import cv2
-
-    path.parent.mkdir(parents=True, exist_ok=True)
-    if not cv2.imwrite(str(path), pixels, [cv2.IMWRITE_PNG_COMPRESSION, PNG_COMPRESSION]):
-        raise OSError(f"could not write {path}")
 
 
 def _png_names(names: list[str]) -> list[str]:

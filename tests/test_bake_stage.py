@@ -10,8 +10,8 @@ import pytest
 
 from configs.params import BakeParams
 from stages import artifacts
-from stages.artifacts import AtlasMesh
-from stages.bake import BAKE, load_photo, write_png
+from stages.artifacts import AtlasMesh, write_png
+from stages.bake import BAKE, load_photo
 from stages.engine.stage import StageContext
 from stages.errors import ReconstructionError, WorkspaceError
 from stages.geometry.cameras import PinholeCameras, PosedScene
@@ -100,6 +100,15 @@ def test_an_image_that_cannot_be_read_is_named(context):
     artifacts.image_path(context.inputs["undistort"], "sub/two.png").write_bytes(b"")
     with pytest.raises(WorkspaceError, match=r"sub/two\.png cannot be read"):
         BAKE.run(context)
+
+
+def test_a_mask_that_cannot_be_read_is_named_and_not_ignored(context):
+    path = artifacts.mask_path(context.inputs["undistort"], "one.png")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(b"no mask")
+    with pytest.raises(WorkspaceError, match=r"one\.png\.png cannot be read") as caught:
+        BAKE.run(context)
+    assert "--force undistort" in caught.value.hint
 
 
 def test_an_image_of_the_wrong_size_is_explained(context):

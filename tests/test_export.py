@@ -72,7 +72,7 @@ def exported(tmp_path) -> tuple[Path, dict]:
 
 
 def workspace(tmp_path: Path, params: ExportParams | None = None) -> StageContext:
-    from stages.bake import write_png
+    from stages.artifacts import write_png
 
     folders = {name: tmp_path / name for name in ("undistort", "atlas", "bake", "out", "scratch")}
     for folder in folders.values():

@@ -16,8 +16,7 @@ import pytest
 
 from configs.params import ReportParams
 from stages import artifacts
-from stages.artifacts import AtlasMesh, ImageRecord, ImageSet, SkippedImage
-from stages.bake import write_png
+from stages.artifacts import AtlasMesh, ImageRecord, ImageSet, SkippedImage, write_png
 from stages.engine.stage import StageContext
 from stages.geometry.cameras import PinholeCameras, PosedScene
 from stages.geometry.orientation import y_up_rotation
