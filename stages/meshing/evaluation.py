@@ -19,6 +19,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from stages.geometry.similarity import Similarity
+from stages.meshing.cleaning import raycaster
 
 BOX_MARGIN = 0.04  # of the extent: a bulge just outside the object's box is still the method's fault
 FACE_MARGIN = 0.05  # of the extent: faces that lie inside this box are the ones that are sampled again
@@ -104,7 +105,7 @@ def seen_surface(known: KnownSurface) -> np.ndarray:
     """Points [P, 3] of the known surface that at least one camera's pixel centre sees, evenly thinned."""
     import open3d as o3d
 
-    scene = _raycaster(known.vertices, known.faces)
+    scene = raycaster(known.vertices, known.faces)
     points = []
     for cam_from_world in known.cam_from_world:
         rays = o3d.t.geometry.RaycastingScene.create_rays_pinhole(
@@ -166,7 +167,7 @@ def score_surface(vertices: np.ndarray, faces: np.ndarray, known: KnownSurface, 
     seen = seen_surface(known)
     seen = seen[seen[:, 2] > ground]
 
-    scene = _raycaster(known.vertices, known.faces)
+    scene = raycaster(known.vertices, known.faces)
     to_known = scene.compute_distance(o3d.core.Tensor(predicted.astype(np.float32))).numpy() / extent
     to_predicted = cKDTree(predicted).query(seen, workers=-1)[0] / extent
     f_scores = [_f_score(to_known, to_predicted, threshold) for threshold in SCORE_THRESHOLDS]
@@ -184,14 +185,3 @@ def score_surface(vertices: np.ndarray, faces: np.ndarray, known: KnownSurface, 
 def _f_score(to_known: np.ndarray, to_predicted: np.ndarray, threshold: float) -> float:
     precision, recall = (to_known < threshold).mean(), (to_predicted < threshold).mean()
     return float(200 * precision * recall / max(precision + recall, 1e-9))
-
-
-def _raycaster(vertices: np.ndarray, faces: np.ndarray):
-    import open3d as o3d
-
-    scene = o3d.t.geometry.RaycastingScene()
-    scene.add_triangles(
-        o3d.core.Tensor(np.ascontiguousarray(vertices, np.float32)),
-        o3d.core.Tensor(np.ascontiguousarray(faces, np.uint32)),
-    )
-    return scene
