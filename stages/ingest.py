@@ -6,7 +6,6 @@ and counted, never fatal by themselves.
 
 from __future__ import annotations
 
-import hashlib
 import logging
 import math
 import shutil
@@ -20,6 +19,7 @@ import numpy as np
 
 from stages import artifacts
 from stages.artifacts import ImageRecord, ImageSet, SkippedImage
+from stages.engine.fingerprint import file_sha256
 from stages.engine.stage import Stage, StageContext
 from stages.errors import InputError
 
@@ -166,11 +166,7 @@ def _first(names: list[str]) -> str:
 
 def _sha256(path: Path) -> str:
     try:
-        with path.open("rb") as file:
-            digest = hashlib.sha256()
-            for chunk in iter(lambda: file.read(1 << 20), b""):
-                digest.update(chunk)
-            return digest.hexdigest()
+        return file_sha256(path)
     except OSError:
         return f"unreadable:{path}"  # reading it as a photo fails next, with the reason
 
@@ -230,7 +226,7 @@ def _take_photo(
             stored_size = photo.size
             image = photo if orientation in (None, 0, 1) else ImageOps.exif_transpose(photo)
             rgb, alpha = _rgb_and_alpha(image)
-    except _UnusableError:
+    except (_UnusableError, MemoryError):
         raise
     except Exception as error:  # Pillow's decoders raise nearly anything on a damaged file
         raise _UnusableError(f"cannot be read ({error})") from error
