@@ -34,6 +34,7 @@ format: venv
 docs: venv
 	$(BIN)/python docs/make_reference.py
 	$(BIN)/python -m benchmarks.run_sets --table-only
+	$(BIN)/python -m benchmarks.ablate --table-only
 
 clean:
 	rm -rf .venv demo build dist *.egg-info

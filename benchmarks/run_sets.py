@@ -30,6 +30,7 @@ OUT = ROOT / "benchmarks" / "out"
 PAGE = ROOT / "docs" / "benchmarks.md"
 VALIDATOR = ROOT / "benchmarks" / "validate_glb.mjs"
 DEMO = "demo"
+NOT_MEASURED = "Not measured yet."
 GIB = 1 << 30
 
 
@@ -121,7 +122,7 @@ def run_set(name: str, data: Path | None) -> Result:
         arguments = ["run", str(photos), "--workspace", str(workspace)]
         shown = f"hineus run DATA/{name}/{photos.name}"
         truth = data / name
-    answer = _hineus([*arguments, "--json"])
+    answer = run_hineus([*arguments, "--json"])
     stages = tuple(
         StageCost(
             stage["name"],
@@ -138,7 +139,12 @@ def run_set(name: str, data: Path | None) -> Result:
     return Result(name, shown, machine(), stages, _score(folder, truth), validate(glb), glb.stat().st_size)
 
 
-def _hineus(arguments: Sequence[str]) -> dict[str, Any]:
+def run_hineus(arguments: Sequence[str]) -> dict[str, Any]:
+    """What `hineus ARGUMENTS --json` answers, run in a process of its own.
+
+    Raises:
+        RuntimeError: it failed; its message is included.
+    """
     command = [sys.executable, "-m", "hineus_cli", *arguments]
     done = subprocess.run(command, cwd=ROOT, stdout=subprocess.PIPE, text=True, check=False)
     if done.returncode != 0:
@@ -255,7 +261,7 @@ def summary_table(results: Sequence[Result]) -> str:
         ]
         for result in results
     ]
-    return _markdown(header, rows)
+    return markdown_table(header, rows)
 
 
 def stage_table(results: Sequence[Result]) -> str:
@@ -267,7 +273,7 @@ def stage_table(results: Sequence[Result]) -> str:
         for name in names
     ]
     rows.append(["all", *(f"{result.wall_s:.0f} / {result.cpu_s:.0f}" for result in results)])
-    return _markdown(["stage", *(result.name for result in results)], rows)
+    return markdown_table(["stage", *(result.name for result in results)], rows)
 
 
 def memory_table(results: Sequence[Result]) -> str:
@@ -275,7 +281,7 @@ def memory_table(results: Sequence[Result]) -> str:
     names = list(dict.fromkeys(stage.name for result in results for stage in result.stages))
     costs = [{stage.name: stage for stage in result.stages} for result in results]
     rows = [[name, *(f"{cost[name].peak_rss / GIB:.2f}" if name in cost else "-" for cost in costs)] for name in names]
-    return _markdown(["stage", *(result.name for result in results)], rows)
+    return markdown_table(["stage", *(result.name for result in results)], rows)
 
 
 def texture_table(results: Sequence[Result]) -> str:
@@ -291,7 +297,7 @@ def texture_table(results: Sequence[Result]) -> str:
         )
     )
     rows = [[name.replace("_", " "), *(_text(result.number("bake", name)) for result in results)] for name in names]
-    return _markdown(["texture", *(result.name for result in results)], rows)
+    return markdown_table(["texture", *(result.name for result in results)], rows)
 
 
 TABLES = {"summary": summary_table, "stages": stage_table, "memory": memory_table, "texture": texture_table}
@@ -304,17 +310,26 @@ def with_tables(page: str, results: Sequence[Result]) -> str:
         ValueError: a marker is missing.
     """
     for name, table in TABLES.items():
-        begin, end = f"<!-- table {name} -->", f"<!-- end {name} -->"
-        if page.count(begin) != 1 or page.count(end) != 1:
-            raise ValueError(f"the markers {begin} and {end} are expected once each")
-        before, rest = page.split(begin)
-        after = rest.split(end)[1]
-        body = table(results) if results else "Not measured yet."
-        page = f"{before}{begin}\n{body}\n{end}{after}"
+        page = with_table(page, name, table(results) if results else NOT_MEASURED)
     return page
 
 
-def _markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+def with_table(page: str, name: str, body: str) -> str:
+    """The page with `body` between the markers of table `name`.
+
+    Raises:
+        ValueError: a marker is missing.
+    """
+    begin, end = f"<!-- table {name} -->", f"<!-- end {name} -->"
+    if page.count(begin) != 1 or page.count(end) != 1:
+        raise ValueError(f"the markers {begin} and {end} are expected once each")
+    before, rest = page.split(begin)
+    after = rest.split(end)[1]
+    return f"{before}{begin}\n{body}\n{end}{after}"
+
+
+def markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Markdown: the first column to the left, the others to the right."""
     lines = [header, ["---"] + ["---:"] * (len(header) - 1), *rows]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
