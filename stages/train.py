@@ -84,16 +84,8 @@ def _use_threads(context: StageContext) -> None:
 
 def _load_images(folder: Path, names: tuple[str, ...]) -> tuple[list[np.ndarray], list[np.ndarray] | None]:
     """RGB images [H, W, 3] uint8 and masks [H, W] uint8, or None unless every photo has a mask."""
-    from PIL import Image
-
-    images, masks = [], []
-    for name in names:
-        with Image.open(artifacts.image_path(folder, name)) as image:
-            images.append(np.asarray(image.convert("RGB")))
-        mask = artifacts.mask_path(folder, name)
-        if mask.exists():
-            with Image.open(mask) as image:
-                masks.append(np.asarray(image.convert("L")))
+    images = [artifacts.load_image(folder, name) for name in names]
+    masks = [mask for name in names if (mask := artifacts.load_mask(folder, name)) is not None]
     if 0 < len(masks) < len(images):
         log.warning("only %d of %d photos have a mask: training goes without masks", len(masks), len(images))
     return images, masks if len(masks) == len(images) else None
