@@ -315,7 +315,7 @@ def doctor(
     product().print(table)
     if lacking:
         names = ", ".join(finding.what for finding in lacking)
-        advice = dict.fromkeys(finding.advice for finding in findings if finding.state != "ok" and finding.advice)
+        advice = dict.fromkeys(finding.advice for finding in lacking if finding.advice)
         raise SystemRequirementError(f"This machine lacks {names}.", "Try: " + "; ".join(advice))
 
 
