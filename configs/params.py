@@ -51,7 +51,9 @@ class UndistortParams(Section):
     """Camera poses to pinhole images in a normalised frame."""
 
     max_side: int = Field(1600, ge=64, description="longest side of the undistorted images, pixels")
-    mask_erode: int = Field(2, ge=0, description="masks shrink by this many pixels (at the undistorted size)")
+    mask_erode: int = Field(
+        0, ge=0, description="masks shrink by this many pixels (at the undistorted size), and the object with them"
+    )
     roi_scale: float = Field(1.0, gt=0, description="the region of interest found automatically is scaled by this")
     up: Literal["auto", "+x", "-x", "+y", "-y", "+z", "-z"] = Field(
         "auto", description="up axis in the world frame; auto: from the cameras"
