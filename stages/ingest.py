@@ -99,7 +99,7 @@ def run(context: StageContext) -> dict[str, Any]:
     if missing:
         raise InputError(
             f"{len(missing)} of {len(images)} photos have no mask in {masks_folder}: {_first(missing)}.",
-            f"Add {Path(missing[0]).stem}.png and the like, move those photos away, or run without --masks.",
+            f"Add {Path(missing[0]).stem}.png and the like, move those photos away, or run with `--no-masks`.",
         )
     for item in skipped:
         log.warning("left out %s: %s", item.source, item.reason)

@@ -338,7 +338,7 @@ def test_missing_masks(photos: Path):
     masks = write_masks(photos.parent / "masks", names[:3])
     with pytest.raises(InputError, match=r"2 of 5 photos have no mask in .*: 003\.jpg, 004\.jpg\.") as caught:
         ingest(photos, masks)
-    assert "--masks" in caught.value.hint
+    assert "--no-masks" in caught.value.hint
 
 
 def test_mask_of_the_wrong_size(photos: Path):

@@ -41,7 +41,7 @@ from stages.errors import WorkspaceError
 FORMAT = 1
 
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
-NOT_WRITABLE = (errno.EROFS, errno.EACCES, errno.EPERM)
+NOT_WRITABLE = (errno.EROFS, errno.EACCES, errno.EPERM, errno.ENOTDIR, errno.ENOENT)
 LOCKS_UNSUPPORTED = (errno.ENOLCK, errno.ENOTSUP, errno.ENOSYS)
 
 NEARLY_FULL_BYTES = 1 << 20  # libraries hide "disk full" in errors of their own; less free than this gives it away
