@@ -487,3 +487,10 @@ def test_meter_sees_memory_and_cpu_of_children() -> None:
 def test_resolved_settings_are_plain_data(bench: Bench) -> None:
     assert "!!python" not in (bench.run() and bench.root / "config.yaml").read_text()
     assert isinstance(load_config(file=bench.root / "config.yaml"), Config)
+
+
+def test_a_workspace_below_a_file_is_named(tmp_path: Path) -> None:
+    (tmp_path / "photo.jpg").write_bytes(b"")
+    with pytest.raises(WorkspaceError, match=r"photo\.jpg/ws cannot be written") as caught:
+        Workspace.open(tmp_path / "photo.jpg" / "ws", create=True)
+    assert "--workspace" in caught.value.hint
