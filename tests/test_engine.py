@@ -491,6 +491,7 @@ def test_resolved_settings_are_plain_data(bench: Bench) -> None:
 
 def test_a_workspace_below_a_file_is_named(tmp_path: Path) -> None:
     (tmp_path / "photo.jpg").write_bytes(b"")
-    with pytest.raises(WorkspaceError, match=r"photo\.jpg/ws cannot be written") as caught:
-        Workspace.open(tmp_path / "photo.jpg" / "ws", create=True)
+    workspace = Workspace.open(tmp_path / "photo.jpg" / "ws", create=True)
+    with pytest.raises(WorkspaceError, match=r"photo\.jpg/ws cannot be written") as caught, workspace.lock():
+        pass
     assert "--workspace" in caught.value.hint
