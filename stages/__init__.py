@@ -1,1 +1,6 @@
 """The pipeline from photos to a textured mesh, usable without the command line. `pipeline.py` is its contents page."""
+
+import os
+
+# Numba tries TBB first and warns where it is too old; nothing here needs it. Read when numba is first imported.
+os.environ.setdefault("NUMBA_THREADING_LAYER_PRIORITY", "omp workqueue tbb")
