@@ -31,6 +31,16 @@ def intersect_unit_sphere(
     return entry, leave, (half_squared > 1e-4) & (leave > entry + 1e-3)
 
 
+def stratified(num_rows: int, num_strata: int, generator: torch.Generator | None, device: torch.device) -> torch.Tensor:
+    """[num_rows, num_strata] ascending places in [0, 1): one draw in each of even strata; their centres without a
+    generator."""
+    if generator is None:
+        offset = torch.full((num_rows, num_strata), 0.5, device=device)
+    else:
+        offset = torch.rand(num_rows, num_strata, generator=generator, device=device)
+    return (torch.arange(num_strata, device=device) + offset) / num_strata
+
+
 class SdfCache:
     """The SDF on a regular grid over [-1, 1]^3, refreshed now and then; what sampling and visibility read.
 
@@ -100,11 +110,7 @@ def importance_distances(
     weights = weights + (EVEN_SHARE * weights.sum(1, keepdim=True) + 1e-4) / num_bins
     cdf = torch.nn.functional.pad(torch.cumsum(weights, 1), (1, 0))
     cdf = cdf / cdf[:, -1:]
-    if generator is None:
-        offset = torch.full((len(origins), num_samples), 0.5, device=device)
-    else:
-        offset = torch.rand(len(origins), num_samples, generator=generator, device=device)
-    u = (torch.arange(num_samples, device=device) + offset) / num_samples
+    u = stratified(len(origins), num_samples, generator, device)
     index = torch.searchsorted(cdf, u.contiguous(), right=True).clamp(1, num_bins)
     low, high = cdf.gather(1, index - 1), cdf.gather(1, index)
     inside = ((u - low) / (high - low).clamp(min=1e-8)).clamp(0, 1)

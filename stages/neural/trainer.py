@@ -6,6 +6,7 @@ Shapes: R rays, K samples a ray, N = R K points, P sparse points, I photos.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ from stages.neural.encodings import HashGrid
 from stages.neural.fields import BackgroundNetwork, Fields, FieldShape
 from stages.neural.photos import Photos, RayBatch
 from stages.neural.rendering import composite, sample_optical_depths, weights_from_optical_depth
-from stages.neural.sampling import SdfCache, importance_distances, intersect_unit_sphere
+from stages.neural.sampling import SdfCache, importance_distances, intersect_unit_sphere, stratified
 from stages.neural.visibility import (
     ambiguity,
     color_precision,
@@ -133,9 +134,14 @@ class Trainer:
         )
         self.cache = SdfCache(params.cache_resolution, device)
         self.generator = torch.Generator(device=device).manual_seed(params.seed)
-        self.color_precision = color_precision(photos, torch.Generator(device=device).manual_seed(params.seed))
         self.step_index = 0
         self.cache_step = -(10**9)
+
+    @cached_property
+    def color_precision(self) -> torch.Tensor:
+        """The photos' inverse colour covariance [3, 3], from a draw of its own; only the ambiguity weight asks."""
+        generator = torch.Generator(device=self.device).manual_seed(self.params.seed)
+        return color_precision(self.photos, generator)
 
     # ------------------------------------------------------------------ schedules
     def scale(self, progress: float) -> float:
@@ -150,7 +156,7 @@ class Trainer:
 
     # ------------------------------------------------------------------ one step
     def step(self, progress: float) -> dict[str, torch.Tensor]:
-        """One optimiser step at progress in [0, 1]; returns its unreduced numbers as tensors (no sync)."""
+        """One optimiser step at progress in [0, 1]; returns its terms and checks, batch means as tensors (no sync)."""
         params = self.params
         self._refresh_cache(progress)
         batch = self.photos.draw(params.rays, self.generator)
@@ -256,9 +262,12 @@ class Trainer:
         Half of the neighbours lie on the ray before the surface, as in the paper, half on a disk in its tangent plane.
         """
         params = self.params
+        nothing = torch.zeros((), device=self.device)
+        if not params.planar:
+            return nothing
         chosen = torch.nonzero(rendered.opacity.detach() > 0.5).squeeze(1)[: params.planar_rays]
-        if not params.planar or len(chosen) == 0:
-            return torch.zeros((), device=self.device)
+        if len(chosen) == 0:
+            return nothing
         surface, normals = (part.detach()[chosen] for part in rendered.surface(batch))
         radius = schedules.exponential(progress, params.planar_radius, 3 * self._voxel(1.0))
         count = params.planar_neighbors
@@ -351,11 +360,7 @@ class Trainer:
         count = self.params.background_samples
         behind = torch.nonzero(transmittance.detach() > 0.01).squeeze(1)
         origins, directions = batch.origins[behind], batch.directions[behind]
-        if generator is None:
-            offset = torch.full((len(behind), count + 1), 0.5, device=self.device)
-        else:
-            offset = torch.rand(len(behind), count + 1, generator=generator, device=self.device)
-        inverse = 1 - _BACKGROUND_REACH * (torch.arange(count + 1, device=self.device) + offset) / (count + 1)
+        inverse = 1 - _BACKGROUND_REACH * stratified(len(behind), count + 1, generator, self.device)
         middle = -(origins * directions).sum(1, keepdim=True)
         closest_squared = (origins**2).sum(1, keepdim=True) - middle**2
         distances = middle + (1 / inverse**2 - closest_squared).clamp(min=0).sqrt()
