@@ -38,10 +38,10 @@ from stages.errors import HineusError
 BASE = "base"
 VARIANTS: dict[str, tuple[str, ...]] = {
     BASE: (),
-    "ambiguity": ("train.ambiguity=true",),
-    "planar": ("train.planar=true",),
-    "eikonal": ("train.relaxed_eikonal=true",),
-    "all": ("train.ambiguity=true", "train.planar=true", "train.relaxed_eikonal=true"),
+    "ambiguity": ("train.ambiguity=stable",),
+    "planar": ("train.planar=stable",),
+    "eikonal": ("train.eikonal=stable",),
+    "all": ("train.ambiguity=stable", "train.planar=stable", "train.eikonal=stable"),
 }
 
 RUNS = RESULTS / "ablation"

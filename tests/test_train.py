@@ -21,7 +21,7 @@ from stages.neural.photos import Photos
 from stages.neural.trainer import Sightings, Trainer
 
 TINY = TrainParams(
-    steps=60, rays=128, samples=12, levels=4, log2_rows=10, coarsest=8, finest=32, hidden=16, start_levels=2,
+    steps=60, rays=128, samples=12, levels=4, log2_rows=10, coarsest=8, finest=32, sdf_width=16, radiance_width=16, start_levels=2,
     free_points=64, sparse_batch=32, cache_resolution=24, cache_every=16, background_log2_rows=9,
     background_samples=4,
 )  # fmt: skip

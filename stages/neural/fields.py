@@ -32,8 +32,9 @@ class FieldShape:
     """Everything needed to build the networks again.
 
     Attributes:
-        sdf_grid: hash encoding of the SDF.
-        hidden: width of the SDF's and the radiance MLP's hidden layers.
+        sdf_grid: encoding of the SDF.
+        sdf_layers, sdf_width: hidden layers of the SDF's MLP.
+        radiance_layers, radiance_width: hidden layers of the radiance MLP; the other networks are as wide.
         features: geometry features handed from the SDF network to the radiance network.
         sphere_radius: radius of the sphere that the SDF is before training.
         background_grid: hash encoding of the background, or None without one.
@@ -41,7 +42,10 @@ class FieldShape:
     """
 
     sdf_grid: HashGrid
-    hidden: int
+    sdf_layers: int
+    sdf_width: int
+    radiance_layers: int
+    radiance_width: int
     features: int
     sphere_radius: float
     background_grid: HashGrid | None
@@ -57,7 +61,7 @@ class SdfNetwork(nn.Module):
     def __init__(self, shape: FieldShape, generator: torch.Generator) -> None:
         super().__init__()
         self.grid, self.radius = shape.sdf_grid, shape.sphere_radius
-        channels, hidden, outputs = self.grid.channels, shape.hidden, 1 + shape.features
+        channels, hidden, outputs = self.grid.channels, shape.sdf_width, 1 + shape.features
         self.table = nn.Parameter(self.grid.initial_table(generator))
         self.weight_in = nn.Parameter(_uniform(hidden, channels, generator))
         self.bias_in = nn.Parameter(torch.zeros(hidden))
@@ -95,7 +99,7 @@ class RadianceNetwork(nn.Module):
     def __init__(self, shape: FieldShape, generator: torch.Generator) -> None:
         super().__init__()
         inputs = shape.features + 3 + 3 + 3 + 1 + 15
-        self.layers = _mlp([inputs, shape.hidden, shape.hidden, 3], generator)
+        self.layers = _mlp([inputs, *[shape.radiance_width] * shape.radiance_layers, 3], generator)
 
     def forward(
         self,
@@ -119,7 +123,7 @@ class BackgroundNetwork(nn.Module):
         assert shape.background_grid is not None
         self.grid = shape.background_grid
         self.table = nn.Parameter(self.grid.initial_table(generator))
-        self.layers = _mlp([self.grid.channels + 3, shape.hidden, 4], generator)
+        self.layers = _mlp([self.grid.channels + 3, shape.radiance_width, 4], generator)
 
     def forward(self, points: torch.Tensor, view_dirs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Density [N] per unit of CONTRACTED length and colour [N, 3] at points [N, 3] outside the unit sphere."""

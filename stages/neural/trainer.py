@@ -103,7 +103,10 @@ def field_shape(params: TrainParams, num_images: int, background: bool) -> Field
     background_grid = HashGrid(6, 4, params.background_log2_rows, 16, 256)
     return FieldShape(
         sdf_grid=grid,
-        hidden=params.hidden,
+        sdf_layers=params.sdf_layers,
+        sdf_width=params.sdf_width,
+        radiance_layers=params.radiance_layers,
+        radiance_width=params.radiance_width,
         features=15,
         sphere_radius=params.sphere_radius,
         background_grid=background_grid if background else None,
@@ -231,7 +234,7 @@ class Trainer:
         1 before `ambiguity_from`: early on, a pattern seen at a wrong depth would pass for a reflection.
         """
         num_rays = len(batch.leave)
-        if not self.params.ambiguity or progress < self.params.ambiguity_from:
+        if self.params.ambiguity == "off" or progress < self.params.ambiguity_from:
             return torch.ones(num_rays, device=self.device)
         gains = torch.exp(self.fields.log_gains)
         surface, normals = rendered.surface(batch)
@@ -250,7 +253,7 @@ class Trainer:
 
     def _relaxation(self, ray_error: torch.Tensor, rendered: Rendered) -> torch.Tensor:
         """Weight [N] of the Eikonal term at the rays' samples: below 1 near surfaces whose photo is not met yet."""
-        if not self.params.relaxed_eikonal:
+        if self.params.eikonal == "plain":
             return torch.ones_like(rendered.weights).view(-1)
         near_surface = rendered.weights.detach() > _NEAR_SURFACE_WEIGHT
         omega = losses.eikonal_relaxation(ray_error)[:, None].expand_as(rendered.weights)
@@ -263,7 +266,7 @@ class Trainer:
         """
         params = self.params
         nothing = torch.zeros((), device=self.device)
-        if not params.planar:
+        if params.planar == "off":
             return nothing
         chosen = torch.nonzero(rendered.opacity.detach() > 0.5).squeeze(1)[: params.planar_rays]
         if len(chosen) == 0:
