@@ -47,6 +47,37 @@ def test_relaxation_is_one_on_met_photos_and_bounded_below():
     assert losses.eikonal_relaxation(torch.zeros(1), planarity=0.0).item() == pytest.approx(0.6)
 
 
+def test_relaxation_listens_to_gamma_and_clip_and_detaches_the_planarity():
+    planarity = torch.tensor([0.5], requires_grad=True)
+    omega = losses.eikonal_relaxation(torch.tensor([0.3]), planarity, gamma=2.0, clip=0.25)
+    assert omega.item() == pytest.approx(0.2 + 0.8 * math.exp(-0.5) * 0.75)
+    assert not omega.requires_grad
+
+
+def test_literal_relaxation_is_the_paper_s_product_and_differentiable_in_both():
+    error = torch.tensor([0.0, 0.1, 0.3], requires_grad=True)
+    planarity = torch.tensor([1.0, 0.4, 0.4], requires_grad=True)
+    omega = losses.eikonal_relaxation_literal(error, planarity, gamma=5.0, clip=0.2)
+    assert omega.tolist() == pytest.approx([1, 0.4 * math.exp(-0.5), 0.4 * math.exp(-1)])
+    omega.sum().backward()
+    assert error.grad.tolist() == pytest.approx([-5, -2 * math.exp(-0.5), 0])  # none beyond the clip
+    assert planarity.grad.tolist() == pytest.approx([1, math.exp(-0.5), math.exp(-1)])
+
+
+def test_literal_relaxation_lets_the_eikonal_term_vanish():
+    # Features a unit apart: lambda_pla = 1e-3 / 1.001. A gradient of length 2, wrong by all there is, then costs 1e-3.
+    features = torch.nn.functional.one_hot(torch.zeros(16, 4, dtype=torch.long), 8).float()
+    flat = losses.planarity_literal(features, torch.zeros(16, 8)).mean(1)
+    assert flat.tolist() == pytest.approx([1e-3 / 1.001] * 16)
+    error, photo_error = losses.eikonal_error(torch.tensor([[0.0, 0, 2]]).expand(16, 3)), torch.full((16,), 0.05)
+    literal = (losses.eikonal_relaxation_literal(photo_error, flat) * error).mean().item()
+    assert literal == pytest.approx(1e-3 / 1.001 * math.exp(-0.25))  # 7.8e-4
+    stable = (
+        losses.eikonal_relaxation(photo_error, losses.planarity(features, torch.zeros(16, 8)).mean(1)) * error
+    ).mean()
+    assert stable.item() == pytest.approx(0.2 + 0.8 * math.exp(-0.25) * 0.75)  # 0.67: the median weight is 1/2
+
+
 def test_planar_error_is_zero_on_a_plane_at_any_distance_and_not_on_an_edge():
     generator = torch.Generator().manual_seed(0)
     offsets = 0.1 * (torch.rand(5, 8, 3, generator=generator) - 0.5)
@@ -65,6 +96,55 @@ def test_planar_error_pulls_the_neighbour_towards_the_plane():
     assert error.item() == pytest.approx(0.1 * (0.5 - 0.05))  # slope error 0.5, Huber with delta 0.1
     error.sum().backward()
     assert sdf.grad.item() == pytest.approx(0.1 / 0.04)
+
+
+def test_literal_planar_error_is_zero_on_a_plane_through_x_0_and_not_on_one_beside_it():
+    generator = torch.Generator().manual_seed(0)
+    offsets = 0.1 * (torch.rand(5, 8, 3, generator=generator) - 0.5)
+    normals = torch.nn.functional.normalize(torch.randn(5, 3, generator=generator), dim=1)
+    plane = torch.einsum("qc,qkc->qk", normals, offsets)
+    assert losses.planar_error_literal(plane, normals, offsets).max() < 1e-5
+    beside = losses.planar_error_literal(plane + 1e-3, normals, offsets)
+    torch.testing.assert_close(beside, 1e-3 / offsets.norm(dim=2), rtol=1e-3, atol=1e-5)
+    center = torch.full((5,), 1e-3)
+    assert losses.planar_error(plane + 1e-3, center, normals, offsets, 0.05).max() < 1e-8
+
+
+def test_literal_planar_error_weighs_an_error_by_the_inverse_length():
+    sdf = torch.tensor([[0.02, -0.03]], requires_grad=True)
+    offsets, normals = torch.tensor([[[0.04, 0, 0], [0, 0, -0.01]]]), torch.tensor([[0.0, 0, 1]])
+    error = losses.planar_error_literal(sdf, normals, offsets)
+    assert error[0].tolist() == pytest.approx([0.5, 2.0])
+    error.sum().backward()
+    assert sdf.grad[0].tolist() == pytest.approx([25, -100])
+
+
+def test_literal_planar_error_is_finite_at_x_0_itself():
+    sdf = torch.tensor([[1e-3, 0.0]], requires_grad=True)
+    offsets = torch.zeros(1, 2, 3, requires_grad=True)
+    error = losses.planar_error_literal(sdf, torch.tensor([[0.0, 0, 1]]), offsets)
+    assert error[0].tolist() == pytest.approx([1e6, 0])
+    error.sum().backward()
+    assert sdf.grad.isfinite().all()
+    assert offsets.grad.isfinite().all()
+
+
+def test_literal_planar_terms_agree_with_finite_differences():
+    generator = torch.Generator().manual_seed(1)
+    sdf, normals, offsets, features, center = (
+        torch.randn(*shape, generator=generator, dtype=torch.float64, requires_grad=True)
+        for shape in ((3, 4), (3, 3), (3, 4, 3), (3, 4, 5), (3, 5))
+    )
+    assert torch.autograd.gradcheck(losses.planar_error_literal, (sdf, normals, offsets))
+    assert torch.autograd.gradcheck(lambda f, c: losses.planarity_literal(f, c, 0.5), (features, center))
+
+
+def test_literal_planarity_is_one_for_equal_features_and_pulls_others_apart():
+    features = torch.tensor([[[0.0], [1e-3], [1.0]]], requires_grad=True)
+    weight = losses.planarity_literal(features, torch.zeros(1, 1))
+    assert weight[0].tolist() == pytest.approx([1, 0.5, 1e-3 / 1.001])
+    weight.sum().backward()
+    assert features.grad[0, :, 0].tolist() == pytest.approx([0, -250, -1e-3 / 1.001**2])
 
 
 def test_planarity_is_one_for_equal_features_and_half_at_the_median():

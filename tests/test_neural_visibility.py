@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 import math
+import sys
+from functools import lru_cache
 
+import numpy as np
 import pytest
 import torch
 from sphere_scene import render, ring_of_cameras
 
+from stages.errors import ReconstructionError, SystemRequirementError
 from stages.neural import visibility as vis
 from stages.neural.photos import Photos
 from stages.neural.sampling import SdfCache
 
 
+@lru_cache
 def ball_cache(*balls: tuple[float, float, float, float], resolution: int = 96) -> SdfCache:
-    """Union of balls (x, y, z, radius)."""
+    """Union of balls (x, y, z, radius). Shared between tests: not to be written to."""
     cache = SdfCache(resolution, "cpu")
-    centers, radii = torch.tensor(balls)[:, :3], torch.tensor(balls)[:, 3]
-    cache.refresh(lambda p: (torch.cdist(p, centers) - radii).min(1).values)
+    cache.refresh(lambda p: torch.stack([(p - torch.tensor(b[:3])).norm(dim=1) - b[3] for b in balls]).amin(0))
     return cache
 
 
@@ -76,6 +80,116 @@ def test_sphere_tracing_meets_the_same_minimum_as_dense_samples():
     assert (traced >= dense - 1e-5).all()  # it looks at a subset of the path
 
 
+def paths(start: tuple[float, float, float], end: tuple[float, float, float], count: int = 1):
+    return torch.tensor([start]).expand(count, 3).contiguous(), torch.tensor([end]).expand(count, 3).contiguous()
+
+
+@pytest.mark.parametrize(("num_samples", "mean"), [(16, 0.957), (64, 0.837), (256, 0.491), (1024, 0.058)])
+def test_algorithm_1_fades_with_its_samples_as_the_closed_form_says(num_samples, mean):
+    # f = distance to the surface along a path of 2.5 at a right angle: the mean of a factor is 1 - ln 2 / (beta L).
+    assert (1 - math.log(2) / (100 * 2.5)) ** num_samples == pytest.approx(mean, abs=5e-4)
+    count = 1 << 17 >> int(math.log2(num_samples))
+    points, centers = paths((0, 0, 0.5), (0, 0, 3), count)
+    cache, generator = ball_cache((0, 0, 0, 0.5)), torch.Generator().manual_seed(0)
+    literal = vis.visibility_literal(cache, points, centers, num_samples, generator)
+    assert literal.mean().item() == pytest.approx(mean, abs=0.03)
+    smallest = vis.smallest_sdf_on_paths(cache, points[:1], centers[:1], torch.tensor([0.04]), num_samples)
+    assert vis.sdf_visibility(smallest).item() > 0.95
+
+
+def test_algorithm_1_hides_what_is_behind_and_depends_on_its_sharpness_and_draw():
+    cache = ball_cache((0, 0, 0, 0.5))
+    points, centers = paths((0, 0, -0.5), (0, 0, 3), 50)
+    draw = torch.Generator().manual_seed
+    assert vis.visibility_literal(cache, points, centers, 64, draw(0)).max() < 1e-6
+    front, centers = paths((0, 0, 0.5), (0, 0, 3), 50)
+    soft, sharp = (vis.visibility_literal(cache, front, centers, 64, draw(1), beta) for beta in (10, 1000))
+    assert soft.mean() < 0.3
+    assert sharp.mean() > 0.95
+    assert torch.equal(sharp, vis.visibility_literal(cache, front, centers, 64, draw(1), 1000))
+    assert not torch.equal(soft, vis.visibility_literal(cache, front, centers, 64, draw(2), 10))
+
+
+def test_algorithm_1_is_the_paper_s_loop():
+    cache = ball_cache((0, 0, 0, 0.4), (0.3, 0, 0.6, 0.1))
+    points, centers = torch.tensor([[0.0, 0, 0.4], [0.4, 0, 0]]), torch.tensor([[0.4, 0.1, 2.5], [0.3, 0.2, -2.0]])
+    fast = vis.visibility_literal(cache, points, centers, 8, torch.Generator().manual_seed(5))
+    draws = torch.rand(2, 8, 1, generator=torch.Generator().manual_seed(5))
+    for i in range(2):
+        product, length = 1.0, (points[i] - centers[i]).norm()
+        direction = (points[i] - centers[i]) / length
+        for k in range(8):
+            place = centers[i] + draws[i, k] * length * direction
+            f = max(cache.lookup(place[None]).item(), place.norm().item() - 1)
+            product /= 1 + math.exp(-100 * f)
+        assert fast[i].item() == pytest.approx(product, rel=1e-4, abs=1e-9)
+
+
+def test_algorithm_1_misses_a_thin_occluder_that_the_others_find():
+    cache = ball_cache((0, 0, 0, 0.3), (0, 0, 0.7, 0.06))
+    points, centers = paths((0, 0, 0.3), (0, 0, 3), 400)
+    literal = vis.visibility_literal(cache, points, centers, 16, torch.Generator().manual_seed(0))
+    assert (literal > 0.5).float().mean() > 0.3  # no sample falls into 0.12 of 2.7 in (1 - 0.12 / 2.7)^16 = 48 %
+    assert (literal < 0.1).float().mean() > 0.1
+    start = torch.full((400,), 0.05)
+    assert (vis.sdf_visibility(vis.smallest_sdf_on_paths(cache, points, centers, start)) < 0.3).all()
+    assert (vis.MeshVisibility(cache)(points, centers, start) == 0).all()
+
+
+def test_nothing_outside_the_unit_sphere_hides():
+    cache = SdfCache(48, "cpu")
+    cache.refresh(lambda p: torch.where(p.norm(dim=1) < 1.05, p.norm(dim=1) - 0.5, -torch.ones(len(p))))
+    points, centers = paths((0.29, 0.29, 0.29), (2.0, 2.0, 2.0), 64)
+    assert (cache.lookup(torch.linspace(0.7, 2, 9)[:, None].expand(9, 3)) < 0).all()
+    assert vis.visibility_literal(cache, points, centers, 16, torch.Generator().manual_seed(0)).mean() > 0.8
+    assert (vis.MeshVisibility(cache)(points, centers, torch.full((64,), 0.05)) == 1).all()
+    assert vis.free_outside(torch.tensor([0.3, -1.0, 0.2]), torch.tensor([0.5, 3.0, 1.1])).tolist() == pytest.approx(
+        [0.3, 2.0, 0.2]
+    )
+
+
+def test_a_mesh_shows_the_front_and_hides_the_back_of_a_ball():
+    cache = ball_cache((0.1, 0, 0, 0.5))  # off the centre: axes in the wrong order would show
+    directions = torch.nn.functional.normalize(torch.randn(400, 3, generator=torch.Generator().manual_seed(0)), dim=1)
+    points = torch.tensor([0.1, 0, 0]) + 0.5 * directions
+    centers = torch.tensor([[2.0, -1.5, 1.0]]).expand(400, 3)
+    facing = (torch.nn.functional.normalize(centers - points, dim=1) * directions).sum(1)
+    visible = vis.MeshVisibility(cache)(points, centers, vis.path_margin(facing, 0.002, 0.01))
+    assert set(visible.tolist()) == {0.0, 1.0}
+    assert (visible[facing > 0.1] == 1).all()
+    assert (visible[facing < -0.3] == 0).all()
+
+
+def test_the_mesh_follows_the_cache():
+    cache = SdfCache(40, "cpu")
+    cache.refresh(lambda p: p.norm(dim=1) - 0.3)
+    mesh = vis.MeshVisibility(cache)
+    points, centers = paths((0, 0, 0.3), (0, 0, 3))
+    start = torch.tensor([0.05])
+    assert mesh(points, centers, start).tolist() == [1]
+    scene = mesh.scene
+    mesh(points, centers, start)
+    assert mesh.scene is scene
+    cache.values.copy_(ball_cache((0, 0, 0, 0.3), (0, 0, 0.7, 0.2), resolution=40).values)
+    assert mesh(points, centers, start).tolist() == [0]
+    cache.refresh(lambda p: p.norm(dim=1) + 1)  # nothing solid, no face
+    assert mesh(points, centers, start).tolist() == [1]
+
+
+def test_a_camera_nearer_than_the_margin_sees():
+    points, centers = paths((0, 0, 0.5), (0, 0, 0.52))
+    assert vis.MeshVisibility(ball_cache((0, 0, 0, 0.5), resolution=40))(
+        points, centers, torch.tensor([0.05])
+    ).tolist() == [1]
+
+
+def test_without_open3d_the_setting_that_needs_it_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "open3d", None)
+    with pytest.raises(SystemRequirementError, match=r"train\.visibility.*open3d") as error:
+        vis.MeshVisibility(ball_cache((0, 0, 0, 0.5)))(*paths((0, 0, 0.5), (0, 0, 3)), torch.tensor([0.05]))
+    assert "train.visibility=stable" in error.value.hint
+
+
 def test_margin_grows_towards_grazing_angles_and_is_bounded():
     margin = vis.path_margin(torch.tensor([1.0, 0.5, 0.1, -1]), scale=0.01, voxel=0.004)
     assert margin.tolist() == pytest.approx([0.04, 0.08, 0.2, 0.2])
@@ -85,6 +199,29 @@ def test_trust_falls_with_ambiguity_and_keeps_its_mean():
     weights = vis.trust(torch.tensor([0.0, 1.0, 3.0]))
     assert weights.mean().item() == pytest.approx(1)
     assert (weights / weights[0]).tolist() == pytest.approx([1, 0.5, 0.25])
+
+
+def test_literal_trust_is_not_renormalised():
+    assert vis.trust_literal(torch.tensor([0.0, 1.0, 3.0])).tolist() == [1, 0.5, 0.25]
+
+
+def test_the_loss_can_be_lowered_by_raising_literal_doubt_only():
+    rendered = torch.tensor([[0.6, 0.2, 0.2]], requires_grad=True)
+    others, visibility = torch.tensor([[[0.2, 0.2, 0.2], [0.4, 0.2, 0.2]]]), torch.tensor([[1.0, 0.96]])
+    doubt = vis.ambiguity(visibility, vis.mahalanobis(rendered[:, None], others, 4 * torch.eye(3)))
+    assert doubt.item() == pytest.approx((0.8 + 0.96 * 0.4) / 2)
+    vis.trust_literal(doubt).sum().backward()
+    # d lambda / d red = (1 + 0.96) / 2 * sqrt(4), and d weight / d lambda = -1 / (1 + lambda)^2.
+    assert rendered.grad[0].tolist() == pytest.approx([-1.96 / 1.592**2, 0, 0], abs=1e-6)
+    assert not vis.trust(doubt).requires_grad
+
+
+def test_mahalanobis_has_a_finite_gradient_where_colours_agree():
+    rendered = torch.full((1, 3), 0.3, requires_grad=True)
+    distance = vis.mahalanobis(rendered, torch.full((1, 3), 0.3), 50 * torch.eye(3))
+    distance.sum().backward()
+    assert distance.item() < 2e-6
+    assert rendered.grad[0].tolist() == [0, 0, 0]
 
 
 def test_mahalanobis_is_euclidean_for_unit_covariance_and_scales_with_it():
@@ -101,7 +238,31 @@ def test_precision_is_the_inverse_covariance_of_the_photos():
     torch.testing.assert_close(precision @ covariance, torch.eye(3), atol=0.05, rtol=0.05)
 
 
+def test_the_paper_s_precision_is_the_plain_inverse_and_fails_on_grey_photos():
+    cameras = ring_of_cameras()
+    images = [render(cameras, i)[0] for i in range(8)]
+    draw = torch.Generator().manual_seed
+    photos = Photos(cameras, images, None, "cpu")
+    literal = vis.color_precision(photos, draw(0), floor=0.0)
+    rows = torch.randint(len(photos.pixels), (100_000,), generator=draw(0))
+    expected = np.linalg.inv(np.cov(photos.pixels[rows].numpy().T / 255.0))
+    torch.testing.assert_close(literal, torch.from_numpy(expected).float(), rtol=1e-4, atol=1e-4)
+    assert not torch.equal(literal, vis.color_precision(photos, draw(0)))
+
+    grey = Photos(cameras, [image[..., :1].repeat(3, 2) for image in images], None, "cpu")
+    with pytest.raises(ReconstructionError, match="ambiguity=paper"):
+        vis.color_precision(grey, draw(0), floor=0.0)
+    assert vis.color_precision(grey, draw(0)).isfinite().all()
+
+
 def test_ambiguity_counts_visible_views_only():
     visibility = torch.tensor([[0.95, 0.5, 1.0], [0.1, 0.2, 0.3]])
     distance = torch.tensor([[2.0, 100, 4], [5, 5, 5]])
     assert vis.ambiguity(visibility, distance).tolist() == pytest.approx([(1.9 + 4) / 2, 0])
+
+
+def test_without_another_view_nothing_is_doubted():
+    nothing = vis.ambiguity(torch.zeros(2, 3), torch.ones(2, 3)), vis.ambiguity(torch.ones(2, 0), torch.ones(2, 0))
+    for doubt in nothing:
+        assert doubt.tolist() == [0, 0]
+        assert vis.trust(doubt).tolist() == vis.trust_literal(doubt).tolist() == [1, 1]

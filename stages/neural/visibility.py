@@ -1,12 +1,18 @@
 """Which photos see a surface point, and how far they disagree on its colour (paper: SDF-guided multi-view consistency).
 
-Shapes: R surface points, I photos, K samples on a path. Nothing here carries a gradient.
+Shapes: R rays, I photos, P paths from a surface point to a camera, K samples on a path.
+
+Visibility reads the cached SDF grid and carries no gradient: the network at P K places would cost 24 times the
+rendering (512 rays, 48 photos, 64 samples). Space outside the unit sphere is free: nothing is reconstructed there.
 """
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 
+from stages.errors import ReconstructionError, SystemRequirementError
 from stages.neural.photos import Photos
 from stages.neural.sampling import SdfCache
 
@@ -15,6 +21,10 @@ SHARPNESS = 100.0
 VISIBLE = 0.9
 # Keeps the colour covariance invertible where photos are nearly grey: one 8-bit level, squared.
 _COLOR_VARIANCE_FLOOR = (1 / 255) ** 2
+# A covariance whose smallest eigenvalue is this small a part of the largest has no inverse worth the name.
+_SINGULAR = 1e-9
+# Smallest squared Mahalanobis distance: keeps the root's gradient finite where two colours agree.
+_SQUARED_DISTANCE_FLOOR = 1e-12
 
 
 def sdf_visibility_literal(path_sdf: torch.Tensor, sharpness: float = SHARPNESS) -> torch.Tensor:
@@ -24,6 +34,35 @@ def sdf_visibility_literal(path_sdf: torch.Tensor, sharpness: float = SHARPNESS)
     so V shrinks as K grows, also for points in plain view.
     """
     return torch.sigmoid(sharpness * path_sdf).prod(-1)
+
+
+@torch.no_grad()
+def visibility_literal(
+    cache: SdfCache,
+    points: torch.Tensor,
+    centers: torch.Tensor,
+    num_samples: int,
+    generator: torch.Generator | None,
+    sharpness: float = SHARPNESS,
+) -> torch.Tensor:
+    """V [P] of surface points [P, 3] from camera centres [P, 3]: the paper's Alg. 1 as written, on the cached grid.
+
+    `num_samples` places drawn uniformly from the whole path, both ends included. On an unobstructed path of length L
+    that leaves the surface at a right angle, the mean of V is (1 - ln 2 / (beta L))^K.
+    """
+    share = torch.rand(len(points), num_samples, 1, generator=generator, device=points.device)
+    places = centers[:, None] + share * (points - centers)[:, None]
+    sdf = free_outside(cache.lookup(places), torch.linalg.vector_norm(places, dim=2))
+    return sdf_visibility_literal(sdf, sharpness)
+
+
+def free_outside(sdf: torch.Tensor, radius: torch.Tensor) -> torch.Tensor:
+    """max(f, |x| - 1) [...] for f and |x| [...]: the solid cut off at the unit sphere.
+
+    What the SDF says outside the sphere is never rendered, and past the grid's cube the cache repeats its border. All
+    that is solid lies in the sphere, so that |x| - 1 bounds the distance to it from below.
+    """
+    return torch.maximum(sdf, radius - 1)
 
 
 def sdf_visibility(min_sdf: torch.Tensor, sharpness: float = SHARPNESS) -> torch.Tensor:
@@ -71,17 +110,85 @@ def smallest_sdf_on_paths(
     return cache.lookup(points[:, None] + distances[..., None] * directions[:, None]).min(1).values
 
 
-def color_precision(photos: Photos, generator: torch.Generator, num_pixels: int = 100_000) -> torch.Tensor:
-    """Inverse [3, 3] of the empirical colour covariance over the training photos, regularised (paper: Sigma^-1)."""
+class MeshVisibility:
+    """Visibility by casting rays at a triangle mesh of the cached SDF (Ref-NeuS; the paper's ablation).
+
+    The mesh is made when it is first asked for, and again after the cache has changed. Needs Open3D.
+    """
+
+    def __init__(self, cache: SdfCache) -> None:
+        self.cache = cache
+        self.version = -1
+        self.scene: Any = None
+
+    @torch.no_grad()
+    def __call__(self, points: torch.Tensor, centers: torch.Tensor, start: torch.Tensor) -> torch.Tensor:
+        """V [P] of points [P, 3] from camera centres [P, 3]: 0 where a face crosses the path between them, else 1.
+
+        The path leaves out the distance `start` [P] (`path_margin`) at the point, or its own faces would hide it.
+        """
+        o3d = _open3d()
+        if self.version != self.cache.values._version:  # torch counts the writes to a tensor
+            self.scene = self._mesh_scene()
+            self.version = self.cache.values._version
+        offsets = centers - points
+        share = (start / torch.linalg.vector_norm(offsets, dim=1)).clamp(max=1)[:, None]
+        rays = torch.cat([points + share * offsets, (1 - share) * offsets], 1)
+        hidden = self.scene.test_occlusions(o3d.core.Tensor(rays.cpu().numpy()), tnear=0.0, tfar=1.0)
+        return 1 - torch.from_numpy(hidden.numpy()).to(points)
+
+    def _mesh_scene(self) -> Any:
+        """Open3D's ray caster of the zero level set (flying edges, Schroeder et al. 2015), scene units."""
+        o3d = _open3d()
+        squares = torch.linspace(-1, 1, self.cache.resolution, device=self.cache.values.device) ** 2
+        radius = (squares[:, None, None] + squares[:, None] + squares).sqrt()
+        volume = o3d.core.Tensor(free_outside(self.cache.values[0, 0], radius).cpu().numpy())
+        mesh = o3d.t.geometry.TriangleMesh.create_isosurfaces(volume, [0.0])
+        scene = o3d.t.geometry.RaycastingScene()
+        if len(mesh.vertex.positions):
+            mesh.vertex.positions = mesh.vertex.positions * self.cache.cell - 1  # from cells
+            scene.add_triangles(mesh)
+        return scene
+
+
+def _open3d() -> Any:
+    try:
+        import open3d
+    except ModuleNotFoundError as error:
+        raise SystemRequirementError(
+            "train.visibility=mesh needs the Python package open3d, which is not installed.",
+            "Run `pip install open3d`, or use `--set train.visibility=stable`.",
+        ) from error
+    return open3d
+
+
+def color_precision(
+    photos: Photos, generator: torch.Generator, num_pixels: int = 100_000, floor: float = _COLOR_VARIANCE_FLOOR
+) -> torch.Tensor:
+    """Inverse [3, 3] of the empirical colour covariance over the training photos (paper: Sigma^-1).
+
+    `floor` is added to each channel's variance. The paper adds none (0): photos in shades of one colour then have no
+    inverse, a `ReconstructionError`.
+    """
     rows = torch.randint(len(photos.pixels), (num_pixels,), generator=generator, device=photos.device)
-    covariance = torch.cov((photos.pixels[rows].float() / 255).T)
-    return torch.linalg.inv(covariance + _COLOR_VARIANCE_FLOOR * torch.eye(3, device=photos.device))
+    covariance = torch.cov((photos.pixels[rows].double() / 255).T) + floor * torch.eye(3, device=photos.device)
+    if torch.linalg.matrix_rank(covariance, rtol=_SINGULAR, hermitian=True) < 3:
+        raise ReconstructionError(
+            "The photos' colours do not span all three channels (grey photos?), so their covariance has no inverse: "
+            "train.ambiguity=paper cannot compare them.",
+            "Use `--set train.ambiguity=stable`, which regularises it.",
+        )
+    return torch.linalg.inv(covariance).float()
 
 
 def mahalanobis(colors: torch.Tensor, others: torch.Tensor, precision: torch.Tensor) -> torch.Tensor:
-    """D_M = sqrt((C_i - C_j)^T Sigma^-1 (C_i - C_j)) [...] for colours [..., 3] (paper eq. ambiguity_factor)."""
+    """D_M = sqrt((C_i - C_j)^T Sigma^-1 (C_i - C_j)) [...] for colours [..., 3] (paper eq. ambiguity_factor).
+
+    At least 1e-6, without a gradient there. The paper's C_i is the rendered colour, and D_M pulls at it.
+    """
     difference = colors - others
-    return torch.einsum("...a,ab,...b->...", difference, precision, difference).clamp(min=0).sqrt()
+    squared = torch.einsum("...a,ab,...b->...", difference, precision, difference)
+    return squared.clamp(min=_SQUARED_DISTANCE_FLOOR).sqrt()
 
 
 def ambiguity(visibility: torch.Tensor, distance: torch.Tensor) -> torch.Tensor:
@@ -93,10 +200,19 @@ def ambiguity(visibility: torch.Tensor, distance: torch.Tensor) -> torch.Tensor:
     return (seen * visibility * distance).sum(1) / seen.sum(1).clamp(min=1)
 
 
-def trust(lambda_ambiguity: torch.Tensor) -> torch.Tensor:
-    """Weight of each ray's colour error [R]: 1 / (1 + lambda), scaled to mean 1 (paper eq. loss_without_ambiguity).
+def trust_literal(lambda_ambiguity: torch.Tensor) -> torch.Tensor:
+    """Weight of each ray's colour error [R]: 1 / (1 + lambda) (paper eq. loss_without_ambiguity as written).
 
-    The mean is held, so that doubt in some rays does not shift the balance against the other terms.
+    Differentiable: where lambda comes from rendered colours, the loss can also be lowered by raising lambda.
     """
-    weights = 1 / (1 + lambda_ambiguity)
+    return 1 / (1 + lambda_ambiguity)
+
+
+def trust(lambda_ambiguity: torch.Tensor) -> torch.Tensor:
+    """Weight of each ray's colour error [R]: sg[1 / (1 + lambda)], scaled to mean 1 (paper eq. loss_without_ambiguity).
+
+    The mean is held, so that doubt in some rays does not shift the balance against the other terms. Detached: else the
+    error could be lowered by raising the doubt.
+    """
+    weights = trust_literal(lambda_ambiguity.detach())
     return weights / weights.mean()

@@ -1,0 +1,69 @@
+"""The paper's feature MLP: what a place looks like, for the planar weight lambda_pla (paper eq. radiance_feat).
+
+Shapes: N points, L frequencies. All live in the scene frame.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import nn
+
+# Paper: gamma(x, 10) and gamma(v, 4).
+POSITION_FREQUENCIES = 10
+DIRECTION_FREQUENCIES = 4
+# Paper: "a skip connection at layer 4": the inputs join the activation of the fourth layer.
+_SKIP_AFTER = 4
+
+
+def positional_encoding(x: torch.Tensor, frequencies: int) -> torch.Tensor:
+    """gamma(x, L) [..., C (1 + 2 L)] of x [..., C] in [-1, 1] (NeRF, eq. 4, the input itself in front).
+
+    x, then sin(2^l pi x) and cos(2^l pi x) for l = 0 .. L - 1.
+    """
+    octaves = math.pi * 2.0 ** torch.arange(frequencies, dtype=x.dtype, device=x.device)
+    angles = x[..., None, :] * octaves[:, None]
+    return torch.cat([x, torch.stack([angles.sin(), angles.cos()], -2).flatten(-3)], -1)
+
+
+class FeatureMlp(nn.Module):
+    """c_feat(x, v) = MLP(gamma(x, 10), gamma(v, 4)), ReLU, the inputs joined in again after the fourth layer.
+
+    The paper names no loss that trains it. `color`, a linear head on the features, gives it one: features that explain
+    the photos' colours tell an edge from an even place. With untrained features lambda_pla is that of random ones.
+    """
+
+    def __init__(self, generator: torch.Generator, layers: int = 8, width: int = 256) -> None:
+        super().__init__()
+        inputs = 3 * (1 + 2 * POSITION_FREQUENCIES) + 3 * (1 + 2 * DIRECTION_FREQUENCIES)
+        columns = [inputs] + [width] * (layers - 1)
+        if layers > _SKIP_AFTER:
+            columns[_SKIP_AFTER] += inputs
+        self.layers = nn.ModuleList([nn.Linear(count, width) for count in columns])
+        self.head = nn.Linear(width, 3)
+        for layer in [*self.layers, self.head]:
+            nonlinearity = "linear" if layer is self.head else "relu"
+            nn.init.kaiming_uniform_(layer.weight, nonlinearity=nonlinearity, generator=generator)
+            nn.init.zeros_(layer.bias)
+
+    def forward(self, points: torch.Tensor, view_dirs: torch.Tensor) -> torch.Tensor:
+        """Features [N, width], not negative, of points [N, 3] seen along unit view_dirs [N, 3] (camera to point).
+
+        The paper's v_k points from x_k to the surface point on its ray: the ray's own direction, which is also the one
+        to give for x_0, where the paper's quotient is 0 / 0.
+        """
+        inputs = torch.cat(
+            [positional_encoding(points, POSITION_FREQUENCIES), positional_encoding(view_dirs, DIRECTION_FREQUENCIES)],
+            -1,
+        )
+        activation = inputs
+        for i, layer in enumerate(self.layers):
+            if i == _SKIP_AFTER:
+                activation = torch.cat([activation, inputs], -1)
+            activation = torch.relu(layer(activation))
+        return activation
+
+    def color(self, features: torch.Tensor) -> torch.Tensor:
+        """sRGB colour [N, 3] in [0, 1] of features [N, width]."""
+        return torch.sigmoid(self.head(features))
