@@ -40,12 +40,13 @@ class FeatureMlp(nn.Module):
         columns = [inputs] + [width] * (layers - 1)
         if layers > _SKIP_AFTER:
             columns[_SKIP_AFTER] += inputs
-        self.layers = nn.ModuleList([nn.Linear(count, width) for count in columns])
-        self.head = nn.Linear(width, 3)
-        for layer in [*self.layers, self.head]:
-            nonlinearity = "linear" if layer is self.head else "relu"
-            nn.init.kaiming_uniform_(layer.weight, nonlinearity=nonlinearity, generator=generator)
+        hidden = [nn.Linear(count, width) for count in columns]
+        self.layers, self.head = nn.ModuleList(hidden), nn.Linear(width, 3)
+        for layer in hidden:
+            nn.init.kaiming_uniform_(layer.weight, nonlinearity="relu", generator=generator)
             nn.init.zeros_(layer.bias)
+        nn.init.kaiming_uniform_(self.head.weight, nonlinearity="linear", generator=generator)
+        nn.init.zeros_(self.head.bias)
 
     def forward(self, points: torch.Tensor, view_dirs: torch.Tensor) -> torch.Tensor:
         """Features [N, width], not negative, of points [N, 3] seen along unit view_dirs [N, 3] (camera to point).
