@@ -1,0 +1,127 @@
+"""A proposal network that says where on a ray to look (mip-NeRF 360, sec. 3; the paper's sampler, after nerfacc).
+
+A small network's density guides the samples; it learns from the rendering weights found there, never from colours.
+Shapes: R rays, P proposal intervals and K samples a ray, N points. Distances are along the ray, scene units.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import nn
+
+from stages.neural.appearance import positional_encoding
+from stages.neural.mlp import mlp
+from stages.neural.rendering import weights_from_optical_depth
+from stages.neural.sampling import EVEN_SHARE, stratified
+
+# Frequencies of the position's encoding; the finest has a period of 1/16 scene unit, about two of 64 intervals.
+_FREQUENCIES = 6
+# The density is this many times a softplus, as walls need hundreds per unit; it begins thin, so that the first rays
+# look at all of their length.
+_DENSITY_GAIN, _DENSITY_BIAS = 10.0, -2.5
+# Keeps the loss finite where a sample has no weight.
+_WEIGHT_EPSILON = 1e-5
+
+
+class ProposalNetwork(nn.Module):
+    """A density that only says where to look: an MLP of gamma(x, 6). 4 layers of 64, as in the paper."""
+
+    def __init__(self, generator: torch.Generator, layers: int = 4, width: int = 64) -> None:
+        super().__init__()
+        self.layers = mlp([3 + 6 * _FREQUENCIES, *[width] * layers, 1], generator)
+
+    def forward(self, points: torch.Tensor) -> torch.Tensor:
+        """Density [N] per scene unit at points [N, 3]."""
+        outputs = self.layers(positional_encoding(points, _FREQUENCIES)).squeeze(1)
+        return _DENSITY_GAIN * nn.functional.softplus(outputs + _DENSITY_BIAS)
+
+
+def stratified_edges(
+    entry: torch.Tensor, leave: torch.Tensor, num_intervals: int, generator: torch.Generator | None
+) -> torch.Tensor:
+    """Ascending edges [R, P + 1] of intervals from entry to leave [R], inner edges within half an interval of even."""
+    inner = stratified(len(entry), num_intervals - 1, generator, entry.device)
+    share = nn.functional.pad((inner * (num_intervals - 1) + 0.5) / num_intervals, (1, 0))
+    share = nn.functional.pad(share, (0, 1), value=1.0)
+    return entry[:, None] + (leave - entry)[:, None] * share
+
+
+def draw_from_weights(
+    edges: torch.Tensor, weights: torch.Tensor, num_samples: int, generator: torch.Generator | None
+) -> torch.Tensor:
+    """Sorted distances [R, K] drawn by inverse CDF from a histogram: weights [R, P], sum > 0, between edges [R, P + 1].
+
+    One stratified draw per sample; the strata's centres without a generator.
+    """
+    cdf = nn.functional.pad(torch.cumsum(weights, 1), (1, 0))
+    cdf = cdf / cdf[:, -1:]
+    u = stratified(len(edges), num_samples, generator, edges.device)
+    index = torch.searchsorted(cdf, u, right=True).clamp(1, weights.shape[1])
+    low, high = cdf.gather(1, index - 1), cdf.gather(1, index)
+    inside = ((u - low) / (high - low).clamp(min=1e-8)).clamp(0, 1)
+    return torch.lerp(edges.gather(1, index - 1), edges.gather(1, index), inside)
+
+
+def proposal_distances(
+    network: ProposalNetwork,
+    origins: torch.Tensor,
+    directions: torch.Tensor,
+    entry: torch.Tensor,
+    leave: torch.Tensor,
+    num_proposal: int,
+    num_samples: int,
+    generator: torch.Generator | None,
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Sorted sample distances [R, K], and the edges [R, P + 1] and weights [R, P] of the histogram behind them.
+
+    The histogram holds the network's rendering weights, one density at the middle of each interval. Samples follow it,
+    but for the share `EVEN_SHARE`, which is spread evenly. The samples are detached; the weights carry the gradient
+    that `interlevel_loss` needs.
+    """
+    edges = stratified_edges(entry, leave, num_proposal, generator)
+    middle, delta = 0.5 * (edges[:, 1:] + edges[:, :-1]), edges[:, 1:] - edges[:, :-1]
+    points = origins[:, None] + middle[..., None] * directions[:, None]
+    density = network(points.reshape(-1, 3)).view_as(middle)
+    weights, _ = weights_from_optical_depth(density * delta)
+    with torch.no_grad():
+        evenly = delta / (leave - entry)[:, None]
+        blended = weights + (EVEN_SHARE * weights.sum(1, keepdim=True) + 1e-4) * evenly
+        distances = draw_from_weights(edges, blended, num_samples, generator)
+    return distances, edges, weights
+
+
+def sample_edges(distances: torch.Tensor) -> torch.Tensor:
+    """Edges [R, K + 1] of the samples' own stretches, half way between sorted distances [R, K], from first to last.
+
+    The same stretches as in `stages.neural.rendering.sample_optical_depths`.
+    """
+    middle = 0.5 * (distances[:, 1:] + distances[:, :-1])
+    return torch.cat([distances[:, :1], middle, distances[:, -1:]], 1)
+
+
+def interlevel_loss(
+    edges: torch.Tensor, weights: torch.Tensor, proposal_edges: torch.Tensor, proposal_weights: torch.Tensor
+) -> torch.Tensor:
+    """L_prop = sum_k max(0, w_k - bound_k)^2 / w_k per ray [R] (mip-NeRF 360, eq. 13).
+
+    bound_k is the sum of the proposal weights [R, P] whose intervals (edges [R, P + 1]) overlap sample k's stretch of
+    the ray, between edges [R, K + 1]: the most that a consistent histogram can hold there. Zero where it holds at least
+    the rendering weight w [R, K] everywhere. The samples' side is detached: the proposal learns from the rendering, not
+    the rendering from the proposal.
+    """
+    edges, weights = edges.detach(), weights.detach()
+    num_proposal = proposal_weights.shape[1]
+    first = torch.searchsorted(proposal_edges, edges[:, :-1].contiguous(), right=True).sub(1).clamp(0, num_proposal)
+    last = torch.searchsorted(proposal_edges, edges[:, 1:].contiguous()).clamp(0, num_proposal)
+    total = nn.functional.pad(torch.cumsum(proposal_weights, 1), (1, 0))
+    bound = total.gather(1, last) - total.gather(1, first)
+    return (torch.relu(weights - bound) ** 2 / (weights + _WEIGHT_EPSILON)).sum(1)
+
+
+def updates_now(step: int, first_updates: int, every: int = 5) -> bool:
+    """Whether the proposal network learns in this step: in each of the first N, then in every fifth, as nerfacc does.
+
+    The paper's "N = 128 proposal updates" leaves open what N counts: we read it as the first steps of training, each of
+    which updates the network. It could also be the number of proposal samples on a ray, a setting of its own here.
+    """
+    return step < first_updates or step % every == 0
