@@ -1,31 +1,46 @@
 """Measure variants of the training settings at equal budget, over sets of photos and seeds.
 
-python -m benchmarks.ablate DATA --steps 1500 --seeds 2                          every set, every variant
-python -m benchmarks.ablate DATA banana --variants base,ambiguity                these
-python -m benchmarks.ablate --table-only                                         only rewrite the table
+python -m benchmarks.ablate DATA                                            every variant on every set that has a truth
+python -m benchmarks.ablate DATA synth_helmet --variants base,ambiguity     these
+python -m benchmarks.ablate DATA --extra far:all,reflection_reach=0.3       and one more: `all` with that setting
+python -m benchmarks.ablate --table-only                                    only rewrite the table
 
-Ingest, structure from motion and undistortion run once a set; every run starts from a copy of them, so variants
-differ in their training alone. Results go to benchmarks/results/ablation/SET-VARIANT-SEED.json; runs that have one
-with the same steps, preset and settings are skipped. Run folders lie in benchmarks/out/ablation/ until scored.
+A truth is a known surface (`gt_mesh.ply`, `transforms.json`), and the score is the distance of the clean mesh to it; or
+known cameras (`cameras_sphere.npz`), and the score is the PSNR of photos that were left out of the training.
+
+Photos and poses are made ready once a set and shared by all its runs. A run is the stages train, extract and cleanup,
+called in a process of its own with one thread; as many run side by side as there are cores. Results go to
+benchmarks/results/ablation/SET-VARIANT-SEED.json as each ends; runs that have one with the same steps, preset and
+settings are skipped, so an interrupted call goes on where it stopped. Run folders lie in benchmarks/out/ablation/ until
+scored, and the log of a run that failed stays there.
 """
 
 from __future__ import annotations
 
 import argparse
+import hashlib
 import json
+import os
+import re
 import shutil
+import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from statistics import fmean
+from typing import Any
 
+from benchmarks.posed_sets import has_cameras, write_posed_set
 from benchmarks.run_sets import (
     NOT_MEASURED,
     OUT,
     PAGE,
     RESULTS,
+    ROOT,
     find_sets,
     machine,
     markdown_table,
@@ -33,21 +48,65 @@ from benchmarks.run_sets import (
     run_hineus,
     with_table,
 )
+from stages.engine.stage import Stage, StageContext
 from stages.errors import HineusError
 
 BASE = "base"
-VARIANTS: dict[str, tuple[str, ...]] = {
-    BASE: (),
-    "ambiguity": ("train.ambiguity=stable",),
-    "planar": ("train.planar=stable",),
-    "eikonal": ("train.eikonal=stable",),
-    "all": ("train.ambiguity=stable", "train.planar=stable", "train.eikonal=stable"),
+# What every variant starts from: colours and the plain Eikonal term. Written out, so that it stays the base whatever
+# the presets and defaults become.
+BASE_SETTINGS = {
+    "train.ambiguity": "off",
+    "train.visibility": "stable",
+    "train.reflection": "off",
+    "train.planar": "off",
+    "train.planar_features": "radiance",
+    "train.eikonal": "plain",
+    "train.density": "laplace",
+    "train.scale": "scheduled",
+    "train.gradients": "analytic",
+}
+TERMS = {f"train.{term}": "stable" for term in ("ambiguity", "reflection", "planar", "eikonal")}
+
+
+def _all_but(term: str) -> dict[str, str]:
+    return {key: value for key, value in TERMS.items() if key != f"train.{term}"}
+
+
+# What each variant sets otherwise, the most telling first: they run in this order.
+VARIANTS: dict[str, dict[str, str]] = {
+    BASE: {},
+    "ambiguity": {"train.ambiguity": "stable"},
+    "reflection": {"train.reflection": "stable"},
+    "planar": {"train.planar": "stable"},
+    "eikonal": {"train.eikonal": "stable"},
+    "all": TERMS,
+    "all-ambiguity": _all_but("ambiguity"),
+    "all-reflection": _all_but("reflection"),
+    "all-planar": _all_but("planar"),
+    "all-eikonal": _all_but("eikonal"),
+    "ambiguity-paper": {"train.ambiguity": "paper", "train.visibility": "paper"},
+    "visibility-paper": {"train.ambiguity": "stable", "train.visibility": "paper"},
+    "visibility-mesh": {"train.ambiguity": "stable", "train.visibility": "mesh"},
+    "reflection-paper": {"train.reflection": "paper"},
+    "planar-paper": {"train.planar": "paper"},
+    # its weight is made of the planar term's
+    "eikonal-paper": {"train.planar": "paper", "train.eikonal": "paper"},
+    "all-paper": {**dict.fromkeys(TERMS, "paper"), "train.visibility": "paper"},
+    "density-neus": {"train.density": "neus"},
+    "scale-learned": {"train.scale": "learned"},
+    "gradients-numerical": {"train.gradients": "numerical"},
+    "planar-mlp": {"train.planar": "stable", "train.planar_features": "mlp"},
 }
 
 RUNS = RESULTS / "ablation"
 FOLDERS = OUT / "ablation"
-SHARED_UNTIL = "undistort"
-RUN_UNTIL = "cleanup"
+SHARED = "undistort"
+HOLDOUT = 8  # every so many photos one is left out, on sets whose score is the PSNR
+# Two runs with a thread each do more on two cores than one run with two.
+ONE_THREAD = {
+    name: "1"
+    for name in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_THREAD_LIMIT")
+}
 
 
 @dataclass(frozen=True)
@@ -60,18 +119,18 @@ class Plan:
     steps: int
     preset: str
     settings: tuple[str, ...]
+    holdout: int = 0
 
     @property
     def name(self) -> str:
         return f"{self.set}-{self.variant}-{self.seed}"
 
     @property
-    def arguments(self) -> list[str]:
-        """Of `hineus run`, without where."""
-        # A budget of minutes would overrule that of steps.
-        sets = [*self.settings, "train.minutes=null", f"train.steps={self.steps}", f"train.seed={self.seed}"]
-        given = [word for text in sets for word in ("--set", text)]
-        return ["--until", RUN_UNTIL, "--preset", self.preset, *given]
+    def sets(self) -> list[str]:
+        """All that is set on top of the preset."""
+        # A budget of minutes would overrule that of steps; a preview at the end is enough.
+        budget = ["train.minutes=null", f"train.steps={self.steps}", "train.preview_every=1"]
+        return [*self.settings, *budget, f"train.seed={self.seed}", f"train.holdout={self.holdout}"]
 
 
 @dataclass(frozen=True)
@@ -81,10 +140,12 @@ class Run:
     Attributes:
         plan: what was run.
         command: that ran it, with DATA for the folder of sets.
-        machine: CPU, cores, versions, device.
+        machine: CPU, cores, versions, device, how many runs went side by side.
         poses: hash of the undistorted photos and poses it started from.
-        score: distances of the clean mesh, see `stages.meshing.evaluation`; None without truth.
+        code: hash of the sources in `stages/neural`.
+        score: distances of the clean mesh, see `stages.meshing.evaluation`; None without a known surface.
         psnr: of the training's rays at its end, dB.
+        held_out_psnr: of photos left out of the training, dB; None where none were.
         train_wall_s, train_cpu_s: seconds of the training stage.
     """
 
@@ -92,91 +153,241 @@ class Run:
     command: str
     machine: dict[str, str]
     poses: str
+    code: str
     score: dict[str, float] | None
     psnr: float | None
+    held_out_psnr: float | None
     train_wall_s: float
     train_cpu_s: float
 
+    @property
+    def value(self) -> float | None:
+        """What variants are compared by: the distance (less is better) where there is one, else the held-out PSNR."""
+        return self.score["mean"] if self.score else self.held_out_psnr
 
-# ---------------------------------------------------------------- running
-def measure(plan: Plan, data: Path, keep: bool = False) -> Run:
-    """Run one plan and score its mesh; its folder is removed unless `keep`.
+
+# ---------------------------------------------------------------- variants
+def settings_of(changes: dict[str, str]) -> tuple[str, ...]:
+    """A variant's settings, those of the base that it does not change included."""
+    return tuple(f"{key}={value}" for key, value in {**BASE_SETTINGS, **changes}.items())
+
+
+def parse_extra(text: str) -> tuple[str, dict[str, str]]:
+    """ "name:setting=value,..." as a name and what it changes; a variant's name in the list stands for its settings.
 
     Raises:
-        RuntimeError: `hineus` failed, or did not take the shared stages over.
-        HineusError: the mesh cannot be scored.
+        ValueError: it has another form.
     """
-    from stages.engine.manifest import load_manifest
+    name, _, listed = text.partition(":")
+    if not re.fullmatch(r"[\w.+-]+", name) or name in VARIANTS or not listed:
+        raise ValueError(f"{text}: expected NEW_NAME:setting=value,setting=value")
+    changes: dict[str, str] = {}
+    for item in listed.split(","):
+        key, equals, value = item.partition("=")
+        if equals:
+            changes[key if "." in key else f"train.{key}"] = value
+        elif item in VARIANTS:
+            changes |= VARIANTS[item]
+        else:
+            raise ValueError(f"{text}: {item} is neither setting=value nor a variant")
+    return name, changes
 
-    photos = photos_of(data / plan.set)
-    assert photos is not None  # find_sets looked
+
+def make_plans(
+    sets: dict[str, int], variants: dict[str, dict[str, str]], seeds: int, steps: int, preset: str
+) -> list[Plan]:
+    """All runs: by variant, then seed, then set, so that what is done when it is interrupted can be compared.
+
+    Args:
+        sets: name -> every so many photos one is left out, 0: none.
+        variants: name -> what it changes.
+    """
+    return [
+        Plan(name, variant, seed, steps, preset, settings_of(changes), holdout)
+        for variant, changes in variants.items()
+        for seed in range(seeds)
+        for name, holdout in sets.items()
+    ]
+
+
+# ---------------------------------------------------------------- making ready
+def prepare(name: str, data: Path, preset: str) -> None:
+    """Make the photos and poses that all runs of a set share, unless they are there.
+
+    Raises:
+        RuntimeError: `hineus` failed.
+    """
+    shared = FOLDERS / name / "shared"
+    if (shared / SHARED).is_dir():
+        return
+    if has_cameras(data / name):
+        partial = shared / f"{SHARED}.partial"
+        shutil.rmtree(partial, ignore_errors=True)
+        write_posed_set(data / name, partial)
+        partial.rename(shared / SHARED)
+        return
+    photos = photos_of(data / name)
+    run_hineus(["run", str(photos), "--workspace", str(shared), "--until", SHARED, "--preset", preset, "--json"])
+
+
+def poses_hash(folder: Path) -> str:
+    """Hash of all files of an undistort folder."""
+    from stages.engine.fingerprint import digest
+    from stages.engine.manifest import describe_outputs
+
+    return digest({path: file.sha256 for path, file in describe_outputs(folder).items()})[:12]
+
+
+def code_hash() -> str:
+    """Hash of the sources that decide what a training comes to."""
+    sources = sorted((ROOT / "stages" / "neural").glob("*.py"))
+    return hashlib.sha256(b"".join(source.read_bytes() for source in sources)).hexdigest()[:8]
+
+
+# ---------------------------------------------------------------- one run
+def measured_stages(truth: Path) -> list[Stage]:
+    """The stages of a run; a mesh that nothing is known of is not made."""
+    from hineus_cli.scoring import has_truth
+    from stages.cleanup import CLEANUP
+    from stages.extract import EXTRACT
+    from stages.train import TRAIN
+
+    return [TRAIN, EXTRACT, CLEANUP] if has_truth(truth) else [TRAIN]
+
+
+def measure(plan: Plan, data: Path, jobs: int = 1, keep: bool = False) -> Run:
+    """Run one plan in this process and score what came out; its folder is removed unless `keep`.
+
+    Raises:
+        HineusError: a stage failed, or the mesh cannot be scored.
+    """
+    from configs.load import load_config
+    from hineus_cli.reconstruct import has_cuda
+
+    code = code_hash()
+    import stages.neural.trainer  # noqa: F401 - now, so that its seconds are not those of the training
+
+    device = "cuda" if has_cuda() else "cpu"
+    config = load_config(plan.preset, None, plan.sets)
     shared = FOLDERS / plan.set / "shared"
-    folder = FOLDERS / plan.set / f"{plan.variant}-{plan.seed}"
-    where = ["run", str(photos), "--workspace"]
-    run_hineus([*where, str(shared), "--until", SHARED_UNTIL, "--preset", plan.preset, "--json"])
-    start_from(shared, folder, shared_stages())
-    answer = run_hineus([*where, str(folder), *plan.arguments, "--json"])
-    stages = {stage["name"]: stage for stage in answer["stages"]}
-    if again := [name for name in shared_stages() if stages[name]["action"] != "skipped"]:
-        raise RuntimeError(f"{', '.join(again)} ran again ({stages[again[0]]['reason']}): its poses are its own")
-    manifest = load_manifest(folder / SHARED_UNTIL)
-    assert manifest is not None  # it was fresh
-    train = stages["train"]
+    # Of a training that goes on from a checkpoint only the last part's CPU seconds would be known: it starts anew.
+    folder = _run_folder(plan)
+    shutil.rmtree(folder, ignore_errors=True)
+    numbers: dict[str, dict[str, Any]] = {}
+    wall: dict[str, float] = {}
+    cpu: dict[str, float] = {}
+    for stage in measured_stages(data / plan.set):
+        inputs = {name: shared / name if name == SHARED else folder / name for name in stage.needs}
+        out, scratch = folder / stage.name, folder / f"{stage.name}.scratch"
+        out.mkdir(parents=True)
+        scratch.mkdir()
+        wall_before, cpu_before = time.monotonic(), time.process_time()
+        context = StageContext(inputs, {}, out, scratch, stage.settings(config), device, workers=1)
+        numbers[stage.name] = stage.run(context)
+        wall[stage.name] = round(time.monotonic() - wall_before, 1)
+        cpu[stage.name] = round(time.process_time() - cpu_before, 1)
+        print(f"{stage.name}: {wall[stage.name]} s", file=sys.stderr, flush=True)
+    trained = numbers["train"]
     run = Run(
         plan=plan,
-        command=" ".join(["hineus run", f"DATA/{plan.set}/{photos.name}", *plan.arguments]),
-        machine={**machine(), "device": answer["device"]},
-        poses=manifest.outputs_digest[:12],
-        score=score_clean_mesh(folder, data / plan.set),
-        psnr=train["numbers"].get("psnr"),
-        train_wall_s=round(train["wall_s"], 1),
-        train_cpu_s=round(train["cpu_s"], 1),
+        command=command(plan),
+        machine={**machine(), "device": device, "jobs": str(jobs)},
+        poses=poses_hash(shared / SHARED),
+        code=code,
+        score=score_clean_mesh(folder, shared, data / plan.set),
+        psnr=trained.get("psnr"),
+        held_out_psnr=trained.get("held_out_psnr"),
+        train_wall_s=wall["train"],
+        train_cpu_s=cpu["train"],
     )
     if not keep:
         shutil.rmtree(folder)
     return run
 
 
-def shared_stages() -> list[str]:
-    """Names of the stages that all runs of a set have in common."""
-    from stages.pipeline import PIPELINE
-
-    names = [stage.name for stage in PIPELINE]
-    return names[: names.index(SHARED_UNTIL) + 1]
-
-
-def start_from(shared: Path, folder: Path, stages: Sequence[str]) -> None:
-    """Make `folder` a workspace with the published `stages` of workspace `shared` and nothing else.
-
-    A stage is known by the contents of its folder and of its sources, so the copies are fresh.
-    """
-    # Of a training that goes on from a checkpoint only the last part's CPU seconds would be known: it starts anew.
-    shutil.rmtree(folder, ignore_errors=True)
-    for name in stages:
-        shutil.copytree(shared / name, folder / name)
-    for name in ("workspace.json", "config.yaml"):
-        shutil.copy(shared / name, folder / name)
+def command(plan: Plan) -> str:
+    """The call that makes this run (and those of lower seeds)."""
+    words = ["python -m benchmarks.ablate DATA", plan.set, f"--steps {plan.steps} --preset {plan.preset}"]
+    if plan.variant in VARIANTS:
+        words.append(f"--variants {plan.variant}")
+    else:
+        changed = [text for text in plan.settings if text not in settings_of({})]
+        words.append(f"--variants {BASE} --extra {plan.variant}:{','.join(changed)}")
+    return " ".join([*words, f"--seeds {plan.seed + 1}"])
 
 
-def score_clean_mesh(folder: Path, truth: Path) -> dict[str, float] | None:
-    """Distances of the workspace's clean mesh to the truth, None where there is no truth."""
+def score_clean_mesh(folder: Path, shared: Path, truth: Path) -> dict[str, float] | None:
+    """Distances of the run's clean mesh to the known surface, None where there is none."""
     from hineus_cli.scoring import has_truth, score_mesh
     from stages import artifacts
 
     if not has_truth(truth):
         return None
-    vertices, faces = artifacts.load_mesh(folder / RUN_UNTIL)
-    world_from_scene = artifacts.load_scene(folder / "undistort").world_from_scene
+    vertices, faces = artifacts.load_mesh(folder / "cleanup")
+    world_from_scene = artifacts.load_scene(shared / SHARED).world_from_scene
     with tempfile.TemporaryDirectory() as world:
         artifacts.save_mesh(Path(world), world_from_scene.apply(vertices), faces)
-        return score_mesh(Path(world) / artifacts.MESH, artifacts.model_path(folder / "sfm"), truth)
+        return score_mesh(Path(world) / artifacts.MESH, artifacts.model_path(shared / "sfm"), truth)
+
+
+def _run_folder(plan: Plan) -> Path:
+    return FOLDERS / plan.set / f"{plan.variant}-{plan.seed}"
+
+
+# ---------------------------------------------------------------- all runs
+def run_apart(plan: Plan, data: Path, jobs: int, keep: bool) -> None:
+    """Run one plan in a process of its own, which saves the result.
+
+    Raises:
+        RuntimeError: it failed; the last line of its log is included.
+    """
+    folder = _run_folder(plan)
+    order, log = folder.with_name(f"{folder.name}.json"), folder.with_name(f"{folder.name}.log")
+    order.write_text(json.dumps({"plan": asdict(plan), "data": str(data), "jobs": jobs, "keep": keep}))
+    words = [sys.executable, "-m", "benchmarks.ablate", "--one", str(order)]
+    with log.open("w", encoding="utf-8") as lines:
+        done = subprocess.run(
+            words, cwd=ROOT, env={**os.environ, **ONE_THREAD}, stdout=lines, stderr=lines, check=False
+        )
+    order.unlink()
+    if done.returncode != 0:
+        said = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+        raise RuntimeError(f"{said[-1] if said else f'ended with {done.returncode}'} (see {log})")
+    if not keep:
+        log.unlink()
+
+
+def run_ordered(order: Path) -> None:
+    """What the process of one run does."""
+    given = json.loads(order.read_text(encoding="utf-8"))
+    save_run(measure(_plan(given["plan"]), Path(given["data"]), given["jobs"], given["keep"]))
+
+
+def run_plans(plans: Sequence[Plan], data: Path, jobs: int, keep: bool) -> list[str]:
+    """Run all, `jobs` at a time; returns the names of those that failed."""
+    failed = []
+    with ThreadPoolExecutor(jobs) as pool:
+        pending = {pool.submit(run_apart, plan, data, jobs, keep): plan for plan in plans}
+        try:
+            for count, future in enumerate(as_completed(pending), start=1):
+                name = pending[future].name
+                error = future.exception()
+                print(f"[{count} of {len(plans)}] {name}: {error or 'done'}", file=sys.stderr, flush=True)
+                if error is not None:
+                    failed.append(name)
+        except KeyboardInterrupt:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+    return failed
 
 
 # ---------------------------------------------------------------- result files
 def save_run(run: Run) -> None:
     RUNS.mkdir(parents=True, exist_ok=True)
-    text = json.dumps(asdict(run), indent=1, allow_nan=False)
-    (RUNS / f"{run.plan.name}.json").write_text(text + "\n", encoding="utf-8")
+    path = RUNS / f"{run.plan.name}.json"
+    partial = path.with_suffix(".partial")
+    partial.write_text(json.dumps(asdict(run), indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    partial.replace(path)
 
 
 def load_runs() -> list[Run]:
@@ -184,58 +395,105 @@ def load_runs() -> list[Run]:
     runs = []
     for path in RUNS.glob("*.json"):
         data = json.loads(path.read_text(encoding="utf-8"))
-        plan = data.pop("plan")
-        runs.append(Run(plan=Plan(**{**plan, "settings": tuple(plan["settings"])}), **data))
+        runs.append(Run(plan=_plan(data.pop("plan")), **data))
     order = {name: place for place, name in enumerate(VARIANTS)}
     return sorted(runs, key=lambda r: (r.plan.set, order.get(r.plan.variant, len(order)), r.plan.variant, r.plan.seed))
 
 
+def _plan(data: dict[str, Any]) -> Plan:
+    return Plan(**{**data, "settings": tuple(data["settings"])})
+
+
 # ---------------------------------------------------------------- table
 def ablation_table(runs: Sequence[Run]) -> str:
-    """One row a set and variant, and below the table what each variant sets."""
-    header = ["set", "variant", "steps", "seeds", "distance %", "spread", "change", "training CPU", "PSNR dB"]
+    """A table a set with a row a variant, what code they were made with, and at last what each variant sets."""
+    parts = []
+    for name in dict.fromkeys(run.plan.set for run in runs):
+        of_set = [run for run in runs if run.plan.set == name]
+        parts += [f"**{name}**", _set_table(of_set)]
+        if note := _code_note(of_set):
+            parts.append(note)
+    base = settings_of({})
+    changed = {run.plan.variant: [text for text in run.plan.settings if text not in base] for run in runs}
+    legend = [
+        f"- {variant}: {', '.join(f'`{text}`' for text in texts or (base if variant == BASE else ()))}"
+        for variant, texts in changed.items()
+    ]
+    return "\n\n".join([*parts, "\n".join(legend)])
+
+
+def _set_table(runs: Sequence[Run]) -> str:
+    header = [
+        "variant", "steps", "seeds", "distance %", "held-out PSNR dB", "spread", "change", "verdict", "training CPU",
+        "training PSNR dB",
+    ]  # fmt: skip
     groups: dict[tuple[object, ...], list[Run]] = {}
     for run in runs:
         plan = run.plan
-        groups.setdefault((plan.set, plan.variant, plan.steps, plan.preset, plan.settings, run.poses), []).append(run)
+        groups.setdefault((plan.variant, plan.steps, plan.preset, plan.settings, run.poses), []).append(run)
     rows = []
     for group in groups.values():
-        plan = group[0].plan
-        distances = [run.score["mean"] for run in group if run.score]
-        psnrs = [run.psnr for run in group if run.psnr is not None]
+        values = [run.value for run in group if run.value is not None]
         pairs = [(run, base) for run in group for base in runs if _compares(run, base)]
-        scored = [(a.score["mean"], b.score["mean"]) for a, b in pairs if a.score and b.score]
         timed = [(a.train_cpu_s, b.train_cpu_s) for a, b in pairs if a.machine == b.machine]
         rows.append(
             [
-                plan.set,
-                plan.variant,
-                str(plan.steps),
+                group[0].plan.variant,
+                str(group[0].plan.steps),
                 str(len(group)),
-                f"{fmean(distances):.3f}" if distances else "-",
-                f"{max(distances) - min(distances):.3f}" if len(distances) > 1 else "-",
-                f"{100 * (_ratio(scored) - 1):+.1f} %" if scored else "-",
-                f"x {_ratio(timed):.2f}" if timed else "-",
-                f"{fmean(psnrs):.2f}" if psnrs else "-",
+                _mean([run.score["mean"] for run in group if run.score], 3),
+                _mean([run.held_out_psnr for run in group if run.held_out_psnr is not None], 2),
+                f"{_spread(values):.3f}" if len(values) > 1 else "-",
+                *_change_and_verdict(pairs),
+                f"x {sum(a for a, _ in timed) / max(sum(b for _, b in timed), 1e-9):.2f}" if timed else "-",
+                _mean([run.psnr for run in group if run.psnr is not None], 2),
             ]
         )
-    settings = {run.plan.variant: run.plan.settings for run in runs}
-    legend = [
-        f"- {variant}: {', '.join(f'`{text}`' for text in texts) or 'the preset as it is'}"
-        for variant, texts in settings.items()
-    ]
-    return "\n".join([markdown_table(header, rows), "", *legend])
+    return markdown_table(header, rows)
 
 
 def _compares(run: Run, base: Run) -> bool:
     """Whether `run` is no base, and `base` is one that differs from it in the variant's settings alone."""
     a, b = run.plan, base.plan
-    same = (a.set, a.seed, a.steps, a.preset, run.poses) == (b.set, b.seed, b.steps, b.preset, base.poses)
-    return a.variant != BASE and b.variant == BASE and same
+    same = (a.set, a.seed, a.steps, a.preset, a.holdout) == (b.set, b.seed, b.steps, b.preset, b.holdout)
+    return a.variant != BASE and b.variant == BASE and same and run.poses == base.poses
 
 
-def _ratio(pairs: Sequence[tuple[float, float]]) -> float:
-    return sum(a for a, _ in pairs) / max(sum(b for _, b in pairs), 1e-9)
+def _change_and_verdict(pairs: Sequence[tuple[Run, Run]]) -> tuple[str, str]:
+    """Over the seeds that both have: what the variant changes, and whether that is more than the seeds do."""
+    scored = [(a, b) for a, b in pairs if a.value is not None and b.value is not None]
+    if not scored:
+        return "-", "-"
+    ours, theirs = ([run.value or 0.0 for run in side] for side in zip(*scored, strict=True))
+    by_distance = scored[0][0].score is not None
+    difference = fmean(ours) - fmean(theirs)
+    change = f"{100 * difference / max(fmean(theirs), 1e-9):+.1f} %" if by_distance else f"{difference:+.2f} dB"
+    if any(a.code != b.code for a, b in scored):
+        change += " *"
+    if len(scored) < 2:
+        return change, "-"
+    if abs(difference) <= max(_spread(ours), _spread(theirs)):
+        return change, "within spread"
+    return change, "helps" if (difference < 0) == by_distance else "hurts"
+
+
+def _code_note(runs: Sequence[Run]) -> str:
+    """Which variants were made with which version of the code, where they differ."""
+    variants: dict[str, dict[str, None]] = {}
+    for run in runs:
+        variants.setdefault(run.code, {})[run.plan.variant] = None
+    if len(variants) < 2:
+        return ""
+    listed = "; ".join(f"`{code}` {', '.join(names)}" for code, names in variants.items())
+    return f"\\* The code of the training changed between this run and its base. Versions: {listed}."
+
+
+def _spread(values: Sequence[float]) -> float:
+    return max(values) - min(values)
+
+
+def _mean(values: Sequence[float], digits: int) -> str:
+    return f"{fmean(values):.{digits}f}" if values else "-"
 
 
 def write_table() -> None:
@@ -244,44 +502,57 @@ def write_table() -> None:
     PAGE.write_text(with_table(PAGE.read_text(encoding="utf-8"), "ablation", body), encoding="utf-8")
 
 
+# ---------------------------------------------------------------- command
 def main(argv: Sequence[str] | None = None) -> int:
-    from hineus_cli.reconstruct import default_preset
+    from hineus_cli.reconstruct import available_cores, default_preset, has_cuda
+    from hineus_cli.scoring import has_truth
 
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("data", type=Path, nargs="?", help="folder of sets")
-    parser.add_argument("sets", nargs="*", help="names of sets; default: all")
+    parser.add_argument("sets", nargs="*", help="names of sets; default: all with a known surface or known cameras")
     parser.add_argument("--steps", type=int, default=1500, help="training steps of every run")
     parser.add_argument("--seeds", type=int, default=2, help="how many seeds, from 0")
     parser.add_argument("--variants", default=",".join(VARIANTS), help="names, separated by commas")
+    parser.add_argument("--extra", action="append", default=[], help="NAME:setting=value,...: one more variant")
     parser.add_argument("--preset", help="default: that of `hineus run`")
+    parser.add_argument("--jobs", type=int, help="runs side by side; default: one a core, or one on a GPU")
     parser.add_argument("--again", action="store_true", help="also runs that have a result")
     parser.add_argument("--keep", action="store_true", help="keep the run folders")
     parser.add_argument("--table-only", action="store_true", help="run nothing")
+    parser.add_argument("--one", type=Path, help=argparse.SUPPRESS)
     arguments = parser.parse_args(argv)
-    failed = []
+    if arguments.one is not None:
+        run_ordered(arguments.one)
+        return 0
+    failed: list[str] = []
     if not arguments.table_only:
-        variants = arguments.variants.split(",")
-        if unknown := [name for name in variants if name not in VARIANTS]:
+        named = arguments.variants.split(",")
+        if unknown := [name for name in named if name not in VARIANTS]:
             parser.error(f"no variant {', '.join(unknown)}; there are {', '.join(VARIANTS)}")
+        variants = {name: VARIANTS[name] for name in sorted(named, key=lambda name: name != BASE)}
+        try:
+            variants |= dict(map(parse_extra, arguments.extra))
+        except ValueError as error:
+            parser.error(str(error))
         if arguments.data is None:
             parser.error("name a folder of sets, or --table-only")
-        preset = arguments.preset or default_preset()
-        done = {run.plan for run in load_runs()}
-        for plan in [
-            Plan(name, variant, seed, arguments.steps, preset, VARIANTS[variant])
-            for name in find_sets(arguments.data, arguments.sets)
-            for seed in range(arguments.seeds)
-            for variant in variants
-        ]:
-            if plan in done and not arguments.again:
-                print(f"{plan.name}: has a result (--again measures it anew)", file=sys.stderr)
-                continue
-            print(f"{plan.name}: running", file=sys.stderr)
+        data, preset = arguments.data.resolve(), arguments.preset or default_preset()
+        names = find_sets(data, arguments.sets)
+        if not arguments.sets:
+            names = [name for name in names if has_truth(data / name) or has_cameras(data / name)]
+        sets = {name: 0 if has_truth(data / name) else HOLDOUT for name in names}
+        done = set() if arguments.again else {run.plan for run in load_runs()}
+        plans = [p for p in make_plans(sets, variants, arguments.seeds, arguments.steps, preset) if p not in done]
+        print(f"{len(plans)} runs to make (others have a result; --again measures them anew)", file=sys.stderr)
+        for name in dict.fromkeys(plan.set for plan in plans):
             try:
-                save_run(measure(plan, arguments.data.resolve(), arguments.keep))
+                prepare(name, data, preset)
             except (RuntimeError, HineusError) as error:
-                print(f"{plan.name}: {error}", file=sys.stderr)
-                failed.append(plan.name)
+                print(f"{name}: {error}", file=sys.stderr)
+                failed += [plan.name for plan in plans if plan.set == name]
+                plans = [plan for plan in plans if plan.set != name]
+        jobs = arguments.jobs or (1 if has_cuda() else available_cores())
+        failed += run_plans(plans, data, jobs, arguments.keep)
     write_table()
     return 1 if failed else 0
 

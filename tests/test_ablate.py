@@ -1,60 +1,98 @@
-"""The measuring of variants: plans, copies of the shared stages, result files and the table, without training."""
+"""The measuring of variants: plans, what a run does, result files and the table, without training."""
 
 from __future__ import annotations
 
 import json
-from itertools import pairwise
+from dataclasses import asdict, replace
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from toy_pipeline import TOY
 
 from benchmarks import ablate
-from benchmarks.ablate import BASE, VARIANTS, Plan, Run, ablation_table, load_runs, save_run, start_from
+from benchmarks.ablate import BASE, VARIANTS, Plan, Run, ablation_table, load_runs, parse_extra, save_run, settings_of
+from benchmarks.posed_sets import PIXEL_SHIFT, write_posed_set
 from configs.load import load_config
-from configs.params import Config
-from stages.engine.runner import run_pipeline
-from stages.engine.workspace import Workspace
+from stages import artifacts
+from stages.engine.stage import Stage, StageContext
 
 
-def _run(variant=BASE, seed=0, mean: float | None = 1.0, cpu=100.0, psnr=30.0, steps=1500, name="banana", **changes):
-    plan = Plan(name, variant, seed, steps, "cpu", VARIANTS[variant])
+def _plan(variant=BASE, seed=0, steps=1500, name="helmet", holdout=0) -> Plan:
+    return Plan(name, variant, seed, steps, "cpu", settings_of(VARIANTS[variant]), holdout)
+
+
+def _run(variant=BASE, seed=0, mean: float | None = 1.0, cpu=100.0, psnr=30.0, steps=1500, name="helmet", **changes):
     score = None if mean is None else {"mean": mean}
-    return Run(**{"plan": plan, "command": "hineus run", "machine": {"cpu": "x"}, "poses": "p", "score": score,
-                  "psnr": psnr, "train_wall_s": cpu / 2, "train_cpu_s": cpu, **changes})  # fmt: skip
+    return Run(**{"plan": _plan(variant, seed, steps, name), "command": "ablate", "machine": {"cpu": "x"}, "poses": "p",
+                  "code": "c", "score": score, "psnr": psnr, "held_out_psnr": None, "train_wall_s": cpu / 2,
+                  "train_cpu_s": cpu, **changes})  # fmt: skip
 
 
 def _rows(runs):
-    lines = ablation_table(runs).split("\n\n")[0].splitlines()[2:]
-    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+    lines = [line for line in ablation_table(runs).splitlines() if line.startswith("|")]
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if not line.startswith("| ---")][1:]
 
 
 @pytest.fixture
 def here(tmp_path, monkeypatch):
-    """Result files, run folders and a page of their own, and one set of photos without truth."""
+    """Result files, run folders and a page of their own; a set with a known surface and one without."""
     monkeypatch.setattr(ablate, "RUNS", tmp_path / "runs")
     monkeypatch.setattr(ablate, "FOLDERS", tmp_path / "out")
     monkeypatch.setattr(ablate, "PAGE", tmp_path / "page.md")
     (tmp_path / "page.md").write_text("top\n<!-- table ablation -->\n<!-- end ablation -->\nbottom\n")
-    (tmp_path / "data" / "banana" / "images").mkdir(parents=True)
+    for name in ("helmet", "scan"):
+        (tmp_path / "data" / name / "images").mkdir(parents=True)
+        (tmp_path / "out" / name / "shared" / "undistort").mkdir(parents=True)
+    for name in ("gt_mesh.ply", "transforms.json"):
+        (tmp_path / "data" / "helmet" / name).write_text("")
     return tmp_path
 
 
 # ---------------------------------------------------------------- variants
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_every_variant_changes_settings_that_exist(variant):
-    plain, changed = load_config("cpu"), load_config("cpu", None, VARIANTS[variant])
+    plain, changed = (load_config("cpu", None, settings_of(changes)) for changes in ({}, VARIANTS[variant]))
     assert (changed != plain) == (variant != BASE)
 
 
+def test_no_two_variants_are_the_same():
+    assert len({settings_of(changes) for changes in VARIANTS.values()}) == len(VARIANTS)
+
+
+def test_the_base_has_every_term_off_whatever_the_defaults():
+    sets = ["train.planar=paper", "train.ambiguity=stable", *settings_of({})]
+    train = load_config("cpu", None, sets).train
+    assert (train.ambiguity, train.reflection, train.planar, train.eikonal) == ("off", "off", "off", "plain")
+
+
 @pytest.mark.parametrize("preset", ["cpu", "gpu", "demo"])
-def test_a_plan_fixes_steps_and_seed_whatever_the_preset(preset):
-    arguments = Plan("banana", "ambiguity", 3, 700, preset, VARIANTS["ambiguity"]).arguments
-    sets = [after for word, after in pairwise(arguments) if word == "--set"]
-    train = load_config(preset, None, sets).train
-    assert (train.steps, train.minutes, train.seed, train.ambiguity) == (700, None, 3, True)
+def test_a_plan_fixes_steps_seed_and_hold_out_whatever_the_preset(preset):
+    plan = Plan("helmet", "ambiguity", 3, 700, preset, settings_of(VARIANTS["ambiguity"]), 8)
+    train = load_config(preset, None, plan.sets).train
+    assert (train.steps, train.minutes, train.seed, train.holdout, train.ambiguity) == (700, None, 3, 8, "stable")
+
+
+def test_an_extra_variant_is_named_settings_on_top_of_the_base_or_of_a_variant():
+    assert parse_extra("far:reflection_reach=0.3,cleanup.min_views=2") == (
+        "far", {"train.reflection_reach": "0.3", "cleanup.min_views": "2"}
+    )  # fmt: skip
+    _, changes = parse_extra("far:planar-mlp,weight_planar=0.3")
+    assert changes == {**VARIANTS["planar-mlp"], "train.weight_planar": "0.3"}
+    assert load_config("cpu", None, settings_of(changes)).train.weight_planar == 0.3
+
+
+@pytest.mark.parametrize("text", ["far", "far:", "planar:steps=3", "a/b:steps=3", "far:nothing"])
+def test_an_extra_variant_of_another_form_is_refused(text):
+    with pytest.raises(ValueError, match=text):
+        parse_extra(text)
+
+
+def test_runs_go_by_variant_then_seed_then_set():
+    plans = ablate.make_plans({"a": 0, "b": 8}, {BASE: {}, "planar": VARIANTS["planar"]}, 2, 9, "cpu")
+    names = [plan.name for plan in plans]
+    assert names[:5] == ["a-base-0", "b-base-0", "a-base-1", "b-base-1", "a-planar-0"]
+    assert [plan.holdout for plan in plans[:2]] == [0, 8]
 
 
 # ---------------------------------------------------------------- table
@@ -62,30 +100,54 @@ def test_a_variant_is_compared_with_base_over_the_seeds():
     runs = [_run(mean=1.0), _run(seed=1, mean=1.2), _run("planar", mean=0.9, cpu=150.0, psnr=29.0),
             _run("planar", seed=1, mean=0.86, cpu=130.0, psnr=31.0)]  # fmt: skip
     assert _rows(runs) == [
-        ["banana", "base", "1500", "2", "1.100", "0.200", "-", "-", "30.00"],
-        ["banana", "planar", "1500", "2", "0.880", "0.040", "-20.0 %", "x 1.40", "30.00"],
+        ["base", "1500", "2", "1.100", "-", "0.200", "-", "-", "-", "30.00"],
+        ["planar", "1500", "2", "0.880", "-", "0.040", "-20.0 %", "helps", "x 1.40", "30.00"],
     ]
-    assert "- base: the preset as it is\n- planar: `train.planar=true`" in ablation_table(runs)
+    table = ablation_table(runs)
+    assert table.startswith("**helmet**\n\n| variant |")
+    assert "- planar: `train.planar=stable`" in table
+
+
+@pytest.mark.parametrize(
+    ("means", "verdict"),
+    [((0.95, 1.00), "within spread"), ((0.85, 0.90), "helps"), ((1.20, 1.30), "hurts"), ((0.6, 1.2), "within spread")],
+)
+def test_a_change_counts_when_it_is_more_than_the_larger_spread(means, verdict):
+    runs = [_run(mean=1.0), _run(seed=1, mean=1.1)]
+    runs += [_run("planar", seed=seed, mean=mean) for seed, mean in enumerate(means)]
+    assert _rows(runs)[1][7] == verdict
 
 
 def test_only_the_seeds_that_both_have_are_compared():
     runs = [_run(mean=1.0), _run("planar", mean=0.5), _run("planar", seed=1, mean=9.0)]
-    assert _rows(runs)[1][4:7] == ["4.750", "8.500", "-50.0 %"]
+    assert _rows(runs)[1][3:8] == ["4.750", "-", "8.500", "-50.0 %", "-"]
 
 
 @pytest.mark.parametrize("other", [{"steps": 300}, {"name": "viking"}, {"poses": "q"}])
 def test_runs_of_another_budget_set_or_start_are_not_compared(other):
-    rows = _rows([_run(), _run("planar", **other)])
-    assert rows[1][5:8] == ["-", "-", "-"]
+    rows = [row for row in _rows([_run(), _run("planar", **other)]) if row[0] == "planar"]
+    assert rows[0][6:9] == ["-", "-", "-"]
 
 
 def test_seconds_of_another_machine_are_not_compared():
-    assert _rows([_run(), _run("planar", mean=0.5, machine={"cpu": "y"})])[1][6:8] == ["-50.0 %", "-"]
+    assert _rows([_run(), _run("planar", mean=0.5, machine={"cpu": "y"})])[1][6:9] == ["-50.0 %", "-", "-"]
 
 
-def test_sets_without_truth_get_their_psnr():
-    rows = _rows([_run(mean=None), _run("planar", mean=None, psnr=31.5)])
-    assert rows[1] == ["banana", "planar", "1500", "1", "-", "-", "-", "x 1.00", "31.50"]
+def test_sets_without_a_surface_are_compared_by_the_photos_left_out():
+    runs = [_run(variant, seed, None, held_out_psnr=psnr + 0.1 * seed)
+            for variant, psnr in ((BASE, 25.0), ("planar", 25.6), ("eikonal", 24.0)) for seed in (0, 1)]  # fmt: skip
+    assert [row[3:8] for row in _rows(runs)] == [
+        ["-", "25.05", "0.100", "-", "-"],
+        ["-", "25.65", "0.100", "+0.60 dB", "helps"],
+        ["-", "24.05", "0.100", "-1.00 dB", "hurts"],
+    ]
+
+
+def test_results_of_other_code_are_marked():
+    runs = [_run(), _run("planar", mean=0.5, code="d"), _run("eikonal", mean=0.5)]
+    assert [row[6] for row in _rows(runs)] == ["-", "-50.0 % *", "-50.0 %"]
+    assert "Versions: `c` base, eikonal; `d` planar." in ablation_table(runs)
+    assert "Versions" not in ablation_table([_run(), _run("planar")])
 
 
 def test_the_table_of_the_page_is_that_of_the_result_files():
@@ -103,104 +165,133 @@ def test_results_survive_their_files_in_the_order_of_the_variants(here):
     assert load_runs() == runs
 
 
-def test_runs_that_have_a_result_are_skipped(here, monkeypatch):
+def test_runs_that_have_a_result_are_skipped_and_a_failure_stops_no_other(here, monkeypatch):
     made = []
 
-    def measure(plan, data, keep):
+    def run_apart(plan, data, jobs, keep):
         made.append(plan.name)
-        if plan.name == "banana-ambiguity-1":
+        if plan.name == "scan-planar-1":
             raise RuntimeError("no")
-        return _run(plan.variant, plan.seed, steps=plan.steps, plan=plan)
+        save_run(_run(plan=plan))
 
-    monkeypatch.setattr(ablate, "measure", measure)
-    command = [str(here / "data"), "--steps", "9", "--variants", "base,ambiguity", "--preset", "cpu"]
-    every = ["banana-base-0", "banana-ambiguity-0", "banana-base-1", "banana-ambiguity-1"]
+    monkeypatch.setattr(ablate, "run_apart", run_apart)
+    command = [str(here / "data"), "--steps", "9", "--variants", "planar,base", "--preset", "cpu", "--jobs", "1"]
+    every = ["helmet-base-0", "scan-base-0", "helmet-base-1", "scan-base-1",
+             "helmet-planar-0", "scan-planar-0", "helmet-planar-1", "scan-planar-1"]  # fmt: skip
+    (here / "data" / "scan" / "cameras_sphere.npz").write_text("")
     assert ablate.main(command) == 1  # one failed, the others have results
     assert made == every
     ablate.main(command)
-    assert made[4:] == ["banana-ambiguity-1"]
+    assert made[8:] == ["scan-planar-1"]
     ablate.main([*command, "--steps", "10", "--seeds", "1"])
-    assert made[5:] == every[:2]
+    assert made[9:] == [every[0], every[1], every[4], every[5]]
     ablate.main([*command, "--table-only"])
-    assert len(made) == 7
+    assert len(made) == 13
     page = (here / "page.md").read_text()
     assert page.startswith("top\n")
-    assert "| banana | ambiguity | 10 |" in page
-    with pytest.raises(SystemExit):
-        ablate.main([*command, "--variants", "plane"])
+    assert "| planar | 10 |" in page
+    for wrong in (["--variants", "plane"], ["--extra", "far"]):
+        with pytest.raises(SystemExit):
+            ablate.main([*command, *wrong])
 
 
-def test_the_copies_of_shared_stages_are_fresh(tmp_path):
-    """Also when the folder held a run with other settings before."""
-    photos = tmp_path / "photos"
-    photos.mkdir()
-    (photos / "a.jpg").write_text("abc")
-    sources = {"photos": photos, "masks": None}
-
-    def run(name, **options):
-        return run_pipeline(TOY, Workspace.open(tmp_path / name, create=True), Config(), sources, **options)
-
-    run("shared", until="undistort")
-    for _ in range(2):
-        start_from(tmp_path / "shared", tmp_path / "run", ["ingest", "sfm", "undistort"])
-        assert [outcome.action for outcome in run("run")] == ["skipped", "skipped", "skipped", "ran"]
+def test_all_sets_with_a_truth_are_run_and_those_named(here, monkeypatch):
+    made = []
+    monkeypatch.setattr(ablate, "run_plans", lambda plans, *_: made.extend((p.set, p.holdout) for p in plans) or [])
+    command = [str(here / "data"), "--variants", BASE, "--seeds", "1"]
+    ablate.main(command)
+    ablate.main([*command[:1], "scan", *command[1:]])
+    assert made == [("helmet", 0), ("scan", ablate.HOLDOUT)]
 
 
-def _stub(calls, action="skipped"):
-    """In the place of `hineus`: makes the folders that are copied and scored."""
+def test_a_process_of_its_own_has_one_thread_and_says_what_failed(here, monkeypatch):
+    seen = {}
 
-    def hineus(arguments):
-        calls.append(arguments)
-        folder = Path(arguments[arguments.index("--workspace") + 1])
-        for name in ablate.shared_stages():
-            (folder / name).mkdir(parents=True, exist_ok=True)
-        for name in ("workspace.json", "config.yaml"):
-            (folder / name).write_text("{}")
-        numbers = {"psnr": 31.25}
-        names = [*ablate.shared_stages(), "train", "extract", "cleanup"]
-        stages = [{"name": n, "action": action, "reason": "why", "numbers": numbers, "wall_s": 2.04, "cpu_s": 3.06}
-                  for n in names]  # fmt: skip
-        return {"device": "cpu", "stages": stages}
+    def process(words, cwd, env, stdout, stderr, check):
+        seen.update(order=json.loads(Path(words[-1]).read_text()), threads=env["OMP_NUM_THREADS"])
+        stdout.write("Traceback\nthe last line\n")
+        return SimpleNamespace(returncode=seen.get("code", 0))
 
-    return hineus
+    monkeypatch.setattr(ablate.subprocess, "run", process)
+    plan = _plan("planar", 1)
+    ablate.run_apart(plan, here / "data", 2, keep=False)
+    assert ablate._plan(seen["order"]["plan"]) == plan
+    assert (seen["threads"], seen["order"]["jobs"]) == ("1", 2)
+    assert [path.name for path in (here / "out" / "helmet").iterdir()] == ["shared"]
+    seen["code"] = 1
+    with pytest.raises(RuntimeError, match=r"the last line \(see .*planar-1\.log\)"):
+        ablate.run_apart(plan, here / "data", 2, keep=False)
 
 
-def test_a_run_starts_from_the_shared_stages_and_leaves_its_figures_only(here, monkeypatch):
-    calls: list[list[str]] = []
-    monkeypatch.setattr(ablate, "run_hineus", _stub(calls))
-    manifest = SimpleNamespace(outputs_digest="0123456789abcdef")
-    monkeypatch.setattr("stages.engine.manifest.load_manifest", lambda folder: manifest)
-    plan = Plan("banana", "planar", 1, 9, "cpu", VARIANTS["planar"])
-    run = ablate.measure(plan, here / "data")
-    assert [Path(call[3]).name for call in calls] == ["shared", "planar-1"]
-    assert "undistort" in calls[0]
-    assert (run.psnr, run.train_wall_s, run.train_cpu_s, run.poses) == (31.25, 2.0, 3.1, "0123456789ab")
-    assert (run.score, run.machine["device"]) == (None, "cpu")
-    assert run.command.startswith("hineus run DATA/banana/images --until cleanup --preset cpu --set train.planar=true")
-    assert not (here / "out" / "banana" / "planar-1").exists()
-    assert (here / "out" / "banana" / "shared" / "sfm").is_dir()
+def _stub_stages(monkeypatch):
+    """In the place of the real ones: stages that write down what they were handed."""
+    calls = []
+
+    def run(context):
+        calls.append(context)
+        (context.out / "file").write_text("")
+        return {"psnr": 31.25, "held_out_psnr": 28.5}
+
+    needs = {"train": ("undistort",), "extract": ("undistort", "train")}
+    stages = [Stage(name, 1, needs[name], name, run) for name in needs]
+    monkeypatch.setattr(ablate, "measured_stages", lambda truth: stages)
+    monkeypatch.setattr(ablate, "score_clean_mesh", lambda *_: {"mean": 0.5})
+    return calls
+
+
+def test_a_run_calls_the_stages_on_the_shared_poses_and_leaves_its_figures_only(here, monkeypatch):
+    calls = _stub_stages(monkeypatch)
+    shared = here / "out" / "helmet" / "shared" / "undistort"
+    (shared / "scene.json").write_text("{}")
+    plan = _plan("planar", 1, 9)
+    run = ablate.measure(plan, here / "data", jobs=2)
+    train, extract = calls
+    assert (dict(train.inputs), train.workers) == ({"undistort": shared}, 1)
+    assert (train.params.planar, train.params.seed, train.params.steps) == ("stable", 1, 9)
+    assert extract.inputs["train"] == train.out
+    assert (run.psnr, run.held_out_psnr, run.value, run.code) == (31.25, 28.5, 0.5, ablate.code_hash())
+    assert run.machine["jobs"] == "2"
+    assert not train.out.exists()
     ablate.measure(plan, here / "data", keep=True)
-    assert (here / "out" / "banana" / "planar-1").is_dir()
-    save_run(run)
-    assert json.loads((here / "runs" / "banana-planar-1.json").read_text())["plan"]["steps"] == 9
+    assert (train.out / "file").exists()
+    (shared / "scene.json").write_text("{ }")
+    assert ablate.measure(plan, here / "data").poses != run.poses
+    order = here / "order.json"
+    order.write_text(json.dumps({"plan": asdict(plan), "data": str(here / "data"), "jobs": 2, "keep": False}))
+    assert ablate.main(["--one", str(order)]) == 0
+    assert [saved.plan for saved in load_runs()] == [plan]
 
 
-def test_a_run_with_poses_of_its_own_is_refused(here, monkeypatch):
-    monkeypatch.setattr(ablate, "run_hineus", _stub([], action="ran"))
-    with pytest.raises(RuntimeError, match="ingest, sfm, undistort ran again"):
-        ablate.measure(Plan("banana", BASE, 0, 9, "cpu", ()), here / "data")
+def test_a_mesh_of_which_nothing_is_known_is_not_made(here):
+    names = [[stage.name for stage in ablate.measured_stages(here / "data" / name)] for name in ("helmet", "scan")]
+    assert names == [["train", "extract", "cleanup"], ["train"]]
 
 
-def test_the_mesh_is_scored_in_the_world_frame(tmp_path, monkeypatch):
-    from stages import artifacts
+def test_the_command_of_a_run_makes_that_run_again():
+    assert ablate.command(_plan("planar", 1, 9)) == (
+        "python -m benchmarks.ablate DATA helmet --steps 9 --preset cpu --variants planar --seeds 2"
+    )
+    name, changes = parse_extra("far:planar,weight_planar=0.3")
+    words = ablate.command(Plan("helmet", name, 0, 9, "cpu", settings_of(changes))).split()
+    assert parse_extra(words[words.index("--extra") + 1]) == (name, changes)
+
+
+def test_poses_that_are_there_are_not_made_again(here, monkeypatch):
+    calls = []
+    monkeypatch.setattr(ablate, "run_hineus", calls.append)
+    ablate.prepare("helmet", here / "data", "cpu")
+    assert calls == []
+    (here / "out" / "helmet" / "shared" / "undistort").rmdir()
+    ablate.prepare("helmet", here / "data", "cpu")
+    assert "undistort" in calls[0]
+
+
+def test_the_mesh_is_scored_in_the_world_frame(here, monkeypatch):
     from stages.geometry.similarity import Similarity
 
-    truth, folder = tmp_path / "truth", tmp_path / "run"
+    folder, truth = here / "run", here / "data"
+    assert ablate.score_clean_mesh(folder, here / "shared", truth / "scan") is None
     (folder / "cleanup").mkdir(parents=True)
-    truth.mkdir()
-    assert ablate.score_clean_mesh(folder, truth) is None
-    for name in ("gt_mesh.ply", "transforms.json"):
-        (truth / name).write_text("")
     corners = np.eye(3)
     artifacts.save_mesh(folder / "cleanup", corners, np.array([[0, 1, 2]]))
     world = Similarity(2.0, np.eye(3), np.array([1.0, 0.0, 0.0]))
@@ -212,6 +303,64 @@ def test_the_mesh_is_scored_in_the_world_frame(tmp_path, monkeypatch):
         return {"mean": 1.0}
 
     monkeypatch.setattr("hineus_cli.scoring.score_mesh", score_mesh)
-    assert ablate.score_clean_mesh(folder, truth) == {"mean": 1.0}
+    assert ablate.score_clean_mesh(folder, here / "shared", truth / "helmet") == {"mean": 1.0}
     assert np.allclose(seen["vertices"], 2 * corners + [1, 0, 0])
-    assert seen["model"] == folder / "sfm" / "model"
+    assert seen["model"] == here / "shared" / "sfm" / "model"
+
+
+# ---------------------------------------------------------------- sets with known cameras
+def test_a_set_with_known_cameras_becomes_an_undistort_folder(tmp_path):
+    from sphere_scene import ring_of_cameras
+
+    cameras = ring_of_cameras(4)
+    source, folder = tmp_path / "scan", tmp_path / "undistort"
+    scale, offset = 231.0, np.array([-28.0, -13.0, 641.0])
+    scene_from_world = np.diag([1 / scale] * 3 + [1.0])
+    scene_from_world[:3, 3] = -offset / scale
+    matrices = {}
+    grey = np.zeros((40, 48), np.uint8)
+    for i in range(4):
+        name = f"{i:03d}.png"
+        artifacts.write_png(source / "image" / name, np.full((40, 48, 3), 40 * i, np.uint8))
+        artifacts.write_png(source / "mask" / f"{i}.png", np.where(np.arange(48) > 10 * i, grey + 255, grey))
+        projection = np.eye(4)
+        projection[:3] = -7.0 * cameras.intrinsics[i] @ cameras.cam_from_scene[i]  # of any scale and sign
+        matrices[f"world_mat_{i}"] = projection @ scene_from_world
+        matrices[f"scale_mat_{i}"] = np.linalg.inv(scene_from_world)
+    np.savez(source / "cameras_sphere.npz", **matrices)
+    write_posed_set(source, folder)
+
+    scene = artifacts.load_scene(folder)
+    assert scene.cameras.names == ("000.png", "001.png", "002.png", "003.png")
+    assert np.allclose(scene.cameras.cam_from_scene, cameras.cam_from_scene)
+    points = np.random.default_rng(0).uniform(-0.5, 0.5, (20, 3))
+    for i in range(4):
+        pixels, depth = scene.cameras.project(i, points)
+        expected, expected_depth = cameras.project(i, points)
+        assert np.allclose(pixels, expected + PIXEL_SHIFT)
+        assert np.allclose(depth, expected_depth)
+        assert artifacts.load_image(folder, scene.cameras.names[i])[0, 0, 0] == 40 * i
+        assert np.array_equal(artifacts.load_mask(folder, scene.cameras.names[i])[0] > 0, np.arange(48) > 10 * i)
+    assert np.allclose(scene.world_from_scene.apply(np.zeros(3)), offset)
+    assert (len(scene.points), len(scene.observations)) == (0, 0)
+    assert np.allclose(scene.up, [0, 0, 1])
+
+
+def test_a_scene_without_sparse_points_trains(tmp_path):
+    from sphere_scene import ring_of_cameras, sphere_scene, write_undistorted
+
+    from configs.params import TrainParams
+    from stages import train
+
+    cameras = ring_of_cameras()
+    folder, out, scratch = (tmp_path / name for name in ("undistort", "out", "scratch"))
+    write_undistorted(folder, cameras)
+    nothing = {"points": np.zeros((0, 3)), "point_errors": np.zeros(0), "observations": np.zeros((0, 2), np.int32)}
+    artifacts.save_scene(folder, replace(sphere_scene(cameras), **nothing))
+    out.mkdir()
+    scratch.mkdir()
+    params = TrainParams(steps=2, rays=32, samples=8, levels=2, start_levels=2, log2_rows=9, coarsest=8, finest=16,
+                         sdf_width=8, radiance_width=8, cache_resolution=16, background=False)  # fmt: skip
+    numbers = train.run(StageContext({"undistort": folder}, {}, out, scratch, params))
+    assert (numbers["steps"], numbers["sightings"]) == (2, 0)
+    assert artifacts.field_path(out).exists()
