@@ -14,12 +14,13 @@ import numpy as np
 
 from stages import artifacts
 from stages.engine.stage import Stage, StageContext
-from stages.errors import ReconstructionError
+from stages.errors import ConfigError, ReconstructionError
 
 log = logging.getLogger(__name__)
 
 LOG_EVERY = 50  # steps between metric lines
 CHECKPOINT_EVERY = 60.0  # seconds
+MIN_TRAINING = 3  # photos
 
 
 def run(context: StageContext) -> dict[str, Any]:
@@ -27,13 +28,16 @@ def run(context: StageContext) -> dict[str, Any]:
     import torch
 
     from stages.neural.field import field_state
+    from stages.neural.held_out import held_out_psnr, left_out
     from stages.neural.photos import Photos
     from stages.neural.trainer import Sightings, Trainer
 
     _use_threads(context)
     folder, params = context.inputs["undistort"], context.params
     scene = artifacts.load_scene(folder)
-    photos = Photos(scene.cameras, *_load_images(folder, scene.cameras.names), context.device)
+    held_out = left_out(len(scene.cameras), params.holdout)
+    _check_hold_out(len(held_out), int(held_out.sum()), params.holdout)
+    photos = Photos(scene.cameras, *_load_images(folder, scene.cameras.names), context.device, ~held_out)
     sightings = Sightings.from_scene(scene, context.device)
     trainer = Trainer(photos, sightings, params, context.device)
 
@@ -63,13 +67,18 @@ def run(context: StageContext) -> dict[str, Any]:
     torch.save(field_state(trainer.fields), artifacts.field_path(context.out))
     artifacts.metrics_path(context.out).write_bytes(metrics.read_bytes())
     seconds = spent + time.monotonic() - started
+    summary: dict[str, Any] = _last_numbers(artifacts.metrics_path(context.out))
+    if params.holdout:
+        nothing = torch.zeros(0, 3, device=trainer.device)
+        psnr = held_out_psnr(photos, lambda batch: trainer.render(batch, 1.0, nothing, None).colors)
+        summary |= {"held_out": int(held_out.sum()), "held_out_psnr": psnr and round(psnr, 4)}
     return {
         "steps": trainer.step_index,
         "train_seconds": round(seconds, 1),
         "rays_per_second": round(trainer.step_index * params.rays / max(seconds, 1e-9)),
         "photos": len(photos),
         "sightings": len(sightings.weights),
-        **_last_numbers(artifacts.metrics_path(context.out)),
+        **summary,
     }
 
 
@@ -89,6 +98,14 @@ def _load_images(folder: Path, names: tuple[str, ...]) -> tuple[list[np.ndarray]
     if 0 < len(masks) < len(images):
         log.warning("only %d of %d photos have a mask: training goes without masks", len(masks), len(images))
     return images, masks if len(masks) == len(images) else None
+
+
+def _check_hold_out(num_photos: int, num_held_out: int, every: int) -> None:
+    """Raises ConfigError where too few photos are left to train on, or none is left out though some should be."""
+    left = num_photos - num_held_out
+    if every and (left < MIN_TRAINING or num_held_out == 0):
+        found = f"leaves {left} of {num_photos} photos to train on (needed: {MIN_TRAINING} to {num_photos - 1})"
+        raise ConfigError(f"`train.holdout` = {every} {found}.", "Try `--set train.holdout=8`, or 0 for none.")
 
 
 def _progress(step: int, seconds: float, params: Any) -> float:

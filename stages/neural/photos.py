@@ -41,7 +41,11 @@ class RayBatch:
 
 
 class Photos:
-    """All pixels as uint8, all cameras as tensors."""
+    """All pixels as uint8, all cameras as tensors.
+
+    Attributes:
+        training: [I] bool, the photos that rays are drawn from; the others are for judging what was learned.
+    """
 
     def __init__(
         self,
@@ -49,8 +53,12 @@ class Photos:
         images: list[np.ndarray],
         masks: list[np.ndarray] | None,
         device: torch.device | str,
+        training: torch.Tensor | None = None,
     ) -> None:
-        """images: I arrays [H, W, 3] uint8; masks: I arrays [H, W] uint8 or None. Raises ValueError on sizes."""
+        """images: I arrays [H, W, 3] uint8; masks: I arrays [H, W] uint8 or None; training: None for all photos.
+
+        Raises ValueError on sizes.
+        """
         for i, image in enumerate(images):
             width, height = cameras.sizes[i]
             if image.shape != (height, width, 3):
@@ -58,6 +66,9 @@ class Photos:
         self.device = torch.device(device)
         self.pixels = torch.from_numpy(np.concatenate([i.reshape(-1, 3) for i in images])).to(device)
         self.masks = torch.from_numpy(np.concatenate([m.ravel() for m in masks])).to(device) if masks else None
+        self.training = torch.ones(len(images), dtype=torch.bool) if training is None else training
+        self.training = self.training.to(device)
+        self._drawn = torch.nonzero(self.training).squeeze(1)
         counts = cameras.sizes.prod(1)
         self.first = torch.from_numpy(np.concatenate([[0], np.cumsum(counts)[:-1]])).to(device)
         self.sizes = torch.from_numpy(cameras.sizes).to(device)
@@ -72,9 +83,9 @@ class Photos:
         return len(self.first)
 
     def draw(self, num_rays: int, generator: torch.Generator) -> RayBatch:
-        """At most num_rays random rays through the unit sphere, photos equally likely."""
+        """At most num_rays random rays through the unit sphere, photos for training equally likely."""
         count = int(num_rays * _OVERDRAW)
-        images = torch.randint(len(self), (count,), generator=generator, device=self.device)
+        images = self._drawn[torch.randint(len(self._drawn), (count,), generator=generator, device=self.device)]
         place = torch.rand(count, 2, generator=generator, device=self.device)
         low, high = self.boxes[images, :2], self.boxes[images, 2:]
         pixels = (low + place * (high - low)).floor()
