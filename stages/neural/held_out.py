@@ -41,12 +41,13 @@ def photo_psnr(photos: Photos, image: int, render: Callable[[RayBatch], torch.Te
     y, x = torch.meshgrid(
         torch.arange(stride // 2, height, stride), torch.arange(stride // 2, width, stride), indexing="ij"
     )
+    grid = torch.stack([x, y], 2).view(-1, 2).to(photos.device)
+    if photos.masks is not None:
+        grid = grid[photos.masks[photos.first[image] + grid[:, 1] * width + grid[:, 0]] > 127]
     total, count = 0.0, 0
-    for pixels in torch.stack([x, y], 2).view(-1, 2).float().to(photos.device).split(_RAYS):
+    for pixels in grid.float().split(_RAYS):
         batch = photos.rays(torch.full((len(pixels),), image, device=photos.device), pixels)
         error = ((render(batch).clamp(0, 1) - batch.colors) ** 2).mean(1)
-        if batch.masks is not None:
-            error = error[batch.masks > 0.5]
         total, count = total + float(error.sum()), count + len(error)
     return -10 * float(torch.tensor(max(total / count, _SMALLEST_ERROR)).log10()) if count else None
 
