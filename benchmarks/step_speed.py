@@ -41,17 +41,18 @@ def alternate(*functions: Callable[[], object]) -> list[float]:
 
 
 def encoding_pass(encode: Callable, grid: encodings.HashGrid) -> Callable[[], None]:
-    """Features and Jacobian of points along rays, and their backward pass."""
+    """Features and spatial gradients of points along rays, and their backward pass."""
     generator = torch.Generator().manual_seed(0)
     table = torch.randn(grid.num_rows, grid.features, generator=generator).requires_grad_()
     starts = torch.rand(POINTS // 16, 1, 3, generator=generator) - 0.5
     steps = 0.02 * torch.randn(POINTS // 16, 1, 3, generator=generator)
     points = (starts + steps * torch.arange(16)[None, :, None]).reshape(-1, 3).contiguous()
+    cotangent = torch.randn(POINTS, grid.channels, generator=generator).requires_grad_()
 
     def run() -> None:
-        features, jacobian = encode(points, table, grid, grid.levels)
+        features, vjp = encode(points, table, grid, grid.levels)
         table.grad = None
-        (features.sum() + jacobian.sum()).backward()
+        (features.sum() + vjp(cotangent).sum()).backward()
 
     return run
 

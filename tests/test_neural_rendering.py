@@ -12,7 +12,13 @@ from hypothesis import strategies as st
 
 from stages.neural.density import laplace_density, section_optical_depth
 from stages.neural.rendering import composite, sample_optical_depths, weights_from_optical_depth
-from stages.neural.sampling import SdfCache, importance_distances, intersect_unit_sphere
+from stages.neural.sampling import (
+    SdfCache,
+    importance_distances,
+    importance_distances_reference,
+    intersect_unit_sphere,
+    stratified,
+)
 
 
 def test_laplace_density_at_known_places():
@@ -119,6 +125,28 @@ def test_samples_gather_at_the_surface_sorted_inside_the_interval():
     assert (distances.max() - distances.min()) > 1.0  # and some look elsewhere
     fixed = [importance_distances(cache, origins, directions, entry, leave, 16, 0.01, None) for _ in range(2)]
     assert torch.equal(*fixed)
+
+
+@pytest.mark.parametrize("scale", [0.02, 0.1])
+def test_the_sampling_kernel_agrees_with_the_reference(scale):
+    """Rays through the ball, past it, and from a camera inside the sphere; random strata and even ones."""
+    cache, cache64, draws = sphere_cache(), sphere_cache(), torch.Generator().manual_seed(0)
+    cache64.values = cache64.values.double()
+    origins = torch.nn.functional.normalize(torch.randn(200, 3, generator=draws), dim=1) * 2
+    origins[:20] *= 0.4
+    targets = 0.4 * torch.randn(200, 3, generator=draws)
+    directions = torch.nn.functional.normalize(targets - origins, dim=1)
+    entry, leave, hit = intersect_unit_sphere(origins, directions)
+    rays = [tensor[hit] for tensor in (origins, directions, entry, leave)]
+    for seed in (None, 1):
+        first, second = (None if seed is None else torch.Generator().manual_seed(seed) for _ in range(2))
+        got = importance_distances(cache, *rays, 16, scale, first)
+        places = stratified(len(rays[0]), 16, second, torch.device("cpu"))
+        # In float64: a grazing ray's weights are near the rounding error of its transmittance in float32.
+        arguments = [tensor.double() for tensor in (*rays, places)]
+        expected = importance_distances_reference(cache64, *arguments, max(scale, 0.5 * cache.cell), 64)
+        torch.testing.assert_close(got.double(), expected, rtol=0, atol=1e-4)
+        assert (got - expected).abs().median() < 1e-6
 
 
 def test_half_of_the_laplace_depth_lies_on_each_side_of_a_wall():

@@ -1,18 +1,22 @@
-"""Multiresolution hash encoding with its exact Jacobian (Müller et al. 2022, progressive as in Neuralangelo).
+"""Encodings of positions with their spatial derivatives: a multiresolution hash (Müller et al. 2022), or frequencies
+(NeRF); both progressive, coarse levels first (Neuralangelo, BARF).
 
-`encode(points, table, grid)` returns features and their spatial Jacobian in ONE forward pass, both differentiable
-with respect to the table. A normal is then Jacobian^T times the MLP's gradient with respect to its features, so
-training needs first-order autograd only.
+`encode(points, table, encoding, active_levels)` returns features and their vector-Jacobian product (vjp): a function
+from the gradient of anything with respect to the features [N, C] to its gradient with respect to the points [N, 3].
+A normal is then the vjp of the MLP's gradient with respect to its inputs. Both are differentiable with respect to the
+table and to what the vjp is given, so training needs first-order autograd only.
 
 Two implementations agree to 1e-5: `encode_reference` (pure torch, any device) and the numba kernels behind
 `encode` on the CPU.
 
-Layout: C = levels * features channels, level-major. `table` is [rows, features]; level l owns the rows
+Layout: C channels, level-major. A hash grid's `table` is [rows, features]; level l owns the rows
 offsets[l] .. offsets[l + 1]. A level whose full lattice fits its share is indexed densely, else by the spatial hash.
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -79,29 +83,105 @@ class HashGrid:
         return (noise * 2 - 1) * INITIAL_AMPLITUDE
 
 
-def encode(
-    points: torch.Tensor, table: torch.Tensor, grid: HashGrid, active_levels: int
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Features [N, C] and Jacobian [N, 3, C] (d feature / d coordinate) of points [N, 3].
+@dataclass(frozen=True)
+class Frequencies:
+    """NeRF's positional encoding: level k holds sin(2^k pi x) and cos(2^k pi x) of the three coordinates.
 
-    Channels of levels >= active_levels are zero. Points outside [-1, 1]^3 are clamped to it.
+    It has no table. Channels of a level: three sines, then three cosines.
+
+    Attributes:
+        levels: number of octaves.
     """
-    if points.is_cuda or grid.features != 4:
-        return encode_reference(points, table, grid, active_levels)
-    return _KernelEncode.apply(points, table, grid, active_levels)
+
+    levels: int = 8
+
+    @property
+    def channels(self) -> int:
+        return 6 * self.levels
+
+    def voxel_size(self, active_levels: int | None = None) -> float:
+        """Half a wavelength of the highest active frequency, in scene units."""
+        return 0.5 ** ((active_levels or self.levels) - 1)
 
 
-def encode_features(points: torch.Tensor, table: torch.Tensor, grid: HashGrid, active_levels: int) -> torch.Tensor:
+Encoding = HashGrid | Frequencies
+Vjp = Callable[[torch.Tensor], torch.Tensor]
+
+
+def encode(
+    points: torch.Tensor, table: torch.Tensor | None, encoding: Encoding, active_levels: int
+) -> tuple[torch.Tensor, Vjp]:
+    """Features [N, C] of points [N, 3], and their vjp [N, C] -> [N, 3], which may be called once.
+
+    Channels of levels >= active_levels are zero. A hash grid clamps points to [-1, 1]^3.
+    """
+    if isinstance(encoding, Frequencies) or not _has_kernel(points, encoding):
+        return encode_reference(points, table, encoding, active_levels)
+    features, jacobian, *factors = _KernelEncode.apply(points, table, encoding, active_levels)
+    called = False
+
+    def vjp(cotangent: torch.Tensor) -> torch.Tensor:
+        nonlocal called
+        if called:  # the factors of two products cannot be added
+            raise RuntimeError("the vjp of an encoding was called twice, expected once")
+        called = True
+        return _KernelVjp.apply(cotangent, jacobian, *factors)
+
+    return features, vjp
+
+
+def encode_features(
+    points: torch.Tensor, table: torch.Tensor | None, encoding: Encoding, active_levels: int
+) -> torch.Tensor:
     """Features [N, C] alone, differentiable with respect to the table: for density without normals."""
-    if points.is_cuda or grid.features != 4:
-        return _reference_features(points, table, grid, active_levels)
-    return _KernelFeatures.apply(points, table, grid, active_levels)
+    if isinstance(encoding, Frequencies) or not _has_kernel(points, encoding):
+        return _reference_features(points, table, encoding, active_levels)
+    return _KernelFeatures.apply(points, table, encoding, active_levels)
+
+
+def _has_kernel(points: torch.Tensor, grid: HashGrid) -> bool:
+    return points.device.type == "cpu" and points.dtype == torch.float32 and grid.features == 4
 
 
 def encode_reference(
+    points: torch.Tensor, table: torch.Tensor | None, encoding: Encoding, active_levels: int
+) -> tuple[torch.Tensor, Vjp]:
+    """`encode` in plain torch: the reference of the kernels, and the path on CUDA."""
+    if isinstance(encoding, Frequencies):
+        return _encode_frequencies(points, encoding, active_levels)
+    assert table is not None
+    features, jacobian = hash_jacobian(points, table, encoding, active_levels)
+    return features, lambda cotangent: torch.bmm(jacobian, cotangent.unsqueeze(2)).squeeze(2)
+
+
+def _reference_features(
+    points: torch.Tensor, table: torch.Tensor | None, encoding: Encoding, active_levels: int
+) -> torch.Tensor:
+    """`encode_features` in plain torch."""
+    if isinstance(encoding, Frequencies):
+        return _encode_frequencies(points, encoding, active_levels)[0]
+    assert table is not None
+    return _hash_features(points, table, encoding, active_levels)
+
+
+def _encode_frequencies(points: torch.Tensor, encoding: Frequencies, active_levels: int) -> tuple[torch.Tensor, Vjp]:
+    frequencies = math.pi * 2.0 ** torch.arange(active_levels, device=points.device, dtype=points.dtype)
+    angles = points[:, None] * frequencies[:, None]  # [N, levels, 3]
+    sines, cosines = torch.sin(angles), torch.cos(angles)
+    padding = encoding.channels - 6 * active_levels
+    features = torch.nn.functional.pad(torch.cat([sines, cosines], 2).flatten(1), (0, padding))
+
+    def vjp(cotangent: torch.Tensor) -> torch.Tensor:
+        of_sines, of_cosines = cotangent[:, : 6 * active_levels].view(-1, active_levels, 6).split(3, 2)
+        return torch.einsum("nka,k->na", of_sines * cosines - of_cosines * sines, frequencies)
+
+    return features, vjp
+
+
+def hash_jacobian(
     points: torch.Tensor, table: torch.Tensor, grid: HashGrid, active_levels: int
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """`encode` in plain torch: the reference of the kernels, and the path on CUDA."""
+    """Features [N, C] and Jacobian [N, 3, C] (d feature / d coordinate) of a hash grid, in plain torch."""
     features, jacobians = [], []
     for level in range(active_levels):
         corners, fraction, scale = _corners(points, grid, level)
@@ -124,7 +204,7 @@ def encode_reference(
     return torch.nn.functional.pad(feature, (0, padding)), torch.nn.functional.pad(jacobian, (0, padding))
 
 
-def _reference_features(points: torch.Tensor, table: torch.Tensor, grid: HashGrid, active_levels: int) -> torch.Tensor:
+def _hash_features(points: torch.Tensor, table: torch.Tensor, grid: HashGrid, active_levels: int) -> torch.Tensor:
     features = []
     for level in range(active_levels):
         corners, fraction, _ = _corners(points, grid, level)
@@ -154,7 +234,12 @@ def _corners(points: torch.Tensor, grid: HashGrid, level: int) -> tuple[torch.Te
 
 
 class _KernelEncode(torch.autograd.Function):
-    """`encode` through the numba kernels; gradients with respect to the table only."""
+    """Features, Jacobian and two stand-ins for the Jacobian's gradient; gradients with respect to the table only.
+
+    The Jacobian is used in one product with a cotangent u (`_KernelVjp`), so its gradient is g u^T, g [N, 3] the
+    gradient of the product. Autograd would have to write that out as [N, 3, C]. The stand-ins have the shapes of g and
+    u, hold nothing, and receive them as their gradients: one pass over the table then takes all gradients.
+    """
 
     @staticmethod
     def forward(ctx, points, table, grid, active_levels):
@@ -168,21 +253,54 @@ class _KernelEncode(torch.autograd.Function):
         )  # fmt: skip
         ctx.save_for_backward(points, table)
         ctx.grid, ctx.active_levels = grid, active_levels
-        return features, jacobian
+        ctx.mark_non_differentiable(jacobian)
+        ctx.set_materialize_grads(False)
+        return features, jacobian, torch.empty(1, 1).expand(len(points), 3), torch.empty(1, 1).expand_as(features)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx, grad_features, grad_jacobian):
+    def backward(ctx, grad_features, _, grad_gradients, cotangent):
         from stages.neural import kernels
 
         points, table = ctx.saved_tensors
         grid = ctx.grid
+        arguments = (points.detach().numpy(), grid.resolutions, grid.offsets, grid.dense, ctx.active_levels)
         grad_table = torch.zeros_like(table)
-        kernels.encode_backward(
-            points.detach().numpy(), grid.resolutions, grid.offsets, grid.dense, ctx.active_levels,
-            grad_features.contiguous().numpy(), grad_jacobian.contiguous().numpy(), grad_table.numpy(),
-        )  # fmt: skip
+        if grad_gradients is None:
+            kernels.features_backward(*arguments, grad_features.contiguous().numpy(), grad_table.numpy())
+        else:
+            if grad_features is None:
+                grad_features = torch.zeros_like(cotangent)
+            kernels.encode_backward(
+                *arguments, grad_features.contiguous().numpy(), grad_gradients.contiguous().numpy(),
+                cotangent.contiguous().numpy(), grad_table.numpy(),
+            )  # fmt: skip
         return None, grad_table, None, None
+
+
+class _KernelVjp(torch.autograd.Function):
+    """Jacobian [N, 3, C] times cotangent [N, C] -> [N, 3]; hands its factors' gradients on (see `_KernelEncode`)."""
+
+    @staticmethod
+    def forward(ctx, cotangent, jacobian, _grad_gradients, _cotangent):
+        from stages.neural import kernels
+
+        cotangent = cotangent.contiguous()
+        gradients = torch.empty(len(jacobian), 3)
+        kernels.vjp_forward(jacobian.numpy(), cotangent.detach().numpy(), gradients.numpy())
+        ctx.save_for_backward(cotangent, jacobian)
+        return gradients
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, grad_gradients):
+        from stages.neural import kernels
+
+        cotangent, jacobian = ctx.saved_tensors
+        grad_gradients = grad_gradients.contiguous()
+        grad_cotangent = torch.empty_like(cotangent)
+        kernels.vjp_backward(jacobian.numpy(), grad_gradients.numpy(), grad_cotangent.numpy())
+        return grad_cotangent, None, grad_gradients, cotangent
 
 
 class _KernelFeatures(torch.autograd.Function):

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from stages.neural.encodings import HashGrid
+from stages.neural.encodings import Encoding, Frequencies, HashGrid
 from stages.neural.fields import Fields, FieldShape
 
 CHUNK = 1 << 16  # points evaluated at a time: bounds the memory of one call
@@ -62,6 +62,11 @@ def field_state(fields: Fields) -> dict[str, Any]:
     return {"shape": asdict(fields.shape), "weights": fields.state_dict()}
 
 
+def _encoding(values: dict[str, int]) -> Encoding:
+    """An encoding from its attributes, as `asdict` wrote them."""
+    return Frequencies(**values) if set(values) == {"levels"} else HashGrid(**values)
+
+
 def load_field(path: Path, device: torch.device | str = "cpu") -> TrainedField:
     """Read a field that was saved with `torch.save(field_state(fields), path)`.
 
@@ -72,7 +77,7 @@ def load_field(path: Path, device: torch.device | str = "cpu") -> TrainedField:
         raise ValueError(f"{path}: got {type(state).__name__}, expected a trained field")
     shape = state["shape"]
     for key in ("sdf_grid", "background_grid"):
-        shape[key] = HashGrid(**shape[key]) if shape[key] else None
+        shape[key] = _encoding(shape[key]) if shape[key] else None
     fields = Fields(FieldShape(**shape))
     fields.load_state_dict(state["weights"])
     return TrainedField(fields, device)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import nn
 
-from stages.neural.encodings import HashGrid, encode, encode_features
+from stages.neural.encodings import Encoding, Frequencies, HashGrid, encode, encode_features
 
 # Half width of the smooth ReLU's bend: about the blur of the softplus(beta = 100) that IDR and NeuS use.
 BEND = 0.05
@@ -23,8 +23,43 @@ def smooth_relu(z: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
 
     The second derivative exists almost everywhere, so normals get gradients; no exponential is needed.
     """
+    if z.device.type == "cpu" and z.dtype == torch.float32:
+        return _KernelSmoothRelu.apply(z)
+    return smooth_relu_reference(z)
+
+
+def smooth_relu_reference(z: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """`smooth_relu` in plain torch: the reference of the kernel, and the path on CUDA."""
     slope = (z * (0.5 / BEND) + 0.5).clamp(0, 1)
     return BEND * slope * slope + torch.relu(z - BEND), slope
+
+
+class _KernelSmoothRelu(torch.autograd.Function):
+    """`smooth_relu` in one pass each way."""
+
+    @staticmethod
+    def forward(ctx, z):
+        from stages.neural import kernels
+
+        activation, slope = torch.empty(z.shape), torch.empty(z.shape)
+        kernels.smooth_relu_forward(
+            z.detach().reshape(-1).numpy(), BEND, activation.view(-1).numpy(), slope.view(-1).numpy()
+        )
+        ctx.save_for_backward(slope)
+        return activation, slope
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, grad_activation, grad_slope):
+        from stages.neural import kernels
+
+        (slope,) = ctx.saved_tensors
+        grad_z = torch.empty(slope.shape)
+        kernels.smooth_relu_backward(
+            slope.view(-1).numpy(), BEND, grad_activation.reshape(-1).numpy(), grad_slope.reshape(-1).numpy(),
+            grad_z.view(-1).numpy(),
+        )  # fmt: skip
+        return grad_z
 
 
 @dataclass(frozen=True)
@@ -32,16 +67,17 @@ class FieldShape:
     """Everything needed to build the networks again.
 
     Attributes:
-        sdf_grid: encoding of the SDF.
+        sdf_grid: encoding of the SDF: a hash grid, or frequencies.
         sdf_layers, sdf_width: hidden layers of the SDF's MLP.
         radiance_layers, radiance_width: hidden layers of the radiance MLP; the other networks are as wide.
         features: geometry features handed from the SDF network to the radiance network.
         sphere_radius: radius of the sphere that the SDF is before training.
         background_grid: hash encoding of the background, or None without one.
         num_images: photos with an exposure of their own.
+        numerical: whether the SDF's gradient is taken by central differences instead of by differentiation.
     """
 
-    sdf_grid: HashGrid
+    sdf_grid: Encoding
     sdf_layers: int
     sdf_width: int
     radiance_layers: int
@@ -50,43 +86,79 @@ class FieldShape:
     sphere_radius: float
     background_grid: HashGrid | None
     num_images: int
+    numerical: bool = False
 
 
 class SdfNetwork(nn.Module):
-    """f(x) = |x| - r + MLP(hash(x)): a hash encoding and one hidden layer on top of a sphere.
+    """f(x) = |x| - r + MLP(encoding(x)): an encoding and hidden layers on top of a sphere.
 
-    The analytic sphere is the geometric initialisation: exact at step 0 whatever the width.
+    The analytic sphere is the geometric initialisation: f is that sphere at step 0, whatever the width and depth. A
+    hash encoding is silent then. Frequencies are not, so that their columns of the first layer start at zero.
     """
 
     def __init__(self, shape: FieldShape, generator: torch.Generator) -> None:
         super().__init__()
-        self.grid, self.radius = shape.sdf_grid, shape.sphere_radius
-        channels, hidden, outputs = self.grid.channels, shape.sdf_width, 1 + shape.features
-        self.table = nn.Parameter(self.grid.initial_table(generator))
-        self.weight_in = nn.Parameter(_uniform(hidden, channels, generator))
-        self.bias_in = nn.Parameter(torch.zeros(hidden))
-        weight_out = _uniform(outputs, hidden, generator)
-        weight_out[0] *= 0.1
-        self.weight_out = nn.Parameter(weight_out)
-        # With silent encodings each hidden unit answers smooth_relu(0) = BEND / 4: taken off, so that f is the sphere.
-        self.bias_out = nn.Parameter(-0.25 * BEND * weight_out.sum(1))
+        self.grid, self.radius, self.numerical = shape.sdf_grid, shape.sphere_radius, shape.numerical
+        self.table = None if isinstance(self.grid, Frequencies) else nn.Parameter(self.grid.initial_table(generator))
+        widths = [self.grid.channels, *[shape.sdf_width] * shape.sdf_layers, 1 + shape.features]
+        weights = [_uniform(rows, columns, generator) for columns, rows in itertools.pairwise(widths)]
+        weights[-1][0] *= 0.1
+        if isinstance(self.grid, Frequencies):
+            weights[0].zero_()
+        # Where the first layer hears nothing, each hidden unit answers smooth_relu(0) = BEND / 4. The next layer's
+        # bias takes it off, so that the same holds there, and at last f is the sphere.
+        biases = [torch.zeros(shape.sdf_width), *(-0.25 * BEND * weight.sum(1) for weight in weights[1:])]
+        self.weights, self.biases = nn.ParameterList(weights), nn.ParameterList(biases)
 
     def forward(self, points: torch.Tensor, active_levels: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """f [N], geometry features [N, G] and grad f [N, 3] at points [N, 3], all differentiable once."""
-        encoded, jacobian = encode(points, self.table, self.grid, active_levels)
-        activation, slope = smooth_relu(torch.addmm(self.bias_in, encoded, self.weight_in.T))
-        outputs = torch.addmm(self.bias_out, activation, self.weight_out.T)
-        from_encoding = (slope * self.weight_out[0]) @ self.weight_in  # d MLP / d encoding, [N, C]
+        """f [N], geometry features [N, G] and grad f [N, 3] at points [N, 3], all differentiable once.
+
+        The gradient is a reverse sweep through the layers, written out, or central differences over one active voxel
+        to either side (Neuralangelo).
+        """
+        if self.numerical:
+            encoded = encode_features(points, self.table, self.grid, active_levels)
+            outputs, _ = self._mlp(encoded)
+            return self._on_sphere(outputs[:, 0], points), outputs[:, 1:], self._differences(points, active_levels)
+        encoded, vjp = encode(points, self.table, self.grid, active_levels)
+        outputs, slopes = self._mlp(encoded)
+        *hidden, last = self.weights
+        cotangent = last[0]  # d MLP / d activation, pulled back to d MLP / d encoding, [N, C]
+        for weight, slope in zip(reversed(hidden), reversed(slopes), strict=True):
+            cotangent = (slope * cotangent) @ weight
         radius = torch.linalg.vector_norm(points, dim=1, keepdim=True).clamp(min=1e-6)
-        gradients = torch.bmm(jacobian, from_encoding.unsqueeze(2)).squeeze(2) + points / radius
-        return outputs[:, 0] + radius.squeeze(1) - self.radius, outputs[:, 1:], gradients
+        return self._on_sphere(outputs[:, 0], points), outputs[:, 1:], vjp(cotangent) + points / radius
 
     def sdf(self, points: torch.Tensor, active_levels: int) -> torch.Tensor:
         """f [N] alone."""
-        encoded = encode_features(points, self.table, self.grid, active_levels)
-        activation, _ = smooth_relu(torch.addmm(self.bias_in, encoded, self.weight_in.T))
-        value = activation @ self.weight_out[0] + self.bias_out[0]
-        return value + torch.linalg.vector_norm(points, dim=1) - self.radius
+        activation, _ = self._hidden(encode_features(points, self.table, self.grid, active_levels))
+        return self._on_sphere(activation @ self.weights[-1][0] + self.biases[-1][0], points)
+
+    def _mlp(self, encoded: torch.Tensor) -> tuple[torch.Tensor, list[torch.Tensor]]:
+        """Outputs [N, 1 + G] and the slopes [N, W] of the hidden layers."""
+        activation, slopes = self._hidden(encoded)
+        return torch.addmm(self.biases[-1], activation, self.weights[-1].T), slopes
+
+    def _hidden(self, encoded: torch.Tensor) -> tuple[torch.Tensor, list[torch.Tensor]]:
+        """The last hidden layer's activation [N, W] and the slopes of all."""
+        activation, slopes = encoded, []
+        *hidden, _ = zip(self.weights, self.biases, strict=True)
+        for weight, bias in hidden:
+            activation, slope = smooth_relu(torch.addmm(bias, activation, weight.T))
+            slopes.append(slope)
+        return activation, slopes
+
+    def _on_sphere(self, values: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
+        """The MLP's values [N] on top of the initial sphere."""
+        return values + torch.linalg.vector_norm(points, dim=1) - self.radius
+
+    def _differences(self, points: torch.Tensor, active_levels: int) -> torch.Tensor:
+        """grad f [N, 3] as (f(x + h e_i) - f(x - h e_i)) / (2 h), h the finest active voxel."""
+        step = self.grid.voxel_size(active_levels)
+        offsets = step * torch.eye(3, device=points.device, dtype=points.dtype)
+        places = points + torch.stack([offsets, -offsets])[:, :, None]  # [2, 3, N, 3]
+        high, low = self.sdf(places.view(-1, 3), active_levels).view(2, 3, -1)
+        return ((high - low) / (2 * step)).T
 
 
 class RadianceNetwork(nn.Module):
@@ -146,7 +218,8 @@ class Fields(nn.Module):
 
     def tables(self) -> list[nn.Parameter]:
         """The hash tables, which learn at a rate of their own."""
-        return [self.sdf.table] + ([self.background.table] if self.background else [])
+        tables = [self.sdf.table, self.background.table if self.background else None]
+        return [table for table in tables if table is not None]
 
 
 def contract(points: torch.Tensor) -> torch.Tensor:

@@ -9,11 +9,13 @@ from collections.abc import Callable
 
 import torch
 
-from stages.neural.density import section_optical_depth
+from stages.neural.density import _FLAT, section_optical_depth
 from stages.neural.rendering import weights_from_optical_depth
 
 # Part of the samples spread evenly over the ray, so that a surface the cache has missed can still be found.
 EVEN_SHARE = 0.15
+# And this much weight in any case, so that a ray that meets nothing has samples too.
+_EVEN_FLOOR = 1e-4
 
 
 def intersect_unit_sphere(
@@ -100,18 +102,45 @@ def importance_distances(
     The weights are those of a Laplace density of the given scale, widened to what the cache resolves; a share
     `EVEN_SHARE` is spread evenly. One stratified draw per sample; the strata's centres without a generator.
     """
-    device = origins.device
-    edges = torch.linspace(0, 1, num_bins + 1, device=device)
+    places = stratified(len(origins), num_samples, generator, origins.device)
+    scale = max(scale, 0.5 * cache.cell)
+    if origins.device.type != "cpu":
+        return importance_distances_reference(cache, origins, directions, entry, leave, places, scale, num_bins)
+    from stages.neural import kernels
+
+    distances = torch.empty(places.shape)
+    rays = (tensor.contiguous().numpy() for tensor in (origins, directions, entry, leave, places))
+    kernels.importance_distances(
+        cache.values[0, 0].numpy(), *rays, scale, _FLAT, EVEN_SHARE, _EVEN_FLOOR, num_bins, distances.numpy()
+    )
+    return distances
+
+
+@torch.no_grad()
+def importance_distances_reference(
+    cache: SdfCache,
+    origins: torch.Tensor,
+    directions: torch.Tensor,
+    entry: torch.Tensor,
+    leave: torch.Tensor,
+    places: torch.Tensor,
+    scale: float,
+    num_bins: int,
+) -> torch.Tensor:
+    """Distances [R, K] at places [R, K] in [0, 1) of the weights' CDF, in plain torch.
+
+    The reference of the kernel behind `importance_distances`, and the path on CUDA.
+    """
+    edges = torch.linspace(0, 1, num_bins + 1, device=origins.device)
     distances = entry[:, None] + (leave - entry)[:, None] * edges
     sdf = cache.lookup(origins[:, None] + distances[..., None] * directions[:, None])
     delta = (leave - entry)[:, None] / num_bins
-    tau = section_optical_depth(sdf[:, :-1], sdf[:, 1:], delta, max(scale, 0.5 * cache.cell))
+    tau = section_optical_depth(sdf[:, :-1], sdf[:, 1:], delta, scale)
     weights, _ = weights_from_optical_depth(tau)
-    weights = weights + (EVEN_SHARE * weights.sum(1, keepdim=True) + 1e-4) / num_bins
+    weights = weights + (EVEN_SHARE * weights.sum(1, keepdim=True) + _EVEN_FLOOR) / num_bins
     cdf = torch.nn.functional.pad(torch.cumsum(weights, 1), (1, 0))
     cdf = cdf / cdf[:, -1:]
-    u = stratified(len(origins), num_samples, generator, device)
-    index = torch.searchsorted(cdf, u.contiguous(), right=True).clamp(1, num_bins)
+    index = torch.searchsorted(cdf, places.contiguous(), right=True).clamp(1, num_bins)
     low, high = cdf.gather(1, index - 1), cdf.gather(1, index)
-    inside = ((u - low) / (high - low).clamp(min=1e-8)).clamp(0, 1)
+    inside = ((places - low) / (high - low).clamp(min=1e-8)).clamp(0, 1)
     return entry[:, None] + (leave - entry)[:, None] * (index - 1 + inside) / num_bins
