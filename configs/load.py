@@ -1,5 +1,7 @@
 """Layers of settings to one `Config`: defaults < preset < --config file < --set.
 
+Where a layer names `train.backbone`, the settings of that backbone lie right below it.
+
 Every refusal names the setting, where it was written, and the nearest one there is.
 """
 
@@ -66,12 +68,23 @@ def load_config(preset: str | None = None, file: Path | None = None, sets: Seque
     origins: dict[str, str] = {}
     for origin, layer in layers:
         layer = _checked(layer, origin)
-        merged = _merge(merged, layer)
-        origins.update({key: origin for key in _dotted(layer)})
+        backbone = layer.get("train", {}).get("backbone")
+        for origin_of_part, part in (*_backbone(backbone), (origin, layer)):
+            merged = _merge(merged, part)
+            origins.update({key: origin_of_part for key in _dotted(part)})
     try:
         return Config.model_validate(merged)
     except ValidationError as error:
         raise _refusal(error, origins) from None
+
+
+def _backbone(name: Any) -> list[tuple[str, dict[str, Any]]]:
+    """The layer of backbone `name`; none where there is no such backbone, which the schema then refuses."""
+    file = resources.files("configs") / "backbones" / f"{name}.yaml"
+    if not isinstance(name, str) or not name.isidentifier() or not file.is_file():
+        return []
+    origin = f"backbone '{name}'"
+    return [(origin, _checked(_parse(file.read_text(encoding="utf-8"), origin), origin))]
 
 
 def preset_names() -> list[str]:

@@ -30,7 +30,8 @@ def run(context: StageContext) -> dict[str, Any]:
     from stages.neural.field import field_state
     from stages.neural.held_out import held_out_psnr, left_out
     from stages.neural.photos import Photos
-    from stages.neural.trainer import Sightings, Trainer
+    from stages.neural.sightings import Sightings
+    from stages.neural.trainer import Trainer
 
     _use_threads(context)
     folder, params = context.inputs["undistort"], context.params
@@ -114,12 +115,13 @@ def _progress(step: int, seconds: float, params: Any) -> float:
 
 
 def _write_metrics(lines: IO[str], trainer: Any, progress: float, numbers: dict[str, float]) -> None:
+    moment = trainer.moment(progress)
     record = {
         "step": trainer.step_index,
         "progress": round(progress, 5),
         **{key: float(f"{value:.6g}") for key, value in numbers.items()},
-        "scale": round(trainer.scale(progress), 6),
-        "levels": trainer.levels(progress),
+        "scale": round(moment.width, 6),
+        "levels": moment.levels,
     }
     lines.write(json.dumps(record) + "\n")
 

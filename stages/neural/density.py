@@ -1,6 +1,6 @@
-"""From signed distance to optical depth along a ray (Laplace density, VolSDF; paper eq. density).
+"""From signed distance to optical depth along a ray: Laplace density (VolSDF; paper eq. density) or the alpha of NeuS.
 
-Notation: f signed distance (positive outside), b Laplace scale in scene units, sigma density per scene unit,
+Notation: f signed distance (positive outside), b scale in scene units, sigma density per scene unit,
 tau optical depth (dimensionless), delta length of a ray section.
 """
 
@@ -20,6 +20,20 @@ def laplace_density(sdf: torch.Tensor, scale: torch.Tensor | float) -> torch.Ten
     """
     decay = 0.5 * torch.exp(-sdf.abs() / scale)
     return torch.where(sdf >= 0, decay, 1 - decay) / scale
+
+
+def logistic_section_optical_depth(
+    sdf_start: torch.Tensor, sdf_end: torch.Tensor, scale: torch.Tensor | float
+) -> torch.Tensor:
+    """Optical depth tau of ray sections from f at their ends, with the alpha of NeuS (Wang et al. 2021, eq. 13).
+
+    alpha = max((Phi(f_start) - Phi(f_end)) / Phi(f_start), 0), Phi(f) = sigmoid(f / b), and tau = -log(1 - alpha) =
+    max(log Phi(f_start) - log Phi(f_end), 0), which keeps its digits deep inside. Zero where f rises along the ray;
+    the length of the section does not matter.
+    """
+    return torch.relu(
+        torch.nn.functional.logsigmoid(sdf_start / scale) - torch.nn.functional.logsigmoid(sdf_end / scale)
+    )
 
 
 def _density_integral(sdf: torch.Tensor, scale: torch.Tensor | float) -> torch.Tensor:

@@ -6,13 +6,16 @@ Shapes: N points. All live in the scene frame; the region of interest is the uni
 from __future__ import annotations
 
 import itertools
-import math
 from dataclasses import dataclass
 
 import torch
 from torch import nn
 
+from stages.neural.appearance import FeatureMlp
 from stages.neural.encodings import Encoding, Frequencies, HashGrid, encode, encode_features
+from stages.neural.mlp import kaiming_uniform, mlp, spherical_harmonics
+from stages.neural.proposal import ProposalNetwork
+from stages.neural.reflection import ReflectionNetwork
 
 # Half width of the smooth ReLU's bend: about the blur of the softplus(beta = 100) that IDR and NeuS use.
 BEND = 0.05
@@ -75,6 +78,8 @@ class FieldShape:
         background_grid: hash encoding of the background, or None without one.
         num_images: photos with an exposure of their own.
         numerical: whether the SDF's gradient is taken by central differences instead of by differentiation.
+        learned_scale: initial scale of the density where it is learned, scene units, or None.
+        reflection, appearance, proposal: whether there is a reflection network, a feature MLP, a proposal network.
     """
 
     sdf_grid: Encoding
@@ -87,6 +92,10 @@ class FieldShape:
     background_grid: HashGrid | None
     num_images: int
     numerical: bool = False
+    learned_scale: float | None = None
+    reflection: bool = False
+    appearance: bool = False
+    proposal: bool = False
 
 
 class SdfNetwork(nn.Module):
@@ -101,7 +110,7 @@ class SdfNetwork(nn.Module):
         self.grid, self.radius, self.numerical = shape.sdf_grid, shape.sphere_radius, shape.numerical
         self.table = None if isinstance(self.grid, Frequencies) else nn.Parameter(self.grid.initial_table(generator))
         widths = [self.grid.channels, *[shape.sdf_width] * shape.sdf_layers, 1 + shape.features]
-        weights = [_uniform(rows, columns, generator) for columns, rows in itertools.pairwise(widths)]
+        weights = [kaiming_uniform(rows, columns, generator) for columns, rows in itertools.pairwise(widths)]
         weights[-1][0] *= 0.1
         if isinstance(self.grid, Frequencies):
             weights[0].zero_()
@@ -171,7 +180,7 @@ class RadianceNetwork(nn.Module):
     def __init__(self, shape: FieldShape, generator: torch.Generator) -> None:
         super().__init__()
         inputs = shape.features + 3 + 3 + 3 + 1 + 15
-        self.layers = _mlp([inputs, *[shape.radiance_width] * shape.radiance_layers, 3], generator)
+        self.layers = mlp([inputs, *[shape.radiance_width] * shape.radiance_layers, 3], generator)
 
     def forward(
         self,
@@ -195,7 +204,7 @@ class BackgroundNetwork(nn.Module):
         assert shape.background_grid is not None
         self.grid = shape.background_grid
         self.table = nn.Parameter(self.grid.initial_table(generator))
-        self.layers = _mlp([self.grid.channels + 3, shape.radiance_width, 4], generator)
+        self.layers = mlp([self.grid.channels + 3, shape.radiance_width, 4], generator)
 
     def forward(self, points: torch.Tensor, view_dirs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Density [N] per unit of CONTRACTED length and colour [N, 3] at points [N, 3] outside the unit sphere."""
@@ -215,6 +224,12 @@ class Fields(nn.Module):
         self.radiance = RadianceNetwork(shape, generator)
         self.background = BackgroundNetwork(shape, generator) if shape.background_grid else None
         self.log_gains = nn.Parameter(torch.zeros(shape.num_images, 3))
+        self.reflection = (
+            ReflectionNetwork(shape.features, shape.radiance_width, generator) if shape.reflection else None
+        )
+        self.appearance = FeatureMlp(generator) if shape.appearance else None
+        self.proposal = ProposalNetwork(generator) if shape.proposal else None
+        self.log_scale = None if shape.learned_scale is None else nn.Parameter(torch.tensor(shape.learned_scale).log())
 
     def tables(self) -> list[nn.Parameter]:
         """The hash tables, which learn at a rate of their own."""
@@ -226,34 +241,3 @@ def contract(points: torch.Tensor) -> torch.Tensor:
     """Map all of space into the ball of radius 2, the unit ball onto itself (Mip-NeRF 360, eq. 10)."""
     radius = torch.linalg.vector_norm(points, dim=-1, keepdim=True).clamp(min=1e-6)
     return torch.where(radius <= 1, points, (2 - 1 / radius) * points / radius)
-
-
-def spherical_harmonics(directions: torch.Tensor) -> torch.Tensor:
-    """Real spherical harmonics of degree 1 to 3 [N, 15] of unit directions [N, 3], without their constants."""
-    x, y, z = directions.unbind(1)
-    xx, yy, zz = x * x, y * y, z * z
-    return torch.stack(
-        [
-            x, y, z,
-            x * y, y * z, z * x, xx - yy, 3 * zz - 1,
-            y * (3 * xx - yy), x * y * z, y * (5 * zz - 1), z * (5 * zz - 3), x * (5 * zz - 1),
-            z * (xx - yy), x * (xx - 3 * yy),
-        ],
-        1,
-    )  # fmt: skip
-
-
-def _uniform(rows: int, columns: int, generator: torch.Generator) -> torch.Tensor:
-    """Kaiming-uniform weights for a ReLU layer."""
-    return (torch.rand(rows, columns, generator=generator) * 2 - 1) * math.sqrt(6 / columns)
-
-
-def _mlp(widths: list[int], generator: torch.Generator) -> nn.Sequential:
-    layers: list[nn.Module] = []
-    for i, (columns, rows) in enumerate(itertools.pairwise(widths)):
-        layer = nn.Linear(columns, rows)
-        last = i == len(widths) - 2
-        layer.weight.data = _uniform(rows, columns, generator) * (0.3 if last else 1.0)
-        layer.bias.data.zero_()
-        layers += [layer] if last else [layer, nn.ReLU()]
-    return nn.Sequential(*layers)

@@ -7,19 +7,26 @@ from __future__ import annotations
 
 import torch
 
-from stages.neural.density import section_optical_depth
+from stages.neural.density import logistic_section_optical_depth, section_optical_depth
 
 
-def sample_optical_depths(sdf: torch.Tensor, distances: torch.Tensor, scale: torch.Tensor | float) -> torch.Tensor:
+def sample_optical_depths(
+    sdf: torch.Tensor, distances: torch.Tensor, scale: torch.Tensor | float, density: str = "laplace"
+) -> torch.Tensor:
     """Optical depth [R, K] of each sample's own stretch of the ray, half way to its neighbours.
 
     f [R, K] is taken as piecewise linear between the samples at distances [R, K], and integrated exactly. So sparse
     samples cannot invent a crossing that f does not have, and a crossing between two samples is shared by both.
+    The density is that of "laplace", or the logistic one of "neus".
     """
-    delta = 0.5 * (distances[:, 1:] - distances[:, :-1])
     middle = 0.5 * (sdf[:, 1:] + sdf[:, :-1])
-    near_half = section_optical_depth(sdf[:, :-1], middle, delta, scale)
-    far_half = section_optical_depth(middle, sdf[:, 1:], delta, scale)
+    if density == "neus":
+        near_half = logistic_section_optical_depth(sdf[:, :-1], middle, scale)
+        far_half = logistic_section_optical_depth(middle, sdf[:, 1:], scale)
+    else:
+        delta = 0.5 * (distances[:, 1:] - distances[:, :-1])
+        near_half = section_optical_depth(sdf[:, :-1], middle, delta, scale)
+        far_half = section_optical_depth(middle, sdf[:, 1:], delta, scale)
     return torch.nn.functional.pad(near_half, (0, 1)) + torch.nn.functional.pad(far_half, (1, 0))
 
 

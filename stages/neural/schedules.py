@@ -3,6 +3,31 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
+
+import torch
+
+
+@dataclass(frozen=True)
+class Moment:
+    """What the schedules say at one point of the training.
+
+    Attributes:
+        progress: part of the budget that is spent, from 0 to 1.
+        scale: the density's scale b, scene units; a tensor with a gradient where it is learned.
+        levels: how many levels of the encoding are in use.
+        voxel: side h of a cell of the finest of them, scene units.
+    """
+
+    progress: float
+    scale: torch.Tensor | float
+    levels: int
+    voxel: float
+
+    @property
+    def width(self) -> float:
+        """The scale b as a plain number, for what carries no gradient."""
+        return self.scale.item() if isinstance(self.scale, torch.Tensor) else self.scale
 
 
 def exponential(progress: float, start: float, end: float) -> float:
@@ -21,6 +46,14 @@ def warm_up_then_decay(progress: float, warm_up: float, final: float) -> float:
         return progress / warm_up
     phase = min((progress - warm_up) / (1 - warm_up), 1.0)
     return final + (1 - final) * 0.5 * (1 + math.cos(math.pi * phase))
+
+
+def warm_up_then_exponential(progress: float, warm_up: float, final: float) -> float:
+    """Learning-rate factor: straight up from 0 to 1 until `warm_up`, then down to `final` at 1, straight on a log scale
+    (the paper's decay from 1e-2 to 1e-5)."""
+    if progress < warm_up:
+        return progress / warm_up
+    return exponential((progress - warm_up) / (1 - warm_up), 1.0, final)
 
 
 def active_levels(progress: float, levels: int, start: int, until: float) -> int:

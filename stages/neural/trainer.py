@@ -5,104 +5,30 @@ Shapes: R rays, K samples a ray, N = R K points, P sparse points, I photos.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import numpy as np
 import torch
 
 from configs.params import TrainParams
-from stages.geometry.cameras import PosedScene
 from stages.neural import losses, schedules
-from stages.neural.encodings import HashGrid
-from stages.neural.fields import BackgroundNetwork, Fields, FieldShape
+from stages.neural.encodings import Frequencies, HashGrid
+from stages.neural.fields import Fields, FieldShape
 from stages.neural.photos import Photos, RayBatch
-from stages.neural.rendering import composite, sample_optical_depths, weights_from_optical_depth
-from stages.neural.sampling import SdfCache, importance_distances, intersect_unit_sphere, stratified
-from stages.neural.visibility import (
-    ambiguity,
-    color_precision,
-    mahalanobis,
-    path_margin,
-    sdf_visibility,
-    smallest_sdf_on_paths,
-    trust,
-)
-
-# Samples that weigh less than this get no colour: together they change a pixel by less than one grey level.
-_COLOR_THRESHOLD = 2e-4
-# Samples that weigh more than this count as near the surface for the relaxed Eikonal term.
-_NEAR_SURFACE_WEIGHT = 0.01
-# The background's last sample is this near to infinity, as a part of the contracted shell: 200 radii away.
-_BACKGROUND_REACH = 0.995
-
-
-@dataclass(frozen=True)
-class Sightings:
-    """Which photo saw which SfM point: M lines of sight that are free up to the surface at their end.
-
-    Attributes:
-        points: [M, 3] the SfM point at the end of each line, inside the region of interest.
-        directions: [M, 3] unit, from the camera to the point.
-        free: [M] length of the line inside the unit sphere before the point.
-        weights: [M] in [0, 1].
-    """
-
-    points: torch.Tensor
-    directions: torch.Tensor
-    free: torch.Tensor
-    weights: torch.Tensor
-
-    @staticmethod
-    def from_scene(scene: PosedScene, device: torch.device | str) -> Sightings:
-        """Sightings of points inside the unit sphere; weight 1 / (1 + e^2), e the reprojection error in pixels."""
-        inside = np.linalg.norm(scene.points, axis=1) < 0.98
-        image, point = scene.observations[inside[scene.observations[:, 1]]].T
-        points = torch.from_numpy(scene.points[point]).float()
-        origins = torch.from_numpy(scene.cameras.centers[image]).float()
-        distances = torch.linalg.vector_norm(points - origins, dim=1)
-        directions = (points - origins) / distances[:, None]
-        entry, _, _ = intersect_unit_sphere(origins, directions)
-        weights = torch.from_numpy(1 / (1 + scene.point_errors[point] ** 2)).float()
-        kept = (points, directions, (distances - entry).clamp(min=0), weights)
-        return Sightings(*(tensor.to(device) for tensor in kept))
-
-
-@dataclass(frozen=True)
-class Rendered:
-    """What a batch of rays shows.
-
-    Attributes:
-        colors: [R, 3] sRGB with the background behind, before exposure.
-        opacity: [R] of the surface alone.
-        weights, distances: [R, K] rendering weights of the samples and where they lie on the ray.
-        gradients: [N, 3] of the SDF at the samples.
-        extra_sdf, extra_gradients: the same at the extra points that were asked for.
-    """
-
-    colors: torch.Tensor
-    opacity: torch.Tensor
-    weights: torch.Tensor
-    distances: torch.Tensor
-    gradients: torch.Tensor
-    extra_sdf: torch.Tensor
-    extra_gradients: torch.Tensor
-
-    def surface(self, batch: RayBatch) -> tuple[torch.Tensor, torch.Tensor]:
-        """Mean surface point and unit normal of each ray [R, 3]; mean something only where the ray is opaque."""
-        depth = (self.weights * self.distances).sum(1) / self.opacity.clamp(min=1e-3)
-        normals = composite(self.weights, self.gradients.view(*self.weights.shape, 3))
-        points = batch.origins + depth[:, None] * batch.directions
-        return points, torch.nn.functional.normalize(normals, dim=1)
+from stages.neural.proposal import interlevel_loss, sample_edges, updates_now
+from stages.neural.renderer import Rendered, Renderer
+from stages.neural.sampling import SdfCache
+from stages.neural.schedules import Moment
+from stages.neural.sightings import Sightings, sighting_loss
+from stages.neural.terms import Terms
 
 
 def field_shape(params: TrainParams, num_images: int, background: bool) -> FieldShape:
     """The networks' shape for these settings."""
-    grid = HashGrid(params.levels, params.level_features, params.log2_rows, params.coarsest, params.finest)
+    hash_grid = HashGrid(params.levels, params.level_features, params.log2_rows, params.coarsest, params.finest)
     background_grid = HashGrid(6, 4, params.background_log2_rows, 16, 256)
     return FieldShape(
-        sdf_grid=grid,
+        sdf_grid=hash_grid if params.encoding == "hash" else Frequencies(params.levels),
         sdf_layers=params.sdf_layers,
         sdf_width=params.sdf_width,
         radiance_layers=params.radiance_layers,
@@ -111,6 +37,11 @@ def field_shape(params: TrainParams, num_images: int, background: bool) -> Field
         sphere_radius=params.sphere_radius,
         background_grid=background_grid if background else None,
         num_images=num_images,
+        numerical=params.gradients == "numerical",
+        learned_scale=params.scale_start if params.scale == "learned" else None,
+        reflection=params.reflection != "off",
+        appearance=params.planar_features == "mlp" and (params.planar != "off" or params.eikonal != "plain"),
+        proposal=params.sampler == "proposal",
     )
 
 
@@ -131,80 +62,78 @@ class Trainer:
                 {"params": networks, "base_lr": params.lr_network},
             ],
             lr=params.lr_table,
-            betas=(0.9, 0.99),
+            betas=(0.9, params.adam_beta2),
             eps=1e-15,
             fused=True,
         )
         self.cache = SdfCache(params.cache_resolution, device)
         self.generator = torch.Generator(device=device).manual_seed(params.seed)
+        self.renderer = Renderer(self.fields, self.cache, params)
+        self.terms = Terms(self.fields, photos, self.cache, params, self.generator)
         self.step_index = 0
         self.cache_step = -(10**9)
 
-    @cached_property
-    def color_precision(self) -> torch.Tensor:
-        """The photos' inverse colour covariance [3, 3], from a draw of its own; only the ambiguity weight asks."""
-        generator = torch.Generator(device=self.device).manual_seed(self.params.seed)
-        return color_precision(self.photos, generator)
-
     # ------------------------------------------------------------------ schedules
-    def scale(self, progress: float) -> float:
-        """Laplace scale b in scene units; it ends at half a voxel of the finest level, or at `scale_end`."""
-        floor = 0.5 * self.fields.shape.sdf_grid.voxel_size()
-        return schedules.exponential(
-            progress / self.params.sharpen_until, self.params.scale_start, max(self.params.scale_end, floor)
-        )
+    def moment(self, progress: float) -> Moment:
+        """What the schedules say at progress in [0, 1].
 
-    def levels(self, progress: float) -> int:
-        return schedules.active_levels(progress, self.params.levels, self.params.start_levels, self.params.coarse_until)
+        A scheduled scale ends at half a voxel of the finest level, or at `scale_end`; a learned one starts at
+        `scale_start` and is held above a tenth of that voxel.
+        """
+        params, grid = self.params, self.fields.shape.sdf_grid
+        levels = schedules.active_levels(progress, params.levels, params.start_levels, params.coarse_until)
+        scale: torch.Tensor | float
+        if self.fields.log_scale is not None:
+            scale = torch.exp(self.fields.log_scale).clamp(min=0.1 * grid.voxel_size())
+        else:
+            end = max(params.scale_end, 0.5 * grid.voxel_size())
+            scale = schedules.exponential(progress / params.sharpen_until, params.scale_start, end)
+        return Moment(progress, scale, levels, grid.voxel_size(levels))
 
     # ------------------------------------------------------------------ one step
     def step(self, progress: float) -> dict[str, torch.Tensor]:
         """One optimiser step at progress in [0, 1]; returns its terms and checks, batch means as tensors (no sync)."""
         params = self.params
-        self._refresh_cache(progress)
+        moment = self.moment(progress)
+        self._refresh_cache(moment)
         batch = self.photos.draw(params.rays, self.generator)
-        extra, sparse_weights = self._extra_points()
-        num_sparse = len(sparse_weights)
-        rendered = self.render(batch, progress, extra, self.generator)
+        places, sparse_weights = self.sightings.draw(params.sparse_batch, params.sparse_step, self.generator)
+        anywhere = torch.rand(params.free_points, 3, generator=self.generator, device=self.device) * 2 - 1
+        rendered = self.renderer.render(batch, moment, torch.cat([places, anywhere]), self.generator)
         exposed = rendered.colors * torch.exp(self.fields.log_gains[batch.images])
+        nothing = torch.zeros((), device=self.device)
 
         ray_error = losses.rgb_error(exposed, batch.colors)
-        photo_error = ray_error * self._trust(batch, rendered, progress)
+        photo_error = ray_error * self.terms.trust(batch, rendered, exposed, moment)
+        mask_loss = nothing
         if batch.masks is not None:  # outside the masks nothing is known of the colour
             photo_error = photo_error * batch.masks
             mask_loss = losses.mask_error(rendered.opacity, batch.masks).mean()
-        else:
-            mask_loss = torch.zeros((), device=self.device)
         rgb_loss = photo_error.mean()
+        omega = self.terms.relaxation(batch, rendered, ray_error)
         eikonal_loss = torch.cat(
-            [
-                self._relaxation(ray_error, rendered) * losses.eikonal_error(rendered.gradients),
-                losses.eikonal_error(rendered.extra_gradients),
-            ]
+            [omega * losses.eikonal_error(rendered.gradients), losses.eikonal_error(rendered.extra_gradients)]
         ).mean()
-        planar_loss = self._planar_loss(batch, rendered, progress)
-        on_point, behind, front, free = rendered.extra_sdf[: 4 * num_sparse].view(4, num_sparse)
-        margin = 0.25 * params.sparse_step
-        sparse_error = (
-            losses.sparse_point_error(on_point, params.sparse_tolerance)
-            + losses.inside_error(behind, margin)
-            + losses.outside_error(front, margin)
-            + losses.outside_error(free, margin)
-        )
-        sparse_loss = (sparse_weights * sparse_error).sum() / max(num_sparse, 1)
+        planar_loss = self.terms.planar_loss(batch, rendered, moment)
+        appearance_loss = self.terms.appearance_loss(batch, rendered)
+        sparse_loss = sighting_loss(rendered.extra_sdf[: len(places)], sparse_weights, params)
         exposure_loss = losses.exposure_error(self.fields.log_gains).mean()
+        proposal_loss = self._proposal_loss(rendered)
 
         loss = (
             rgb_loss
             + params.weight_eikonal * eikonal_loss
-            + params.weight_planar * schedules.exponential(progress, 0.1, 1.0) * planar_loss
+            + params.weight_planar * schedules.exponential(progress / params.planar_until, 0.1, 1.0) * planar_loss
             + params.weight_sparse * schedules.fade_out(progress, params.sparse_until) * sparse_loss
             + params.weight_mask * mask_loss
             + params.weight_exposure * exposure_loss
+            + appearance_loss
+            + proposal_loss
         )
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
-        factor = schedules.warm_up_then_decay(progress, params.lr_warm_up, params.lr_final)
+        decay = schedules.warm_up_then_decay if params.lr_decay == "cosine" else schedules.warm_up_then_exponential
+        factor = decay(progress, params.lr_warm_up, params.lr_final)
         for group in self.optimizer.param_groups:
             group["lr"] = group["base_lr"] * factor
         self.optimizer.step()
@@ -225,172 +154,31 @@ class Trainer:
                 "psnr": -10 * torch.log10(mse.clamp(min=1e-10)),
                 "gradient_norm": torch.linalg.vector_norm(rendered.gradients, dim=1).mean(),
                 "opacity": rendered.opacity.detach().mean(),
+                "reflected": rendered.reflected.mean(),
             }
 
-    @torch.no_grad()
-    def _trust(self, batch: RayBatch, rendered: Rendered, progress: float) -> torch.Tensor:
-        """Weight [R] of each ray's colour error: 1 / (1 + lambda_ambiguity), mean 1 (paper eq. loss_without_ambiguity).
+    def _proposal_loss(self, rendered: Rendered) -> torch.Tensor:
+        """What trains the proposal network, in the steps that train it; zero where a grid guides the samples."""
+        if rendered.proposal is None or not updates_now(self.step_index, self.params.proposal_updates):
+            return torch.zeros((), device=self.device)
+        edges = sample_edges(rendered.distances)
+        return interlevel_loss(edges, rendered.weights, *rendered.proposal).mean()
 
-        1 before `ambiguity_from`: early on, a pattern seen at a wrong depth would pass for a reflection.
-        """
-        num_rays = len(batch.leave)
-        if self.params.ambiguity == "off" or progress < self.params.ambiguity_from:
-            return torch.ones(num_rays, device=self.device)
-        gains = torch.exp(self.fields.log_gains)
-        surface, normals = rendered.surface(batch)
-        to_cameras = torch.nn.functional.normalize(self.photos.centers - surface[:, None], dim=2)
-        facing = torch.einsum("ra,ria->ri", normals, to_cameras)
-        colors, in_frame = self.photos.observe(surface)
-        others = torch.arange(len(self.photos), device=self.device) != batch.images[:, None]
-        ray, view = torch.nonzero(in_frame & others & (facing > 0) & (rendered.opacity > 0.5)[:, None], as_tuple=True)
-        margin = path_margin(facing[ray, view], self.scale(progress), max(self._voxel(progress), self.cache.cell / 2))
-        smallest = smallest_sdf_on_paths(self.cache, surface[ray], self.photos.centers[view], margin)
-        visibility = torch.zeros_like(facing)
-        visibility[ray, view] = sdf_visibility(smallest)
-        own = batch.colors / gains[batch.images]
-        distance = mahalanobis(own[:, None], colors / gains, self.color_precision)
-        return trust(ambiguity(visibility, distance))
-
-    def _relaxation(self, ray_error: torch.Tensor, rendered: Rendered) -> torch.Tensor:
-        """Weight [N] of the Eikonal term at the rays' samples: below 1 near surfaces whose photo is not met yet."""
-        if self.params.eikonal == "plain":
-            return torch.ones_like(rendered.weights).view(-1)
-        near_surface = rendered.weights.detach() > _NEAR_SURFACE_WEIGHT
-        omega = losses.eikonal_relaxation(ray_error)[:, None].expand_as(rendered.weights)
-        return torch.where(near_surface, omega, torch.ones_like(omega)).reshape(-1)
-
-    def _planar_loss(self, batch: RayBatch, rendered: Rendered, progress: float) -> torch.Tensor:
-        """Mean planar error around the surface points of some of the rays, adaptively weighted (paper L_planar).
-
-        Half of the neighbours lie on the ray before the surface, as in the paper, half on a disk in its tangent plane.
-        """
-        params = self.params
-        nothing = torch.zeros((), device=self.device)
-        if params.planar == "off":
-            return nothing
-        chosen = torch.nonzero(rendered.opacity.detach() > 0.5).squeeze(1)[: params.planar_rays]
-        if len(chosen) == 0:
-            return nothing
-        surface, normals = (part.detach()[chosen] for part in rendered.surface(batch))
-        radius = schedules.exponential(progress, params.planar_radius, 3 * self._voxel(1.0))
-        count = params.planar_neighbors
-        draws = torch.randn(len(chosen), count, 3, generator=self.generator, device=self.device)
-        tangent = draws - torch.einsum("qkc,qc->qk", draws, normals)[..., None] * normals[:, None]
-        disk = torch.nn.functional.normalize(tangent, dim=2)
-        on_ray = -batch.directions[chosen, None].expand_as(disk)
-        reach = radius * torch.rand(len(chosen), count, 1, generator=self.generator, device=self.device)
-        half = torch.arange(count, device=self.device) % 2 == 0
-        offsets = torch.where(half[None, :, None], on_ray * reach, disk * (reach * radius).sqrt())
-
-        neighbors = (surface[:, None] + offsets).reshape(-1, 3)
-        sdf, features, gradients = self.fields.sdf(torch.cat([surface, neighbors]), self.levels(progress))
-        center, center_features = sdf[: len(chosen)], features[: len(chosen)]
-        unit_normals = torch.nn.functional.normalize(gradients[: len(chosen)], dim=1)
-        shape = (len(chosen), count)
-        error = losses.planar_error(sdf[len(chosen) :].view(shape), center, unit_normals, offsets, radius)
-        flatness = losses.planarity(features[len(chosen) :].view(*shape, -1), center_features)
-        return (flatness * error).mean()
-
-    def _voxel(self, progress: float) -> float:
-        """Side of the finest active cell of the encoding, scene units: the paper's h."""
-        return self.fields.shape.sdf_grid.voxel_size(self.levels(progress))
-
-    def _extra_points(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Points [4 S + A, 3] evaluated beside the rays' samples, and the weights [S] of the sightings among them.
-
-        Of S sightings the points, then places a step behind them, a step before them, and somewhere on the free line
-        of sight; last A places anywhere in the cube.
-        """
-        params, sightings = self.params, self.sightings
-        total = len(sightings.weights)
-        count = min(params.sparse_batch, total)
-        chosen = torch.randint(max(total, 1), (count,), generator=self.generator, device=self.device)
-        along = torch.rand(count, generator=self.generator, device=self.device)
-        points, directions = sightings.points[chosen], sightings.directions[chosen]
-        step = params.sparse_step * directions
-        free = (along * sightings.free[chosen]).clamp(min=params.sparse_step)[:, None] * directions
-        anywhere = torch.rand(params.free_points, 3, generator=self.generator, device=self.device) * 2 - 1
-        places = torch.cat([points, points + step, points - step, points - free, anywhere])
-        return places, sightings.weights[chosen]
-
-    # ------------------------------------------------------------------ rendering
     def render(
-        self,
-        batch: RayBatch,
-        progress: float,
-        extra: torch.Tensor,
-        generator: torch.Generator | None,
+        self, batch: RayBatch, progress: float, extra: torch.Tensor, generator: torch.Generator | None
     ) -> Rendered:
-        """Render rays and evaluate the SDF at extra points [E, 3] in the same pass."""
-        scale, levels = self.scale(progress), self.levels(progress)
-        distances = importance_distances(
-            self.cache, batch.origins, batch.directions, batch.entry, batch.leave,
-            self.params.samples, scale, generator,
-        )  # fmt: skip
-        num_rays, num_samples = distances.shape
-        points = (batch.origins[:, None] + distances[..., None] * batch.directions[:, None]).reshape(-1, 3)
-        num_points = len(points)
-        sdf, features, gradients = self.fields.sdf(torch.cat([points, extra]), levels)
-        tau = sample_optical_depths(sdf[:num_points].view(num_rays, num_samples), distances, scale)
-        weights, transmittance = weights_from_optical_depth(tau)
-
-        seen = torch.nonzero(weights.detach().view(-1) > _COLOR_THRESHOLD).squeeze(1)
-        ray = seen // num_samples
-        normals = torch.nn.functional.normalize(gradients[seen], dim=1)
-        sample_colors = self.fields.radiance(points[seen], normals, batch.directions[ray], features[seen])
-        colors = torch.zeros(num_rays, 3, device=self.device).index_add(
-            0, ray, weights.view(-1)[seen, None] * sample_colors
-        )
-        if self.fields.background is not None:
-            colors = colors + self._background(self.fields.background, batch, transmittance, generator)
-        return Rendered(
-            colors, 1 - transmittance, weights, distances, gradients[:num_points],
-            sdf[num_points:], gradients[num_points:],
-        )  # fmt: skip
-
-    def _background(
-        self,
-        background: BackgroundNetwork,
-        batch: RayBatch,
-        transmittance: torch.Tensor,
-        generator: torch.Generator | None,
-    ) -> torch.Tensor:
-        """Background colour [R, 3] weighted by the transmittance [R] that the surface leaves.
-
-        Samples are even in the inverse of their distance from the scene's centre, from the unit sphere outwards
-        (NeRF++), so that half of them look at what lies within twice the region's radius.
-        """
-        count = self.params.background_samples
-        behind = torch.nonzero(transmittance.detach() > 0.01).squeeze(1)
-        origins, directions = batch.origins[behind], batch.directions[behind]
-        inverse = 1 - _BACKGROUND_REACH * stratified(len(behind), count + 1, generator, self.device)
-        middle = -(origins * directions).sum(1, keepdim=True)
-        closest_squared = (origins**2).sum(1, keepdim=True) - middle**2
-        distances = middle + (1 / inverse**2 - closest_squared).clamp(min=0).sqrt()
-        centers = 0.5 * (distances[:, 1:] + distances[:, :-1])
-        points = (origins[:, None] + centers[..., None] * directions[:, None]).reshape(-1, 3)
-        delta = inverse[:, :-1] - inverse[:, 1:]  # the contracted radius is 2 - inverse
-        dirs = directions[:, None].expand(-1, count, -1).reshape(-1, 3)
-        density, colors = background(points, dirs)
-        tau = density.view(len(behind), count) * delta
-        weights, left = weights_from_optical_depth(tau)
-        # What is left behind the last sample belongs to it: the background is opaque at infinity.
-        weights = torch.cat([weights[:, :-1], weights[:, -1:] + left[:, None]], 1)
-        color = composite(weights, colors.view(len(behind), count, 3))
-        return torch.zeros(len(batch.leave), 3, device=self.device).index_add(
-            0, behind, transmittance[behind, None] * color
-        )
+        """Render rays and evaluate the SDF at extra points [E, 3], with the schedules at progress."""
+        return self.renderer.render(batch, self.moment(progress), extra, generator)
 
     @torch.no_grad()
-    def _refresh_cache(self, progress: float) -> None:
+    def _refresh_cache(self, moment: Moment) -> None:
         """Bring the sampler's grid up to date: all of it at first and now and then, else near the surface."""
         every = self.params.cache_every
         if self.step_index - self.cache_step < every:
             return
-        levels = self.levels(progress)
         refreshes = self.step_index // every
         full = self.step_index <= 4 * every or refreshes % 8 == 0
-        self.cache.refresh(lambda p: self.fields.sdf.sdf(p, levels), None if full else 4 * self.cache.cell)
+        self.cache.refresh(lambda p: self.fields.sdf.sdf(p, moment.levels), None if full else 4 * self.cache.cell)
         self.cache_step = self.step_index
 
     # ------------------------------------------------------------------ previews, checkpoints

@@ -1,0 +1,44 @@
+"""Multi-layer perceptrons from a seeded generator, and the encoding of directions that they take.
+
+Shapes: N rows.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import torch
+from torch import nn
+
+
+def mlp(widths: list[int], generator: torch.Generator) -> nn.Sequential:
+    """Linear layers from widths[0] inputs to widths[-1] outputs with ReLUs between; small last weights, no biases."""
+    layers: list[nn.Module] = []
+    for i, (columns, rows) in enumerate(itertools.pairwise(widths)):
+        layer = nn.Linear(columns, rows)
+        last = i == len(widths) - 2
+        layer.weight.data = kaiming_uniform(rows, columns, generator) * (0.3 if last else 1.0)
+        layer.bias.data.zero_()
+        layers += [layer] if last else [layer, nn.ReLU()]
+    return nn.Sequential(*layers)
+
+
+def kaiming_uniform(rows: int, columns: int, generator: torch.Generator) -> torch.Tensor:
+    """Kaiming-uniform weights [rows, columns] for a ReLU layer."""
+    return (torch.rand(rows, columns, generator=generator) * 2 - 1) * math.sqrt(6 / columns)
+
+
+def spherical_harmonics(directions: torch.Tensor) -> torch.Tensor:
+    """Real spherical harmonics of degree 1 to 3 [N, 15] of unit directions [N, 3], without their constants."""
+    x, y, z = directions.unbind(1)
+    xx, yy, zz = x * x, y * y, z * z
+    return torch.stack(
+        [
+            x, y, z,
+            x * y, y * z, z * x, xx - yy, 3 * zz - 1,
+            y * (3 * xx - yy), x * y * z, y * (5 * zz - 1), z * (5 * zz - 3), x * (5 * zz - 1),
+            z * (xx - yy), x * (xx - 3 * yy),
+        ],
+        1,
+    )  # fmt: skip

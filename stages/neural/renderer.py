@@ -1,0 +1,198 @@
+"""Rays to colours: samples, surface, reflection, background, in that order.
+
+Shapes: R rays, K samples a ray, N = R K points, Q rays that hit something, P bins of the proposal network.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+
+from configs.params import TrainParams
+from stages.neural import reflection
+from stages.neural.fields import BackgroundNetwork, Fields
+from stages.neural.photos import RayBatch
+from stages.neural.proposal import proposal_distances
+from stages.neural.rendering import composite, sample_optical_depths, weights_from_optical_depth
+from stages.neural.sampling import SdfCache, importance_distances, stratified
+from stages.neural.schedules import Moment
+
+# Samples that weigh less than this get no colour: together they change a pixel by less than one grey level.
+_COLOR_THRESHOLD = 2e-4
+# Rays more opaque than this count as having met a surface.
+OPAQUE = 0.5
+# Reflected rays that meet something with less than this probability are not followed: under one grey level.
+_REFLECTION_THRESHOLD = 2e-3
+# The background's last sample is this near to infinity, as a part of the contracted shell: 200 radii away.
+_BACKGROUND_REACH = 0.995
+
+
+@dataclass(frozen=True)
+class Rendered:
+    """What a batch of rays shows.
+
+    Attributes:
+        colors: [R, 3] sRGB with reflections and the background behind, before exposure.
+        opacity: [R] of the surface alone.
+        weights, distances: [R, K] rendering weights of the samples and where they lie on the ray.
+        points: [N, 3] the samples.
+        gradients: [N, 3] of the SDF at the samples.
+        features: [N, G] geometry features at the samples.
+        reflected: [R] part of the colour that came from reflections of the object itself.
+        proposal: edges [R, P + 1] and weights [R, P] of the proposal network, or None where a grid guides the samples.
+        extra_sdf, extra_gradients: f [E] and its gradients [E, 3] at the extra points that were asked for.
+    """
+
+    colors: torch.Tensor
+    opacity: torch.Tensor
+    weights: torch.Tensor
+    distances: torch.Tensor
+    points: torch.Tensor
+    gradients: torch.Tensor
+    features: torch.Tensor
+    reflected: torch.Tensor
+    proposal: tuple[torch.Tensor, torch.Tensor] | None
+    extra_sdf: torch.Tensor
+    extra_gradients: torch.Tensor
+
+    def mean(self, values: torch.Tensor) -> torch.Tensor:
+        """Mean [R, D] of values [N, D] over each ray's surface; means something only where the ray is opaque."""
+        summed = composite(self.weights, values.view(*self.weights.shape, -1))
+        return summed / self.opacity.clamp(min=1e-3)[:, None]
+
+    def surface(self, batch: RayBatch) -> tuple[torch.Tensor, torch.Tensor]:
+        """Mean surface point x_0 and unit normal n_0 of each ray [R, 3]; mean something only where it is opaque."""
+        depth = (self.weights * self.distances).sum(1) / self.opacity.clamp(min=1e-3)
+        points = batch.origins + depth[:, None] * batch.directions
+        return points, torch.nn.functional.normalize(self.mean(self.gradients), dim=1)
+
+
+class Renderer:
+    """Renders rays through the fields; holds no state of its own."""
+
+    def __init__(self, fields: Fields, cache: SdfCache, params: TrainParams) -> None:
+        self.fields, self.cache, self.params = fields, cache, params
+
+    def render(
+        self, batch: RayBatch, moment: Moment, extra: torch.Tensor, generator: torch.Generator | None
+    ) -> Rendered:
+        """Render rays and evaluate the SDF at extra points [E, 3] in the same pass.
+
+        Without a generator samples lie at the centres of their strata: the same rays give the same colours.
+        """
+        distances, proposal = self._sample(batch, moment, generator)
+        num_rays, num_samples = distances.shape
+        points = (batch.origins[:, None] + distances[..., None] * batch.directions[:, None]).reshape(-1, 3)
+        num_points = len(points)
+        sdf, features, gradients = self.fields.sdf(torch.cat([points, extra]), moment.levels)
+        tau = sample_optical_depths(
+            sdf[:num_points].view(num_rays, num_samples), distances, moment.scale, self.params.density
+        )
+        weights, transmittance = weights_from_optical_depth(tau)
+
+        seen = torch.nonzero(weights.detach().view(-1) > _COLOR_THRESHOLD).squeeze(1)
+        ray = seen // num_samples
+        normals = torch.nn.functional.normalize(gradients[seen], dim=1)
+        sample_colors = self.fields.radiance(points[seen], normals, batch.directions[ray], features[seen])
+        colors = torch.zeros(num_rays, 3, device=points.device).index_add(
+            0, ray, weights.view(-1)[seen, None] * sample_colors
+        )
+        if self.fields.background is not None:
+            colors = colors + self._background(self.fields.background, batch, transmittance, generator)
+        rendered = Rendered(
+            colors, 1 - transmittance, weights, distances, points, gradients[:num_points], features[:num_points],
+            torch.zeros(num_rays, device=points.device), proposal, sdf[num_points:], gradients[num_points:],
+        )  # fmt: skip
+        return self._with_reflections(rendered, batch, moment, generator)
+
+    def _sample(
+        self, batch: RayBatch, moment: Moment, generator: torch.Generator | None
+    ) -> tuple[torch.Tensor, tuple[torch.Tensor, torch.Tensor] | None]:
+        """Distances [R, K] of the samples, and the proposal network's histogram where it made them."""
+        params = self.params
+        if self.fields.proposal is None:
+            return importance_distances(
+                self.cache, batch.origins, batch.directions, batch.entry, batch.leave,
+                params.samples, moment.width, generator,
+            ), None  # fmt: skip
+        distances, edges, weights = proposal_distances(
+            self.fields.proposal, batch.origins, batch.directions, batch.entry, batch.leave,
+            params.proposal_samples, params.samples, generator,
+        )  # fmt: skip
+        return distances, (edges, weights)
+
+    def _with_reflections(
+        self, rendered: Rendered, batch: RayBatch, moment: Moment, generator: torch.Generator | None
+    ) -> Rendered:
+        """C' = (1 - rho S) C + rho S g of the rays that met a surface (paper, Self-Reflection Compensation).
+
+        In the stable form S, x_r and n_r carry no gradient, and rays whose reflection meets nothing stay as they are.
+        """
+        network, params = self.fields.reflection, self.params
+        if network is None or (params.reflection == "stable" and moment.progress < params.reflection_from):
+            return rendered
+        hit = torch.nonzero(rendered.opacity.detach() > OPAQUE).squeeze(1)
+        surface, normals = (part[hit] for part in rendered.surface(batch))
+        if params.reflection == "paper":
+            dirs = reflection.reflect(batch.directions[hit], normals)
+            along = reflection.uniform_points(
+                surface, dirs, params.reflection_reach, params.reflection_samples, generator
+            )
+            sdf, _, gradients = self.fields.sdf(along.view(-1, 3), moment.levels)
+            sdf = sdf.view(along.shape[:2])
+            probability = reflection.reflection_probability_literal(sdf, params.reflection_temperature)
+            points, gradients = (reflection.nearest_to_surface(sdf, each.view_as(along)) for each in (along, gradients))
+            reflectivity = torch.ones_like(probability)
+        else:
+            surface, normals = surface.detach(), normals.detach()
+            dirs = reflection.reflect(batch.directions[hit], normals)
+            probability, points = reflection.trace_reflections(
+                self.cache, surface, dirs, moment.width, moment.voxel,
+                params.reflection_reach, params.reflection_samples,
+            )  # fmt: skip
+            met = torch.nonzero(probability > _REFLECTION_THRESHOLD).squeeze(1)
+            hit, normals, dirs, probability, points = (x[met] for x in (hit, normals, dirs, probability, points))
+            with torch.no_grad():
+                _, _, gradients = self.fields.sdf(points, moment.levels)
+            facing = (normals * batch.directions[hit]).sum(1)
+            features = composite(rendered.weights[hit], rendered.features.view(*rendered.weights.shape, -1)[hit])
+            reflectivity = network.reflectivity(features / rendered.opacity[hit, None], facing)
+        seen = network(points, torch.nn.functional.normalize(gradients, dim=1), dirs)
+        composed = reflection.compose(rendered.colors[hit], seen, probability, reflectivity)
+        return replace(
+            rendered,
+            colors=rendered.colors.index_copy(0, hit, composed),
+            reflected=rendered.reflected.index_copy(0, hit, (reflectivity * probability).detach()),
+        )
+
+    def _background(
+        self,
+        background: BackgroundNetwork,
+        batch: RayBatch,
+        transmittance: torch.Tensor,
+        generator: torch.Generator | None,
+    ) -> torch.Tensor:
+        """Background colour [R, 3] weighted by the transmittance [R] that the surface leaves.
+
+        Samples are even in the inverse of their distance from the scene's centre, from the unit sphere outwards
+        (NeRF++), so that half of them look at what lies within twice the region's radius.
+        """
+        count, device = self.params.background_samples, transmittance.device
+        behind = torch.nonzero(transmittance.detach() > 0.01).squeeze(1)
+        origins, directions = batch.origins[behind], batch.directions[behind]
+        inverse = 1 - _BACKGROUND_REACH * stratified(len(behind), count + 1, generator, device)
+        middle = -(origins * directions).sum(1, keepdim=True)
+        closest_squared = (origins**2).sum(1, keepdim=True) - middle**2
+        distances = middle + (1 / inverse**2 - closest_squared).clamp(min=0).sqrt()
+        centers = 0.5 * (distances[:, 1:] + distances[:, :-1])
+        points = (origins[:, None] + centers[..., None] * directions[:, None]).reshape(-1, 3)
+        delta = inverse[:, :-1] - inverse[:, 1:]  # the contracted radius is 2 - inverse
+        dirs = directions[:, None].expand(-1, count, -1).reshape(-1, 3)
+        density, colors = background(points, dirs)
+        tau = density.view(len(behind), count) * delta
+        weights, left = weights_from_optical_depth(tau)
+        # What is left behind the last sample belongs to it: the background is opaque at infinity.
+        weights = torch.cat([weights[:, :-1], weights[:, -1:] + left[:, None]], 1)
+        color = composite(weights, colors.view(len(behind), count, 3))
+        return torch.zeros(len(batch.leave), 3, device=device).index_add(0, behind, transmittance[behind, None] * color)

@@ -1,0 +1,202 @@
+"""The paper's terms on a batch: queries of the fields around the pure functions of `losses` and `visibility`.
+
+Each has the paper's form and a stable form, chosen by a setting, and does nothing where it is off. `docs/math.md`
+says how the two differ and why.
+
+Shapes: R rays, K samples a ray, N = R K points, I photos, Q rays and J neighbours of the planar term.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import torch
+
+from configs.params import TrainParams
+from stages.neural import losses, schedules, visibility
+from stages.neural.fields import Fields
+from stages.neural.photos import Photos, RayBatch
+from stages.neural.renderer import OPAQUE, Rendered
+from stages.neural.sampling import SdfCache
+from stages.neural.schedules import Moment
+
+# Samples that weigh more than this count as near the surface for the relaxed Eikonal term.
+_NEAR_SURFACE_WEIGHT = 0.01
+
+
+class Terms:
+    """Ambiguity weight, planar term and Eikonal relaxation, with what they look at."""
+
+    def __init__(
+        self, fields: Fields, photos: Photos, cache: SdfCache, params: TrainParams, generator: torch.Generator
+    ) -> None:
+        self.fields, self.photos, self.cache, self.params = fields, photos, cache, params
+        self.generator = generator
+        self.device = generator.device
+        self.mesh_visibility = visibility.MeshVisibility(cache) if params.visibility == "mesh" else None
+
+    @cached_property
+    def color_precision(self) -> torch.Tensor:
+        """The photos' inverse colour covariance [3, 3], from a draw of its own; only the ambiguity weight asks."""
+        generator = torch.Generator(device=self.device).manual_seed(self.params.seed)
+        if self.params.ambiguity == "paper":
+            return visibility.color_precision(self.photos, generator, floor=0.0)
+        return visibility.color_precision(self.photos, generator)
+
+    # ------------------------------------------------------------------ ambiguity weight
+    def trust(self, batch: RayBatch, rendered: Rendered, exposed: torch.Tensor, moment: Moment) -> torch.Tensor:
+        """Weight [R] of each ray's colour error, 1 / (1 + lambda_ambiguity) (paper eq. loss_without_ambiguity).
+
+        The stable form compares photos with photos, carries no gradient, has mean 1, and is 1 before
+        `ambiguity_from`: early on, a pattern seen at a wrong depth would pass for a reflection. The paper's form
+        compares the rendered colours `exposed` [R, 3] with the photos, from the first step.
+        """
+        params = self.params
+        off = params.ambiguity == "off" or (params.ambiguity == "stable" and moment.progress < params.ambiguity_from)
+        if off:
+            return torch.ones(len(batch.leave), device=self.device)
+        colors, seen = self._views(batch, rendered, moment)
+        if params.ambiguity == "paper":
+            distance = visibility.mahalanobis(exposed[:, None], colors, self.color_precision)
+            return visibility.trust_literal(visibility.ambiguity(seen, distance))
+        gains = torch.exp(self.fields.log_gains.detach())
+        own = batch.colors / gains[batch.images]
+        distance = visibility.mahalanobis(own[:, None], colors / gains, self.color_precision)
+        return visibility.trust(visibility.ambiguity(seen, distance))
+
+    @torch.no_grad()
+    def _views(self, batch: RayBatch, rendered: Rendered, moment: Moment) -> tuple[torch.Tensor, torch.Tensor]:
+        """What every photo shows at each ray's surface point: colours [R, I, 3] and the visibility factor [R, I]."""
+        params, photos = self.params, self.photos
+        surface, normals = rendered.surface(batch)
+        to_cameras = torch.nn.functional.normalize(photos.centers - surface[:, None], dim=2)
+        facing = torch.einsum("ra,ria->ri", normals, to_cameras)
+        colors, in_frame = photos.observe(surface)
+        others = torch.arange(len(photos), device=self.device) != batch.images[:, None]
+        candidates = in_frame & others & photos.training & (rendered.opacity > OPAQUE)[:, None]
+        if params.visibility != "paper":
+            candidates &= facing > 0
+        ray, view = torch.nonzero(candidates, as_tuple=True)
+        points, centers, beta = surface[ray], photos.centers[view], params.visibility_sharpness
+        if params.visibility == "paper":
+            factor = visibility.visibility_literal(
+                self.cache, points, centers, params.visibility_samples, self.generator, beta
+            )
+        else:
+            voxel = max(moment.voxel, self.cache.cell / 2)
+            margin = visibility.path_margin(facing[ray, view], moment.width, voxel)
+            if self.mesh_visibility is not None:
+                factor = self.mesh_visibility(points, centers, margin)
+            else:
+                smallest = visibility.smallest_sdf_on_paths(
+                    self.cache, points, centers, margin, params.visibility_samples
+                )
+                factor = visibility.sdf_visibility(smallest, beta)
+        seen = torch.zeros_like(facing)
+        seen[ray, view] = factor
+        return colors, seen
+
+    # ------------------------------------------------------------------ appearance features
+    def _appearance(self, points: torch.Tensor, dirs: torch.Tensor, features: torch.Tensor) -> torch.Tensor:
+        """c_feat [M, F] of points [M, 3] towards the surface along dirs [M, 3] (paper eq. radiance_feat).
+
+        Geometry features [M, G] as the radiance network gets them, or those of an MLP of position and direction.
+        """
+        return features if self.fields.appearance is None else self.fields.appearance(points, dirs)
+
+    def appearance_loss(self, batch: RayBatch, rendered: Rendered) -> torch.Tensor:
+        """Colour error of the feature MLP at the surface points: what trains it in the stable form.
+
+        Zero without the MLP. In the paper nothing trains it.
+        """
+        mlp, params = self.fields.appearance, self.params
+        hit = torch.nonzero(rendered.opacity.detach() > OPAQUE).squeeze(1)[: params.planar_rays]
+        if mlp is None or params.planar != "stable" or len(hit) == 0:
+            return torch.zeros((), device=self.device)
+        surface = rendered.surface(batch)[0].detach()[hit]
+        predicted = mlp.color(mlp(surface, batch.directions[hit]))
+        return losses.rgb_error(predicted, batch.colors[hit]).mean()
+
+    # ------------------------------------------------------------------ planar term
+    def planar_loss(self, batch: RayBatch, rendered: Rendered, moment: Moment) -> torch.Tensor:
+        """Mean planar error around the surface points of some of the rays, adaptively weighted (paper L_planar).
+
+        The paper's neighbours lie on the ray before the surface; in the stable form half of them do, the others lie on
+        a disk in the tangent plane, and the reach shrinks to three voxels.
+        """
+        params = self.params
+        nothing = torch.zeros((), device=self.device)
+        if params.planar == "off":
+            return nothing
+        chosen = torch.nonzero(rendered.opacity.detach() > OPAQUE).squeeze(1)[: params.planar_rays]
+        if len(chosen) == 0:
+            return nothing
+        surface, normals = (part.detach()[chosen] for part in rendered.surface(batch))
+        dirs = batch.directions[chosen]
+        radius = params.planar_radius
+        if params.planar == "stable":
+            finest = 3 * self.fields.shape.sdf_grid.voxel_size()
+            radius = schedules.exponential(moment.progress, radius, min(finest, radius))
+        offsets = self._neighbors(normals, dirs, radius)
+        count = offsets.shape[1]
+        neighbors = (surface[:, None] + offsets).reshape(-1, 3)
+        places = torch.cat([surface, neighbors])
+        sdf, features, gradients = self.fields.sdf(places, moment.levels)
+        # c_feat looks from x_k at the surface; at x_0 itself, along the ray.
+        towards = torch.cat([dirs, torch.nn.functional.normalize(-offsets.reshape(-1, 3), dim=1)])
+        features = self._appearance(places, towards, features)
+        center, around = features[: len(chosen)], features[len(chosen) :].view(len(chosen), count, -1)
+        unit_normals = torch.nn.functional.normalize(gradients[: len(chosen)], dim=1)
+        sdf_center, sdf_around = sdf[: len(chosen)], sdf[len(chosen) :].view(len(chosen), count)
+        if params.planar == "paper":
+            weight = losses.planarity_literal(around, center)
+            error = losses.planar_error_literal(sdf_around, unit_normals, offsets)
+        else:
+            weight = losses.planarity(around, center)
+            error = losses.planar_error(sdf_around, sdf_center, unit_normals, offsets, radius)
+        return (weight * error).mean()
+
+    def _neighbors(self, normals: torch.Tensor, dirs: torch.Tensor, radius: float) -> torch.Tensor:
+        """Offsets [Q, J, 3] of neighbours from surface points with normals [Q, 3], seen along dirs [Q, 3]."""
+        shape = (len(normals), self.params.planar_neighbors)
+        reach = radius * torch.rand(*shape, 1, generator=self.generator, device=self.device)
+        on_ray = -dirs[:, None].expand(*shape, 3)
+        if self.params.planar == "paper":
+            return on_ray * reach
+        draws = torch.randn(*shape, 3, generator=self.generator, device=self.device)
+        tangent = draws - torch.einsum("qkc,qc->qk", draws, normals)[..., None] * normals[:, None]
+        disk = torch.nn.functional.normalize(tangent, dim=2) * (reach * radius).sqrt()  # even over the disk's area
+        half = torch.arange(shape[1], device=self.device) % 2 == 0
+        return torch.where(half[None, :, None], on_ray * reach, disk)
+
+    # ------------------------------------------------------------------ Eikonal relaxation
+    def relaxation(self, batch: RayBatch, rendered: Rendered, ray_error: torch.Tensor) -> torch.Tensor:
+        """Weight omega [N] of the Eikonal term at the rays' samples, ray_error [R] the colour error (paper
+        eq. adaptive_weight).
+
+        The paper's form weighs every sample and carries gradients; the stable form only those near surfaces.
+        """
+        params = self.params
+        omega = torch.ones_like(rendered.weights).view(-1)
+        if params.eikonal == "plain":
+            return omega
+        gamma, clip, num_samples = params.relaxation_gamma, params.relaxation_clip, rendered.weights.shape[1]
+        if params.eikonal == "stable":
+            places = torch.nonzero(rendered.weights.detach().view(-1) > _NEAR_SURFACE_WEIGHT).squeeze(1)
+        else:
+            places = torch.arange(len(omega), device=self.device)
+        if len(places) == 0:
+            return omega
+        ray = places // num_samples
+        surface = rendered.surface(batch)[0].detach()
+        if self.fields.appearance is None:
+            center = rendered.mean(rendered.features)[ray]
+        else:
+            center = self.fields.appearance(surface, batch.directions)[ray]
+        towards = torch.nn.functional.normalize(surface[ray] - rendered.points[places], dim=1)
+        features = self._appearance(rendered.points[places], towards, rendered.features[places])
+        if params.eikonal == "paper":
+            planarity = losses.planarity_literal(features[:, None], center)[:, 0]
+            return losses.eikonal_relaxation_literal(ray_error[ray], planarity, gamma, clip)
+        planarity = losses.planarity(features[:, None], center)[:, 0]
+        return omega.index_copy(0, places, losses.eikonal_relaxation(ray_error[ray], planarity, gamma, clip))

@@ -1,0 +1,170 @@
+"""The method's parts in a whole training step: each form of each does something, and only what it should."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from sphere_scene import RADIUS
+from test_train import TINY, make_trainer
+
+from configs.load import load_config
+from configs.params import TrainParams
+from stages.neural.trainer import Trainer
+
+FORMS = {
+    "ambiguity": ["paper", "stable"],
+    "reflection": ["paper", "stable"],
+    "planar": ["paper", "stable"],
+    "eikonal": ["paper", "stable"],
+    "density": ["neus"],
+    "scale": ["learned"],
+    "gradients": ["numerical"],
+    "encoding": ["frequency"],
+    "sampler": ["proposal"],
+}
+OFF = {name: TrainParams.model_fields[name].default for name in FORMS} | {
+    "ambiguity": "off", "reflection": "off", "planar": "off", "eikonal": "plain",
+}  # fmt: skip
+
+
+def rough_trainer(**settings) -> Trainer:
+    """A trainer whose surface is dented: a perfect sphere has no Eikonal error and mirrors nothing of itself."""
+    trainer = make_trainer(TINY.model_copy(update={**OFF, "scale_start": 0.02, **settings}))
+    generator = torch.Generator().manual_seed(0)
+    with torch.no_grad():
+        if trainer.fields.sdf.table is not None:
+            trainer.fields.sdf.table += 0.02 * torch.randn(trainer.fields.sdf.table.shape, generator=generator)
+    return trainer
+
+
+def put_on_a_floor(trainer: Trainer) -> None:
+    """Let the cached grid say that the ball stands on a floor, which it mirrors; the networks know nothing of it."""
+    cache, side = trainer.cache, trainer.cache.resolution
+    places = cache.points(torch.arange(side**3))
+    floor = places[:, 2] + TINY.sphere_radius
+    cache.values.view(-1).copy_(torch.minimum(places.norm(dim=1) - TINY.sphere_radius, floor))
+    trainer.cache_step = trainer.step_index
+
+
+def gradients_of(trainer: Trainer) -> dict[str, torch.Tensor]:
+    return {name: p.grad for name, p in trainer.fields.named_parameters() if p.grad is not None}
+
+
+@pytest.mark.parametrize(("setting", "form"), [(name, form) for name, forms in FORMS.items() for form in forms])
+def test_each_form_of_each_part_changes_the_gradients_of_a_step(setting, form):
+    floor = {"cache_resolution": 64, "reflection_reach": 0.5}
+    base, other = rough_trainer(**floor), rough_trainer(**{**floor, setting: form})
+    for trainer in (base, other):
+        put_on_a_floor(trainer)
+    numbers = [trainer.step(0.5) for trainer in (base, other)]
+    assert {k for k, v in numbers[1].items() if not torch.isfinite(v)} == set()
+    before, after = gradients_of(base), gradients_of(other)
+    assert all(torch.isfinite(g).all() for g in after.values())
+    changed = [
+        name
+        for name in after
+        if name not in before
+        or before[name].shape != after[name].shape
+        or (before[name] - after[name]).abs().max() > 1e-3 * before[name].abs().max()
+    ]
+    assert any(name.startswith("sdf.") for name in changed)
+
+
+def test_terms_that_are_off_count_nothing():
+    trainer = rough_trainer()
+    numbers = trainer.step(0.5)
+    assert (numbers["planar"], numbers["reflected"]) == (0, 0)
+    assert {name.split(".")[0] for name, _ in trainer.fields.named_parameters()} == {
+        "sdf", "radiance", "background", "log_gains",
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(("visibility", "doubt"), [("paper", 0.9), ("stable", 0.7), ("mesh", 0.7)])
+def test_the_ambiguity_weight_trusts_a_painted_ball_and_doubts_a_shifting_one(visibility, doubt):
+    """Every second photo shows other colours: rays on the ball are doubted there; the background keeps its weight."""
+    settings = {"ambiguity": "stable", "visibility": visibility, "sphere_radius": RADIUS, "scale_start": 0.01}
+    trainer = make_trainer(TINY.model_copy(update=settings))
+    moment = trainer.moment(0.5)
+    trainer._refresh_cache(moment)
+    batch = trainer.photos.draw(400, torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        rendered = trainer.render(batch, 0.5, torch.zeros(0, 3), None)
+    on_ball = rendered.opacity > 0.9
+    assert 50 < int(on_ball.sum()) < 350
+
+    def trust(progress: float = 0.5) -> torch.Tensor:
+        return trainer.terms.trust(batch, rendered, rendered.colors, trainer.moment(progress))
+
+    consistent = trust()
+    assert consistent.mean().item() == pytest.approx(1)
+    assert torch.equal(trust(0.1), torch.ones(400))  # not yet
+    pixels = trainer.photos.pixels.view(8, -1, 3)
+    pixels[::2] = 255 - pixels[::2]
+    shifting = trust()
+    ratio = [weights[on_ball].mean() / weights[~on_ball].mean() for weights in (consistent, shifting)]
+    assert ratio[0] > 0.5  # the ball is painted finer than these small photos show
+    assert ratio[1] < doubt * ratio[0]  # the paper's visibility leaves few views to disagree
+
+
+def test_the_papers_weight_carries_a_gradient_and_the_stable_one_none():
+    for form, carries in (("paper", True), ("stable", False)):
+        settings = {"ambiguity": form, "sphere_radius": RADIUS, "scale_start": 0.01}
+        trainer = make_trainer(TINY.model_copy(update=settings))
+        trainer._refresh_cache(trainer.moment(0.5))
+        batch = trainer.photos.draw(200, torch.Generator().manual_seed(0))
+        rendered = trainer.render(batch, 0.5, torch.zeros(0, 3), None)
+        weights = trainer.terms.trust(batch, rendered, rendered.colors, trainer.moment(0.5))
+        assert weights.requires_grad is carries
+
+
+def test_a_learned_scale_learns_and_a_scheduled_one_ends_at_its_end():
+    trainer = rough_trainer(scale="learned")
+    before = trainer.moment(0.5).width
+    assert before == pytest.approx(0.02, rel=1e-5)
+    trainer.step(0.5)
+    assert trainer.moment(0.5).width != before
+    scheduled = rough_trainer(scale_end=0.011)
+    half_voxel = 0.5 * scheduled.fields.shape.sdf_grid.voxel_size()
+    assert scheduled.moment(1.0).width == pytest.approx(max(0.011, half_voxel))
+
+
+def test_reflection_waits_for_its_start_and_colours_only_rays_that_meet_something():
+    trainer = rough_trainer(reflection="stable", reflection_reach=0.5, cache_resolution=64)
+    put_on_a_floor(trainer)
+    batch = trainer.photos.draw(400, torch.Generator().manual_seed(0))
+    nothing = torch.zeros(0, 3)
+    with torch.no_grad():
+        early, late = (trainer.render(batch, progress, nothing, None) for progress in (0.2, 0.5))
+        trainer.fields.reflection = None
+        plain = trainer.render(batch, 0.5, nothing, None)
+    assert early.reflected.abs().max() == 0
+    met, hit = late.reflected > 0, late.opacity > 0.5
+    assert 0 < int(met.sum()) < int(hit.sum())
+    assert not met[~hit].any()
+    torch.testing.assert_close(late.colors[~met], plain.colors[~met])
+    assert (late.colors[met] - plain.colors[met]).abs().max() > 1e-4
+
+
+@pytest.mark.parametrize("backbone", ["neus2", "hfneus", "neuralangelo"])
+def test_every_backbone_trains(backbone):
+    config = load_config(None, None, [f"train.backbone={backbone}"]).train
+    stated = {name: getattr(config, name) for name in config.model_fields_set}
+    small = {name: getattr(TINY, name) for name in TINY.model_fields_set}
+    trainer = make_trainer(TrainParams(**{**stated, **small}))
+    first, second = (trainer.step(progress) for progress in (0.3, 0.31))
+    assert torch.isfinite(first["loss"])
+    assert second["rgb"] < first["rgb"] * 1.5
+    assert all(p.grad is not None for p in trainer.fields.parameters())
+
+
+def test_the_papers_preset_steps_with_small_networks():
+    config = load_config("paper").train
+    small = {name: getattr(TINY, name) for name in TINY.model_fields_set} | {
+        "planar_rays": 16, "visibility_samples": 8, "reflection_samples": 4, "proposal_samples": 16, "finest": 64,
+        "sdf_layers": 3, "sparse_batch": 0,
+    }  # fmt: skip
+    trainer = make_trainer(config.model_copy(update=small))
+    numbers = [trainer.step(progress) for progress in (0.0, 0.01)]
+    assert all(torch.isfinite(value) for value in numbers[1].values())
+    assert numbers[1]["planar"] > 0
+    assert numbers[1]["reflected"] > 0.1  # S is at least about a half on every ray that hits
