@@ -180,7 +180,7 @@ def _last_numbers(metrics: Path) -> dict[str, float]:
 
 TRAIN = Stage(
     name="train",
-    version=1,
+    version=2,
     needs=("undistort",),
     params="train",
     run=run,

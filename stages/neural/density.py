@@ -10,7 +10,7 @@ import torch
 
 # Below this change of f over a section, in units of b, the mid-point rule replaces the difference quotient, which
 # would lose all its digits in float32; the mid-point's relative error there is (0.05)^2 / 24 ~ 1e-4.
-_FLAT = 0.05
+FLAT = 0.05
 
 
 def laplace_density(sdf: torch.Tensor, scale: torch.Tensor | float) -> torch.Tensor:
@@ -50,7 +50,7 @@ def section_optical_depth(
     whole section; delta / b deep inside.
     """
     change = sdf_end - sdf_start
-    flat = change.abs() < _FLAT * scale
+    flat = change.abs() < FLAT * scale
     quotient = (_density_integral(sdf_start, scale) - _density_integral(sdf_end, scale)) / torch.where(
         flat, torch.ones_like(change), change
     )

@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 import torch
 
-from stages.neural.density import _FLAT, section_optical_depth
+from stages.neural.density import FLAT, section_optical_depth
 from stages.neural.rendering import weights_from_optical_depth
 
 # Part of the samples spread evenly over the ray, so that a surface the cache has missed can still be found.
@@ -111,7 +111,7 @@ def importance_distances(
     distances = torch.empty(places.shape)
     rays = (tensor.contiguous().numpy() for tensor in (origins, directions, entry, leave, places))
     kernels.importance_distances(
-        cache.values[0, 0].numpy(), *rays, scale, _FLAT, EVEN_SHARE, _EVEN_FLOOR, num_bins, distances.numpy()
+        cache.values[0, 0].numpy(), *rays, scale, FLAT, EVEN_SHARE, _EVEN_FLOOR, num_bins, distances.numpy()
     )
     return distances
 
