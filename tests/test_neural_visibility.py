@@ -244,10 +244,14 @@ def test_the_paper_s_precision_is_the_plain_inverse_and_fails_on_grey_photos():
     draw = torch.Generator().manual_seed
     photos = Photos(cameras, images, None, "cpu")
     literal = vis.color_precision(photos, draw(0), floor=0.0)
-    rows = torch.randint(len(photos.pixels), (100_000,), generator=draw(0))
-    expected = np.linalg.inv(np.cov(photos.pixels[rows].numpy().T / 255.0))
-    torch.testing.assert_close(literal, torch.from_numpy(expected).float(), rtol=1e-4, atol=1e-4)
+    expected = np.linalg.inv(np.cov(photos.pixels.numpy().T / 255.0))
+    assert np.abs(literal.numpy() - expected).max() < 0.05 * np.abs(expected).max()
     assert not torch.equal(literal, vis.color_precision(photos, draw(0)))
+
+    half = torch.arange(8) < 4  # photos that are held out have no say
+    painted = [image if known else np.zeros_like(image) for image, known in zip(images, half, strict=True)]
+    known, all_known = (vis.color_precision(Photos(cameras, painted, None, "cpu", t), draw(0)) for t in (half, None))
+    assert (known - all_known).abs().max() > 1
 
     grey = Photos(cameras, [image[..., :1].repeat(3, 2) for image in images], None, "cpu")
     with pytest.raises(ReconstructionError, match="ambiguity=paper"):

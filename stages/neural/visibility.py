@@ -170,7 +170,10 @@ def color_precision(
     `floor` is added to each channel's variance. The paper adds none (0): photos in shades of one colour then have no
     inverse, a `ReconstructionError`.
     """
-    rows = torch.randint(len(photos.pixels), (num_pixels,), generator=generator, device=photos.device)
+    training = torch.nonzero(photos.training).squeeze(1)
+    images = training[torch.randint(len(training), (num_pixels,), generator=generator, device=photos.device)]
+    place = torch.rand(num_pixels, generator=generator, device=photos.device, dtype=torch.float64)
+    rows = photos.first[images] + (place * photos.sizes[images].prod(1)).long()
     covariance = torch.cov((photos.pixels[rows].double() / 255).T) + floor * torch.eye(3, device=photos.device)
     if torch.linalg.matrix_rank(covariance, rtol=_SINGULAR, hermitian=True) < 3:
         raise ReconstructionError(
