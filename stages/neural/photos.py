@@ -98,9 +98,10 @@ class Photos:
         """
         in_pixels = torch.einsum("iab,pib->pia", self.pixel_from_scene, points[:, None] - self.centers)
         depth = in_pixels[..., 2]
-        pixels = (in_pixels[..., :2] / depth.clamp(min=1e-6).unsqueeze(2)).floor().long()
-        inside = (depth > 0) & (pixels >= 0).all(2) & (pixels < self.sizes).all(2)
-        rows = self.first + pixels[..., 1] * self.sizes[:, 0] + pixels[..., 0]
+        x, y = (in_pixels[..., :2] / depth.clamp(min=1e-6).unsqueeze(2)).floor().long().unbind(2)
+        width, height = self.sizes.unbind(1)
+        inside = (depth > 0) & (x >= 0) & (x < width) & (y >= 0) & (y < height)
+        rows = self.first + y * width + x
         return self.pixels[rows.masked_fill(~inside, 0)].float() / 255, inside
 
     def rays(self, images: torch.Tensor, pixels: torch.Tensor, limit: int | None = None) -> RayBatch:

@@ -55,25 +55,32 @@ class Terms:
         off = params.ambiguity == "off" or (params.ambiguity == "stable" and moment.progress < params.ambiguity_from)
         if off:
             return torch.ones(len(batch.leave), device=self.device)
-        colors, seen = self._views(batch, rendered, moment)
+        hit = torch.nonzero(rendered.opacity.detach() > OPAQUE).squeeze(1)
+        colors, seen = self._views(hit, batch, rendered, moment)
         if params.ambiguity == "paper":
-            distance = visibility.mahalanobis(exposed[:, None], colors, self.color_precision)
-            return visibility.trust_literal(visibility.ambiguity(seen, distance))
-        gains = torch.exp(self.fields.log_gains.detach())
-        own = batch.colors / gains[batch.images]
-        distance = visibility.mahalanobis(own[:, None], colors / gains, self.color_precision)
-        return visibility.trust(visibility.ambiguity(seen, distance))
+            own, weights = exposed[hit], visibility.trust_literal
+        else:
+            gains = torch.exp(self.fields.log_gains.detach())
+            own, colors, weights = batch.colors[hit] / gains[batch.images[hit]], colors / gains, visibility.trust
+        distance = visibility.mahalanobis(own[:, None], colors, self.color_precision)
+        doubt = torch.zeros(len(batch.leave), device=self.device)  # none where no surface was met
+        return weights(doubt.index_copy(0, hit, visibility.ambiguity(seen, distance)))
 
     @torch.no_grad()
-    def _views(self, batch: RayBatch, rendered: Rendered, moment: Moment) -> tuple[torch.Tensor, torch.Tensor]:
-        """What every photo shows at each ray's surface point: colours [R, I, 3] and the visibility factor [R, I]."""
+    def _views(
+        self, hit: torch.Tensor, batch: RayBatch, rendered: Rendered, moment: Moment
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """What every photo shows at the surface points of rays `hit` [M]: colours [M, I, 3], visibility factor [M, I].
+
+        The factor is 0 in the ray's own photo, in those not trained on, and where the point is out of frame.
+        """
         params, photos = self.params, self.photos
-        surface, normals = rendered.surface(batch)
+        surface, normals = (part[hit] for part in rendered.surface(batch))
         to_cameras = torch.nn.functional.normalize(photos.centers - surface[:, None], dim=2)
-        facing = torch.einsum("ra,ria->ri", normals, to_cameras)
+        facing = torch.einsum("ma,mia->mi", normals, to_cameras)
         colors, in_frame = photos.observe(surface)
-        others = torch.arange(len(photos), device=self.device) != batch.images[:, None]
-        candidates = in_frame & others & photos.training & (rendered.opacity > OPAQUE)[:, None]
+        others = torch.arange(len(photos), device=self.device) != batch.images[hit, None]
+        candidates = in_frame & others & photos.training
         if params.visibility != "paper":
             candidates &= facing > 0
         ray, view = torch.nonzero(candidates, as_tuple=True)
