@@ -1,6 +1,6 @@
 """Layers of settings to one `Config`: defaults < preset < --config file < --set.
 
-Where a layer names `train.backbone`, the settings of that backbone lie right below it.
+Where one of them names `train.backbone`, the settings of that backbone lie right below it; all of --set is one layer.
 
 Every refusal names the setting, where it was written, and the nearest one there is.
 """
@@ -8,6 +8,7 @@ Every refusal names the setting, where it was written, and the nearest one there
 from __future__ import annotations
 
 import difflib
+import itertools
 import re
 import types
 import typing
@@ -57,21 +58,21 @@ def load_config(preset: str | None = None, file: Path | None = None, sets: Seque
     Raises:
         ConfigError: a file cannot be read or parsed, a key is unknown, a value is out of bounds.
     """
-    layers: list[tuple[str, dict[str, Any]]] = []
+    groups: list[list[tuple[str, dict[str, Any]]]] = []
     if preset is not None:
-        layers.append((f"preset '{preset}'", _parse(preset_text(preset), f"preset '{preset}'")))
+        groups.append([(f"preset '{preset}'", _parse(preset_text(preset), f"preset '{preset}'"))])
     if file is not None:
-        layers.append((str(file), _parse(_read(file), str(file))))
-    layers += [(f"--set {text}", _parse_set(text)) for text in sets]
+        groups.append([(str(file), _parse(_read(file), str(file)))])
+    groups.append([(f"--set {text}", _parse_set(text)) for text in sets])
 
     merged: dict[str, Any] = {}
     origins: dict[str, str] = {}
-    for origin, layer in layers:
-        layer = _checked(layer, origin)
-        backbone = layer.get("train", {}).get("backbone")
-        for origin_of_part, part in (*_backbone(backbone), (origin, layer)):
-            merged = _merge(merged, part)
-            origins.update({key: origin_of_part for key in _dotted(part)})
+    for group in groups:
+        layers = [(origin, _checked(layer, origin)) for origin, layer in group]
+        backbones = [_backbone(layer.get("train", {}).get("backbone")) for _, layer in layers]
+        for origin, layer in (*itertools.chain(*backbones), *layers):
+            merged = _merge(merged, layer)
+            origins.update({key: origin for key in _dotted(layer)})
     try:
         return Config.model_validate(merged)
     except ValidationError as error:

@@ -151,8 +151,12 @@ class TrainParams(Section):
     sdf_width: int = Field(64, ge=4, description="width of the SDF's hidden layers")
     radiance_layers: int = Field(2, ge=1, le=16, description="hidden layers of the radiance MLP")
     radiance_width: int = Field(64, ge=4, description="width of the radiance MLP's hidden layers, and of the others")
+    radiance_inputs: Literal["view", "reflected"] = Field(
+        "reflected",
+        description="what the radiance MLP knows of the view: its direction, or the reflected one and n.v too",
+    )
     gradients: Literal["analytic", "numerical"] = Field(
-        "analytic", description="SDF gradients by differentiation, or by central differences one active voxel wide"
+        "analytic", description="SDF gradients by differentiation, or central differences one active voxel to each side"
     )
     sphere_radius: float = Field(0.5, gt=0, lt=1, description="the SDF is this sphere before training, scene units")
 
@@ -188,8 +192,10 @@ class TrainParams(Section):
         "off", description="trust photos less where the others that see a place disagree"
     )
     ambiguity_from: float = Field(0.2, ge=0, le=1, description="progress at which the stable form begins")
-    visibility: Literal["paper", "stable", "mesh"] = Field(
-        "stable", description="how the ambiguity weight finds out which photos see a place"
+    visibility: Literal["network", "paper", "stable", "mesh"] = Field(
+        "stable",
+        description="how the ambiguity weight finds out which photos see a place: the paper's product over the SDF "
+        "network or (`paper`) over its cached grid, the smallest SDF on the path, or rays cast at a mesh",
     )
     visibility_sharpness: float = Field(100.0, gt=0, description="sigmoid sharpness beta, per scene unit")
     visibility_samples: int = Field(64, ge=2, description="samples on a path; the CPU's stable form traces instead")
@@ -210,13 +216,14 @@ class TrainParams(Section):
     planar_features: Literal["radiance", "mlp"] = Field(
         "radiance", description="appearance features: those the radiance MLP gets, or those of an MLP of its own"
     )
-    weight_planar: float = Field(1.0, ge=0, description="weight of the planar term at the end; a tenth at the start")
+    weight_planar: float = Field(1.0, ge=0, description="weight of the planar term")
+    planar_start: float = Field(0.1, gt=0, le=1, description="lambda_pla is scaled by this at the start and by 1 later")
     planar_radius: float = Field(
         0.05, gt=0, description="reach of the planar term at the start, scene units; three voxels at the end"
     )
     planar_rays: int = Field(256, ge=1, description="rays per step that the planar term looks at")
     planar_neighbors: int = Field(4, ge=1, description="places around each of their surface points")
-    planar_until: float = Field(1.0, gt=0, le=1, description="progress at which the planar term has its full weight")
+    planar_until: float = Field(1.0, gt=0, le=1, description="progress from which lambda_pla is not scaled down")
 
     eikonal: Literal["plain", "paper", "stable"] = Field(
         "plain", description="hold the SDF's gradient to length 1 evenly, or less where the photos are not met yet"

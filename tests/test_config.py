@@ -116,3 +116,36 @@ def test_absent_file_and_unknown_preset(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="no preset 'tinny'") as caught:
         load_config("tinny")
     assert "Did you mean `--preset tiny`?" in caught.value.hint
+
+
+BACKBONES = {
+    "hineus": ("laplace", "scheduled", "analytic", "hash"),
+    "neus2": ("neus", "learned", "analytic", "hash"),
+    "hfneus": ("neus", "learned", "analytic", "frequency"),
+    "neuralangelo": ("neus", "learned", "numerical", "hash"),
+}
+
+
+@pytest.mark.parametrize("name", BACKBONES)
+def test_a_backbone_sets_density_scale_gradients_and_encoding(name):
+    train = load_config("cpu", None, [f"train.backbone={name}"]).train
+    assert (train.density, train.scale, train.gradients, train.encoding) == BACKBONES[name]
+
+
+@pytest.mark.parametrize("backwards", [False, True])
+def test_what_is_named_beside_a_backbone_wins_in_any_order(backwards):
+    sets = ["train.backbone=neuralangelo", "train.density=laplace"]
+    train = load_config("cpu", None, sets[::-1] if backwards else sets).train
+    assert (train.density, train.gradients) == ("laplace", "numerical")
+
+
+def test_a_backbone_over_a_file_that_states_everything_wins_and_below_it_does_not(tmp_path):
+    file = tmp_path / "config.yaml"
+    file.write_text(config_yaml(load_config("cpu", None, ["train.backbone=neus2", "train.density=laplace"])))
+    assert load_config(None, file).train.density == "laplace"
+    assert load_config(None, file, ["train.backbone=neus2"]).train.density == "neus"
+
+
+def test_an_unknown_backbone_is_refused_with_those_there_are():
+    with pytest.raises(ConfigError, match=r"hineus \| neus2"):
+        load_config("cpu", None, ["train.backbone=../presets/cpu"])

@@ -13,8 +13,8 @@ from stages.neural.fields import BEND, Fields, FieldShape, SdfNetwork, smooth_re
 
 GRID = HashGrid(levels=4, features=4, log2_rows=10, coarsest=4, finest=24)
 SHAPE = FieldShape(
-    sdf_grid=GRID, sdf_layers=1, sdf_width=16, radiance_layers=1, radiance_width=8, features=3, sphere_radius=0.4,
-    background_grid=None, num_images=2,
+    sdf_grid=GRID, sdf_layers=1, sdf_width=16, radiance_layers=1, radiance_width=8, reflected=True, features=3,
+    sphere_radius=0.4, background_grid=None, num_images=2,
 )  # fmt: skip
 SHAPES = {
     "hash": SHAPE,

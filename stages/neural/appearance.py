@@ -30,8 +30,9 @@ def positional_encoding(x: torch.Tensor, frequencies: int) -> torch.Tensor:
 class FeatureMlp(nn.Module):
     """c_feat(x, v) = MLP(gamma(x, 10), gamma(v, 4)), ReLU, the inputs joined in again after the fourth layer.
 
-    The paper names no loss that trains it. `color`, a linear head on the features, gives it one: features that explain
-    the photos' colours tell an edge from an even place. With untrained features lambda_pla is that of random ones.
+    The paper names no loss that trains it: only its own weight lambda_pla does, which pulls features apart. `color`, a
+    linear head on the features, gives it one: features that explain the photos' colours tell an edge from an even
+    place.
     """
 
     def __init__(self, generator: torch.Generator, layers: int = 8, width: int = 256) -> None:

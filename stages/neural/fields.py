@@ -73,6 +73,7 @@ class FieldShape:
         sdf_grid: encoding of the SDF: a hash grid, or frequencies.
         sdf_layers, sdf_width: hidden layers of the SDF's MLP.
         radiance_layers, radiance_width: hidden layers of the radiance MLP; the other networks are as wide.
+        reflected: whether the radiance MLP gets the reflected direction and n.v beside the view.
         features: geometry features handed from the SDF network to the radiance network.
         sphere_radius: radius of the sphere that the SDF is before training.
         background_grid: hash encoding of the background, or None without one.
@@ -87,6 +88,7 @@ class FieldShape:
     sdf_width: int
     radiance_layers: int
     radiance_width: int
+    reflected: bool
     features: int
     sphere_radius: float
     background_grid: HashGrid | None
@@ -171,15 +173,16 @@ class SdfNetwork(nn.Module):
 
 
 class RadianceNetwork(nn.Module):
-    """Colour from position, normal, view and reflected direction, facing ratio and geometry features.
+    """Colour from position, normal, view direction and geometry features; and reflected direction and facing ratio.
 
     The reflected direction lets a mirror-like surface be explained by its surroundings instead of by dents
-    (Ref-NeRF); n.v carries the Fresnel-like brightening towards grazing angles.
+    (Ref-NeRF); n.v carries the Fresnel-like brightening towards grazing angles. The paper's network has neither.
     """
 
     def __init__(self, shape: FieldShape, generator: torch.Generator) -> None:
         super().__init__()
-        inputs = shape.features + 3 + 3 + 3 + 1 + 15
+        self.reflected = shape.reflected
+        inputs = shape.features + 3 + 3 + 3 + (1 + 15 if shape.reflected else 0)
         self.layers = mlp([inputs, *[shape.radiance_width] * shape.radiance_layers, 3], generator)
 
     def forward(
@@ -190,9 +193,10 @@ class RadianceNetwork(nn.Module):
         features: torch.Tensor,
     ) -> torch.Tensor:
         """sRGB colour [N, 3] in [0, 1]; normals are unit, view_dirs [N, 3] unit from camera to point."""
-        facing = (normals * view_dirs).sum(1, keepdim=True)
-        reflected = view_dirs - 2 * facing * normals
-        inputs = [features, points, normals, view_dirs, facing, spherical_harmonics(reflected)]
+        inputs = [features, points, normals, view_dirs]
+        if self.reflected:
+            facing = (normals * view_dirs).sum(1, keepdim=True)
+            inputs += [facing, spherical_harmonics(view_dirs - 2 * facing * normals)]
         return torch.sigmoid(self.layers(torch.cat(inputs, 1)))
 
 

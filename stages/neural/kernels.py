@@ -336,15 +336,12 @@ def _trilinear(values, x, y, z):
     return (one - fz) * low + fz * high
 
 
-# A path is solid, and its walk over, once f falls below this: a visibility of 0 to the last digit (100 f + 3 < -7).
-_SOLID = np.float32(-0.1)
-
-
 @njit(parallel=True, **_OPTIONS)
-def smallest_on_paths(values, points, targets, start, smallest):
+def smallest_on_paths(values, points, targets, start, solid, smallest):
     """Fill smallest [P] with the least cached f met by sphere tracing from points [P, 3] towards targets [P, 3].
 
-    A step is f long, or half a cell where f is smaller; the walk ends at the target, at the unit sphere, or inside.
+    A step is f long, or half a cell where f is smaller; the walk ends at the target, at the unit sphere, or where f
+    falls below `solid`.
     """
     num_points = len(points)
     half_cell = np.float32(1.0 / (values.shape[0] - 1))
@@ -362,7 +359,7 @@ def smallest_on_paths(values, points, targets, start, smallest):
                     break
                 f = _trilinear(values, px, py, pz)
                 least = min(least, f)
-                if f < _SOLID:
+                if f < solid:
                     break
                 t += max(f, half_cell)
             smallest[p] = least

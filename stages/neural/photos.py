@@ -92,17 +92,20 @@ class Photos:
         return self.rays(images, pixels, limit=num_rays)
 
     def observe(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """What every photo shows at scene points [P, 3]: colours [P, I, 3] in [0, 1] and whether it is in frame [P, I].
+        """What every photo shows at scene points [P, 3]: colours [P, I, 3] in [0, 1] and whether it may show it [P, I].
 
-        The nearest pixel; its colour means nothing where the point is out of frame or behind the camera.
+        The nearest pixel. A photo cannot show a point that is out of frame, behind the camera or, where there are
+        masks, off the photo's mask; the colour means nothing then.
         """
         in_pixels = torch.einsum("iab,pib->pia", self.pixel_from_scene, points[:, None] - self.centers)
         depth = in_pixels[..., 2]
         x, y = (in_pixels[..., :2] / depth.clamp(min=1e-6).unsqueeze(2)).floor().long().unbind(2)
         width, height = self.sizes.unbind(1)
         inside = (depth > 0) & (x >= 0) & (x < width) & (y >= 0) & (y < height)
-        rows = self.first + y * width + x
-        return self.pixels[rows.masked_fill(~inside, 0)].float() / 255, inside
+        rows = (self.first + y * width + x).masked_fill(~inside, 0)
+        if self.masks is not None:
+            inside &= self.masks[rows] > 127
+        return self.pixels[rows].float() / 255, inside
 
     def rays(self, images: torch.Tensor, pixels: torch.Tensor, limit: int | None = None) -> RayBatch:
         """Rays through the centres of integer pixels [R, 2] (x, y) of photos [R]; those that miss are dropped."""

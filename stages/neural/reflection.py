@@ -15,7 +15,7 @@ from torch import nn
 from stages.neural.density import laplace_density, section_optical_depth
 from stages.neural.mlp import mlp, spherical_harmonics
 from stages.neural.rendering import weights_from_optical_depth
-from stages.neural.sampling import SdfCache, stratified
+from stages.neural.sampling import SdfCache, free_outside, stratified
 
 # A ray on which f falls slower than this per unit of length runs along a surface, not into it: within 3 degrees. Else
 # rounding and the grid's facets alone would make a flat mirror reflect itself at grazing angles.
@@ -107,7 +107,8 @@ def trace_reflections(
     """
     start = reflection_start(scale, max(voxel, cache.cell))
     along = start + reach * torch.linspace(0, 1, num_samples, device=points.device)
-    sdf = cache.lookup(points[:, None] + along[:, None] * directions[:, None])
+    places = points[:, None] + along[:, None] * directions[:, None]
+    sdf = free_outside(cache.lookup(places), torch.linalg.vector_norm(places, dim=2))
     probability, distance = reflection_probability(sdf, along.expand_as(sdf), scale)
     return probability, points + distance[:, None] * directions
 

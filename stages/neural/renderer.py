@@ -58,7 +58,7 @@ class Rendered:
 
     def mean(self, values: torch.Tensor) -> torch.Tensor:
         """Mean [R, D] of values [N, D] over each ray's surface; means something only where the ray is opaque."""
-        summed = composite(self.weights, values.view(*self.weights.shape, -1))
+        summed = composite(self.weights, values.view(*self.weights.shape, values.shape[-1]))
         return summed / self.opacity.clamp(min=1e-3)[:, None]
 
     def surface(self, batch: RayBatch) -> tuple[torch.Tensor, torch.Tensor]:
@@ -127,13 +127,14 @@ class Renderer:
     ) -> Rendered:
         """C' = (1 - rho S) C + rho S g of the rays that met a surface (paper, Self-Reflection Compensation).
 
-        In the stable form S, x_r and n_r carry no gradient, and rays whose reflection meets nothing stay as they are.
+        In the paper's form S carries a gradient to f along the reflected ray, though not to where the ray lies. In the
+        stable form S, x_r and n_r carry none, and rays whose reflection meets nothing stay as they are.
         """
         network, params = self.fields.reflection, self.params
         if network is None or (params.reflection == "stable" and moment.progress < params.reflection_from):
             return rendered
         hit = torch.nonzero(rendered.opacity.detach() > OPAQUE).squeeze(1)
-        surface, normals = (part[hit] for part in rendered.surface(batch))
+        surface, normals = (part.detach()[hit] for part in rendered.surface(batch))
         if params.reflection == "paper":
             dirs = reflection.reflect(batch.directions[hit], normals)
             along = reflection.uniform_points(
@@ -145,7 +146,6 @@ class Renderer:
             points, gradients = (reflection.nearest_to_surface(sdf, each.view_as(along)) for each in (along, gradients))
             reflectivity = torch.ones_like(probability)
         else:
-            surface, normals = surface.detach(), normals.detach()
             dirs = reflection.reflect(batch.directions[hit], normals)
             probability, points = reflection.trace_reflections(
                 self.cache, surface, dirs, moment.width, moment.voxel,
@@ -156,8 +156,7 @@ class Renderer:
             with torch.no_grad():
                 _, _, gradients = self.fields.sdf(points, moment.levels)
             facing = (normals * batch.directions[hit]).sum(1)
-            features = composite(rendered.weights[hit], rendered.features.view(*rendered.weights.shape, -1)[hit])
-            reflectivity = network.reflectivity(features / rendered.opacity[hit, None], facing)
+            reflectivity = network.reflectivity(rendered.mean(rendered.features)[hit], facing)
         seen = network(points, torch.nn.functional.normalize(gradients, dim=1), dirs)
         composed = reflection.compose(rendered.colors[hit], seen, probability, reflectivity)
         return replace(

@@ -43,6 +43,15 @@ def stratified(num_rows: int, num_strata: int, generator: torch.Generator | None
     return (torch.arange(num_strata, device=device) + offset) / num_strata
 
 
+def free_outside(sdf: torch.Tensor, radius: torch.Tensor) -> torch.Tensor:
+    """max(f, |x| - 1) [...] for f and |x| [...]: the solid cut off at the unit sphere.
+
+    What the SDF says outside the sphere is never rendered, and past the grid's cube the cache repeats its border. All
+    that is solid lies in the sphere, so that |x| - 1 bounds the distance to it from below.
+    """
+    return torch.maximum(sdf, radius - 1)
+
+
 class SdfCache:
     """The SDF on a regular grid over [-1, 1]^3, refreshed now and then; what sampling and visibility read.
 

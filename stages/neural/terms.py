@@ -8,6 +8,7 @@ Shapes: R rays, K samples a ray, N = R K points, I photos, Q rays and J neighbou
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cached_property
 
 import torch
@@ -22,6 +23,8 @@ from stages.neural.schedules import Moment
 
 # Samples that weigh more than this count as near the surface for the relaxed Eikonal term.
 _NEAR_SURFACE_WEIGHT = 0.01
+# Points of visibility paths that the network is asked for in one go: bounds the memory.
+_POINTS_AT_A_TIME = 1 << 18
 
 
 class Terms:
@@ -47,7 +50,7 @@ class Terms:
     def trust(self, batch: RayBatch, rendered: Rendered, exposed: torch.Tensor, moment: Moment) -> torch.Tensor:
         """Weight [R] of each ray's colour error, 1 / (1 + lambda_ambiguity) (paper eq. loss_without_ambiguity).
 
-        The stable form compares photos with photos, carries no gradient, has mean 1, and is 1 before
+        The stable form compares photos with photos, carries no gradient, has mean 1 over the surface, and is 1 before
         `ambiguity_from`: early on, a pattern seen at a wrong depth would pass for a reflection. The paper's form
         compares the rendered colours `exposed` [R, 3] with the photos, from the first step.
         """
@@ -55,16 +58,17 @@ class Terms:
         off = params.ambiguity == "off" or (params.ambiguity == "stable" and moment.progress < params.ambiguity_from)
         if off:
             return torch.ones(len(batch.leave), device=self.device)
-        hit = torch.nonzero(rendered.opacity.detach() > OPAQUE).squeeze(1)
+        weights = torch.ones(len(batch.leave), device=self.device)  # no doubt where no surface was met
+        met = rendered.opacity.detach() > OPAQUE
+        hit = torch.nonzero(met if batch.masks is None else met & (batch.masks > 0.5)).squeeze(1)
         colors, seen = self._views(hit, batch, rendered, moment)
         if params.ambiguity == "paper":
-            own, weights = exposed[hit], visibility.trust_literal
-        else:
-            gains = torch.exp(self.fields.log_gains.detach())
-            own, colors, weights = batch.colors[hit] / gains[batch.images[hit]], colors / gains, visibility.trust
-        distance = visibility.mahalanobis(own[:, None], colors, self.color_precision)
-        doubt = torch.zeros(len(batch.leave), device=self.device)  # none where no surface was met
-        return weights(doubt.index_copy(0, hit, visibility.ambiguity(seen, distance)))
+            distance = visibility.mahalanobis(exposed[hit, None], colors, self.color_precision)
+            return weights.index_copy(0, hit, visibility.trust_literal(visibility.ambiguity(seen, distance)))
+        gains = torch.exp(self.fields.log_gains.detach())
+        own = batch.colors[hit] / gains[batch.images[hit]]
+        distance = visibility.mahalanobis(own[:, None], colors / gains, self.color_precision)
+        return weights.index_copy(0, hit, visibility.trust(visibility.ambiguity(seen, distance)))
 
     @torch.no_grad()
     def _views(
@@ -81,13 +85,15 @@ class Terms:
         colors, in_frame = photos.observe(surface)
         others = torch.arange(len(photos), device=self.device) != batch.images[hit, None]
         candidates = in_frame & others & photos.training
-        if params.visibility != "paper":
+        literal = params.visibility in ("network", "paper")
+        if not literal:
             candidates &= facing > 0
         ray, view = torch.nonzero(candidates, as_tuple=True)
         points, centers, beta = surface[ray], photos.centers[view], params.visibility_sharpness
-        if params.visibility == "paper":
+        if literal:
+            sdf = self.cache.lookup if params.visibility == "paper" else self._network_sdf(moment)
             factor = visibility.visibility_literal(
-                self.cache, points, centers, params.visibility_samples, self.generator, beta
+                sdf, points, centers, params.visibility_samples, self.generator, beta
             )
         else:
             voxel = max(moment.voxel, self.cache.cell / 2)
@@ -96,33 +102,37 @@ class Terms:
                 factor = self.mesh_visibility(points, centers, margin)
             else:
                 smallest = visibility.smallest_sdf_on_paths(
-                    self.cache, points, centers, margin, params.visibility_samples
+                    self.cache, points, centers, margin, params.visibility_samples, beta
                 )
                 factor = visibility.sdf_visibility(smallest, beta)
         seen = torch.zeros_like(facing)
         seen[ray, view] = factor
         return colors, seen
 
+    def _network_sdf(self, moment: Moment) -> Callable[[torch.Tensor], torch.Tensor]:
+        """f [...] of the network at points [..., 3], in parts: they are many."""
+
+        def sdf(points: torch.Tensor) -> torch.Tensor:
+            parts = points.reshape(-1, 3).split(_POINTS_AT_A_TIME)
+            return torch.cat([self.fields.sdf.sdf(part, moment.levels) for part in parts]).view(points.shape[:-1])
+
+        return sdf
+
     # ------------------------------------------------------------------ appearance features
-    def _appearance(self, points: torch.Tensor, dirs: torch.Tensor, features: torch.Tensor) -> torch.Tensor:
-        """c_feat [M, F] of points [M, 3] towards the surface along dirs [M, 3] (paper eq. radiance_feat).
-
-        Geometry features [M, G] as the radiance network gets them, or those of an MLP of position and direction.
-        """
-        return features if self.fields.appearance is None else self.fields.appearance(points, dirs)
-
     def appearance_loss(self, batch: RayBatch, rendered: Rendered) -> torch.Tensor:
         """Colour error of the feature MLP at the surface points: what trains it in the stable form.
 
-        Zero without the MLP. In the paper nothing trains it.
+        Zero without the MLP, and in the paper's form.
         """
         mlp, params = self.fields.appearance, self.params
         hit = torch.nonzero(rendered.opacity.detach() > OPAQUE).squeeze(1)[: params.planar_rays]
-        if mlp is None or params.planar != "stable" or len(hit) == 0:
+        if mlp is None or "stable" not in (params.planar, params.eikonal) or len(hit) == 0:
             return torch.zeros((), device=self.device)
         surface = rendered.surface(batch)[0].detach()[hit]
         predicted = mlp.color(mlp(surface, batch.directions[hit]))
-        return losses.rgb_error(predicted, batch.colors[hit]).mean()
+        gains = torch.exp(self.fields.log_gains.detach())[batch.images[hit]]
+        error = losses.rgb_error(predicted * gains, batch.colors[hit])
+        return (error if batch.masks is None else error * batch.masks[hit]).mean()
 
     # ------------------------------------------------------------------ planar term
     def planar_loss(self, batch: RayBatch, rendered: Rendered, moment: Moment) -> torch.Tensor:
@@ -149,9 +159,10 @@ class Terms:
         neighbors = (surface[:, None] + offsets).reshape(-1, 3)
         places = torch.cat([surface, neighbors])
         sdf, features, gradients = self.fields.sdf(places, moment.levels)
-        # c_feat looks from x_k at the surface; at x_0 itself, along the ray.
-        towards = torch.cat([dirs, torch.nn.functional.normalize(-offsets.reshape(-1, 3), dim=1)])
-        features = self._appearance(places, towards, features)
+        # c_feat looks from x_k at the surface on its ray, which is along the ray, also for neighbours beside it.
+        along = torch.cat([dirs, dirs.repeat_interleave(count, 0)])
+        if self.fields.appearance is not None:
+            features = self.fields.appearance(places, along)
         center, around = features[: len(chosen)], features[len(chosen) :].view(len(chosen), count, -1)
         unit_normals = torch.nn.functional.normalize(gradients[: len(chosen)], dim=1)
         sdf_center, sdf_around = sdf[: len(chosen)], sdf[len(chosen) :].view(len(chosen), count)
@@ -161,7 +172,11 @@ class Terms:
         else:
             weight = losses.planarity(around, center)
             error = losses.planar_error(sdf_around, sdf_center, unit_normals, offsets, radius)
-        return (weight * error).mean()
+        return self._planarity_scale(moment) * (weight * error).mean()
+
+    def _planarity_scale(self, moment: Moment) -> float:
+        """What lambda_pla is scaled by: from `planar_start` to 1 at progress `planar_until` (paper: 0.1 to 1.0)."""
+        return schedules.exponential(moment.progress / self.params.planar_until, self.params.planar_start, 1.0)
 
     def _neighbors(self, normals: torch.Tensor, dirs: torch.Tensor, radius: float) -> torch.Tensor:
         """Offsets [Q, J, 3] of neighbours from surface points with normals [Q, 3], seen along dirs [Q, 3]."""
@@ -177,33 +192,35 @@ class Terms:
         return torch.where(half[None, :, None], on_ray * reach, disk)
 
     # ------------------------------------------------------------------ Eikonal relaxation
-    def relaxation(self, batch: RayBatch, rendered: Rendered, ray_error: torch.Tensor) -> torch.Tensor:
+    def relaxation(self, batch: RayBatch, rendered: Rendered, ray_error: torch.Tensor, moment: Moment) -> torch.Tensor:
         """Weight omega [N] of the Eikonal term at the rays' samples, ray_error [R] the colour error (paper
         eq. adaptive_weight).
 
-        The paper's form weighs every sample and carries gradients; the stable form only those near surfaces.
+        The paper's form weighs every sample of a ray that meets a surface and carries gradients; the stable form only
+        samples near the surface. 1 elsewhere: there is no x_0 to compare with.
         """
         params = self.params
         omega = torch.ones_like(rendered.weights).view(-1)
         if params.eikonal == "plain":
             return omega
-        gamma, clip, num_samples = params.relaxation_gamma, params.relaxation_clip, rendered.weights.shape[1]
+        weighed = (rendered.opacity.detach() > OPAQUE)[:, None].expand_as(rendered.weights)
         if params.eikonal == "stable":
-            places = torch.nonzero(rendered.weights.detach().view(-1) > _NEAR_SURFACE_WEIGHT).squeeze(1)
-        else:
-            places = torch.arange(len(omega), device=self.device)
-        if len(places) == 0:
+            weighed = weighed & (rendered.weights.detach() > _NEAR_SURFACE_WEIGHT)
+        ray, sample = torch.nonzero(weighed, as_tuple=True)
+        if len(ray) == 0:
             return omega
-        ray = places // num_samples
-        surface = rendered.surface(batch)[0].detach()
-        if self.fields.appearance is None:
-            center = rendered.mean(rendered.features)[ray]
-        else:
-            center = self.fields.appearance(surface, batch.directions)[ray]
-        towards = torch.nn.functional.normalize(surface[ray] - rendered.points[places], dim=1)
-        features = self._appearance(rendered.points[places], towards, rendered.features[places])
-        if params.eikonal == "paper":
-            planarity = losses.planarity_literal(features[:, None], center)[:, 0]
-            return losses.eikonal_relaxation_literal(ray_error[ray], planarity, gamma, clip)
-        planarity = losses.planarity(features[:, None], center)[:, 0]
-        return omega.index_copy(0, places, losses.eikonal_relaxation(ray_error[ray], planarity, gamma, clip))
+        places = ray * rendered.weights.shape[1] + sample
+        gamma, clip = params.relaxation_gamma, params.relaxation_clip
+        with torch.set_grad_enabled(params.eikonal == "paper"):
+            if self.fields.appearance is None:
+                features, center = rendered.features[places], rendered.mean(rendered.features)[ray]
+            else:
+                features = self.fields.appearance(rendered.points[places], batch.directions[ray])
+                center = self.fields.appearance(rendered.surface(batch)[0].detach(), batch.directions)[ray]
+            if params.eikonal == "paper":
+                planarity = self._planarity_scale(moment) * losses.planarity_literal(features[:, None], center)[:, 0]
+                values = losses.eikonal_relaxation_literal(ray_error[ray], planarity, gamma, clip)
+            else:
+                planarity = losses.planarity(features[:, None], center)[:, 0]
+                values = losses.eikonal_relaxation(ray_error[ray], planarity, gamma, clip)
+        return omega.index_copy(0, places, values)

@@ -33,6 +33,7 @@ def field_shape(params: TrainParams, num_images: int, background: bool) -> Field
         sdf_width=params.sdf_width,
         radiance_layers=params.radiance_layers,
         radiance_width=params.radiance_width,
+        reflected=params.radiance_inputs == "reflected",
         features=15,
         sphere_radius=params.sphere_radius,
         background_grid=background_grid if background else None,
@@ -78,13 +79,13 @@ class Trainer:
         """What the schedules say at progress in [0, 1].
 
         A scheduled scale ends at half a voxel of the finest level, or at `scale_end`; a learned one starts at
-        `scale_start` and is held above a tenth of that voxel.
+        `scale_start` and stays above a tenth of that voxel.
         """
         params, grid = self.params, self.fields.shape.sdf_grid
         levels = schedules.active_levels(progress, params.levels, params.start_levels, params.coarse_until)
         scale: torch.Tensor | float
         if self.fields.log_scale is not None:
-            scale = torch.exp(self.fields.log_scale).clamp(min=0.1 * grid.voxel_size())
+            scale = torch.exp(self.fields.log_scale) + 0.1 * grid.voxel_size()
         else:
             end = max(params.scale_end, 0.5 * grid.voxel_size())
             scale = schedules.exponential(progress / params.sharpen_until, params.scale_start, end)
@@ -104,13 +105,13 @@ class Trainer:
         nothing = torch.zeros((), device=self.device)
 
         ray_error = losses.rgb_error(exposed, batch.colors)
-        photo_error = ray_error * self.terms.trust(batch, rendered, exposed, moment)
         mask_loss = nothing
         if batch.masks is not None:  # outside the masks nothing is known of the colour
-            photo_error = photo_error * batch.masks
+            ray_error = ray_error * batch.masks
             mask_loss = losses.mask_error(rendered.opacity, batch.masks).mean()
-        rgb_loss = photo_error.mean()
-        omega = self.terms.relaxation(batch, rendered, ray_error)
+        trust = self.terms.trust(batch, rendered, exposed, moment)
+        rgb_loss = (ray_error * trust).mean()
+        omega = self.terms.relaxation(batch, rendered, ray_error, moment)
         eikonal_loss = torch.cat(
             [omega * losses.eikonal_error(rendered.gradients), losses.eikonal_error(rendered.extra_gradients)]
         ).mean()
@@ -123,7 +124,7 @@ class Trainer:
         loss = (
             rgb_loss
             + params.weight_eikonal * eikonal_loss
-            + params.weight_planar * schedules.exponential(progress / params.planar_until, 0.1, 1.0) * planar_loss
+            + params.weight_planar * planar_loss
             + params.weight_sparse * schedules.fade_out(progress, params.sparse_until) * sparse_loss
             + params.weight_mask * mask_loss
             + params.weight_exposure * exposure_loss
@@ -151,10 +152,13 @@ class Trainer:
                 "planar": planar_loss.detach(),
                 "sparse": sparse_loss.detach(),
                 "mask": mask_loss.detach(),
+                "appearance": appearance_loss.detach(),
+                "proposal": proposal_loss.detach(),
                 "psnr": -10 * torch.log10(mse.clamp(min=1e-10)),
                 "gradient_norm": torch.linalg.vector_norm(rendered.gradients, dim=1).mean(),
                 "opacity": rendered.opacity.detach().mean(),
                 "reflected": rendered.reflected.mean(),
+                "trust": trust.detach().min(),
             }
 
     def _proposal_loss(self, rendered: Rendered) -> torch.Tensor:

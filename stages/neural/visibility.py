@@ -2,19 +2,21 @@
 
 Shapes: R rays, I photos, P paths from a surface point to a camera, K samples on a path.
 
-Visibility reads the cached SDF grid and carries no gradient: the network at P K places would cost 24 times the
-rendering (512 rays, 48 photos, 64 samples). Space outside the unit sphere is free: nothing is reconstructed there.
+Visibility carries no gradient and reads the cached SDF grid where it can: the network at P K places would cost 24 times
+the rendering (512 rays, 48 photos, 64 samples). Space outside the unit sphere is free: nothing is reconstructed there.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 import torch
 
 from stages.errors import ReconstructionError, SystemRequirementError
 from stages.neural.photos import Photos
-from stages.neural.sampling import SdfCache
+from stages.neural.sampling import SdfCache, free_outside
 
 # Paper: sharpness of the sigmoid in eq. sdf_visibility, per scene unit, and the visibility from which a view counts.
 SHARPNESS = 100.0
@@ -38,31 +40,24 @@ def sdf_visibility_literal(path_sdf: torch.Tensor, sharpness: float = SHARPNESS)
 
 @torch.no_grad()
 def visibility_literal(
-    cache: SdfCache,
+    sdf: Callable[[torch.Tensor], torch.Tensor],
     points: torch.Tensor,
     centers: torch.Tensor,
     num_samples: int,
     generator: torch.Generator | None,
     sharpness: float = SHARPNESS,
 ) -> torch.Tensor:
-    """V [P] of surface points [P, 3] from camera centres [P, 3]: the paper's Alg. 1 as written, on the cached grid.
+    """V [P] of surface points [P, 3] from camera centres [P, 3]: the paper's Alg. 1 as written.
+
+    `sdf` gives f [...] at points [..., 3]: the network, as in the paper, or the cached grid for a fraction of the time.
 
     `num_samples` places drawn uniformly from the whole path, both ends included. On an unobstructed path of length L
     that leaves the surface at a right angle, the mean of V is (1 - ln 2 / (beta L))^K.
     """
     share = torch.rand(len(points), num_samples, 1, generator=generator, device=points.device)
     places = centers[:, None] + share * (points - centers)[:, None]
-    sdf = free_outside(cache.lookup(places), torch.linalg.vector_norm(places, dim=2))
-    return sdf_visibility_literal(sdf, sharpness)
-
-
-def free_outside(sdf: torch.Tensor, radius: torch.Tensor) -> torch.Tensor:
-    """max(f, |x| - 1) [...] for f and |x| [...]: the solid cut off at the unit sphere.
-
-    What the SDF says outside the sphere is never rendered, and past the grid's cube the cache repeats its border. All
-    that is solid lies in the sphere, so that |x| - 1 bounds the distance to it from below.
-    """
-    return torch.maximum(sdf, radius - 1)
+    path_sdf = free_outside(sdf(places), torch.linalg.vector_norm(places, dim=2))
+    return sdf_visibility_literal(path_sdf, sharpness)
 
 
 def sdf_visibility(min_sdf: torch.Tensor, sharpness: float = SHARPNESS) -> torch.Tensor:
@@ -84,20 +79,26 @@ def path_margin(facing: torch.Tensor, scale: float, voxel: float) -> torch.Tenso
 
 
 def smallest_sdf_on_paths(
-    cache: SdfCache, points: torch.Tensor, targets: torch.Tensor, start: torch.Tensor, num_samples: int = 32
+    cache: SdfCache,
+    points: torch.Tensor,
+    targets: torch.Tensor,
+    start: torch.Tensor,
+    num_samples: int = 32,
+    sharpness: float = SHARPNESS,
 ) -> torch.Tensor:
     """Smallest cached f [P] between distance `start` [P] from points [P, 3] and targets [P, 3] or the unit sphere.
 
-    On the CPU a kernel walks the paths by sphere tracing and stops at the first solid place; elsewhere they are
-    sampled evenly.
+    On the CPU a kernel walks the paths by sphere tracing and stops at -10 / sharpness, where V is 1e-3 and the rest of
+    the path cannot matter; elsewhere they are sampled evenly.
     """
     if not points.is_cuda:
         from stages.neural import kernels
 
         smallest = torch.empty(len(points))
         kernels.smallest_on_paths(
-            cache.values[0, 0].numpy(), points.numpy(), targets.numpy(), start.numpy(), smallest.numpy()
-        )
+            cache.values[0, 0].numpy(), points.numpy(), targets.numpy(), start.numpy(), np.float32(-10 / sharpness),
+            smallest.numpy(),
+        )  # fmt: skip
         return smallest
     offsets = targets - points
     length = torch.linalg.vector_norm(offsets, dim=1)
@@ -174,6 +175,8 @@ def color_precision(
     images = training[torch.randint(len(training), (num_pixels,), generator=generator, device=photos.device)]
     place = torch.rand(num_pixels, generator=generator, device=photos.device, dtype=torch.float64)
     rows = photos.first[images] + (place * photos.sizes[images].prod(1)).long()
+    if photos.masks is not None:
+        rows = rows[photos.masks[rows] > 127]
     covariance = torch.cov((photos.pixels[rows].double() / 255).T) + floor * torch.eye(3, device=photos.device)
     if torch.linalg.matrix_rank(covariance, rtol=_SINGULAR, hermitian=True) < 3:
         raise ReconstructionError(
