@@ -65,6 +65,7 @@ BASE_SETTINGS = {
     "train.scale": "scheduled",
     "train.gradients": "analytic",
 }
+BACKBONES = ("neus2", "hfneus", "neuralangelo")
 TERMS = {f"train.{term}": "stable" for term in ("ambiguity", "reflection", "planar", "eikonal")}
 
 
@@ -96,6 +97,19 @@ VARIANTS: dict[str, dict[str, str]] = {
     "scale-learned": {"train.scale": "learned"},
     "gradients-numerical": {"train.gradients": "numerical"},
     "planar-mlp": {"train.planar": "stable", "train.planar_features": "mlp"},
+    "view-only": {"train.radiance_inputs": "view"},
+    "proposal": {"train.sampler": "proposal"},
+    # the paper's "integrated into" rows: each backbone without and with the terms
+    **{
+        f"{name}{tail}": {"train.backbone": name, **terms}
+        for name in BACKBONES
+        for tail, terms in (("", {}), ("+all", TERMS))
+    },
+    # the supplement's knobs, around the defaults of t_max 0.1, gamma 5, clip 0.2, hash resolution 512
+    **{f"all-tmax-{value}": {**TERMS, "train.reflection_reach": value} for value in ("0.05", "0.2")},
+    **{f"all-gamma-{value}": {**TERMS, "train.relaxation_gamma": value} for value in ("3", "10")},
+    **{f"all-clip-{value}": {**TERMS, "train.relaxation_clip": value} for value in ("0.1", "0.3")},
+    **{f"all-hash-{value}": {**TERMS, "train.finest": value} for value in ("1024", "2048")},
 }
 
 RUNS = RESULTS / "ablation"
@@ -169,7 +183,11 @@ class Run:
 # ---------------------------------------------------------------- variants
 def settings_of(changes: dict[str, str]) -> tuple[str, ...]:
     """A variant's settings, those of the base that it does not change included."""
-    return tuple(f"{key}={value}" for key, value in {**BASE_SETTINGS, **changes}.items())
+    base = dict(BASE_SETTINGS)
+    if "train.backbone" in changes:  # sets these itself
+        for key in ("train.density", "train.scale", "train.gradients"):
+            del base[key]
+    return tuple(f"{key}={value}" for key, value in {**base, **changes}.items())
 
 
 def parse_extra(text: str) -> tuple[str, dict[str, str]]:

@@ -21,6 +21,8 @@ log = logging.getLogger(__name__)
 LOG_EVERY = 50  # steps between metric lines
 CHECKPOINT_EVERY = 60.0  # seconds
 MIN_TRAINING = 3  # photos
+METRIC_GRADIENTS = (0.8, 1.2)  # mean lengths of grad f within which f passes for a distance
+SETTLED = 500  # steps between looks at that
 
 
 def run(context: StageContext) -> dict[str, Any]:
@@ -39,7 +41,7 @@ def run(context: StageContext) -> dict[str, Any]:
     held_out = left_out(len(scene.cameras), params.holdout)
     _check_hold_out(len(held_out), int(held_out.sum()), params.holdout)
     photos = Photos(scene.cameras, *_load_images(folder, scene.cameras.names), context.device, ~held_out)
-    sightings = Sightings.from_scene(scene, context.device)
+    sightings = Sightings.from_scene(scene, context.device, (~held_out).numpy())
     trainer = Trainer(photos, sightings, params, context.device)
 
     checkpoint = artifacts.checkpoint_path(context.scratch)
@@ -127,11 +129,19 @@ def _write_metrics(lines: IO[str], trainer: Any, progress: float, numbers: dict[
 
 
 def _check(numbers: dict[str, float], step: int) -> None:
+    """Raise where the loss is no number; warn where the SDF is no distance, on which every term counts."""
     if not np.isfinite(numbers["loss"]):
         raise ReconstructionError(
             f"Training diverged at step {step}: the loss is {numbers['loss']}.",
             "Lower the learning rates: `--set train.lr_table=0.005 --set train.lr_network=0.001`",
         )
+    low, high = METRIC_GRADIENTS
+    if step % SETTLED == 0 and not low <= numbers["gradient_norm"] <= high:
+        log.warning(
+            "step %d: the SDF's gradients have a mean length of %.2f, not about 1 (%.1f to %.1f); "
+            "`--set train.weight_eikonal=1` holds them, `train.eikonal` relaxes them",
+            step, numbers["gradient_norm"], low, high,
+        )  # fmt: skip
 
 
 def _save(trainer: Any, path: Path, seconds: float) -> None:

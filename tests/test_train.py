@@ -157,10 +157,17 @@ def metric_lines(path: Path) -> list[dict]:
     return [json.loads(line) for line in path.read_text().splitlines()]
 
 
-def test_a_killed_run_goes_on_with_the_same_loss_curve(tmp_path, monkeypatch):
+EVERYTHING = {
+    "ambiguity": "stable", "visibility": "mesh", "reflection": "stable", "planar": "stable", "planar_features": "mlp",
+    "eikonal": "stable", "scale": "learned", "sampler": "proposal",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("settings", [{}, EVERYTHING], ids=["default", "everything"])
+def test_a_killed_run_goes_on_with_the_same_loss_curve(tmp_path, monkeypatch, settings):
     monkeypatch.setattr(train, "LOG_EVERY", 5)
     monkeypatch.setattr(train, "CHECKPOINT_EVERY", 0)
-    params = TINY.model_copy(update={"preview_every": 1.0})
+    params = TINY.model_copy(update={"preview_every": 1.0, **settings})
     whole = context(tmp_path, "whole", params)
     numbers = train.run(whole)
     assert numbers["steps"] == TINY.steps
@@ -234,13 +241,15 @@ def test_photos_show_a_place_where_it_projects():
 
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
-def test_a_step_on_cuda_matches_the_cpu():
+@pytest.mark.parametrize("settings", [{}, EVERYTHING], ids=["default", "everything"])
+def test_a_step_on_cuda_matches_the_cpu(settings):
+    params = TINY.model_copy(update={**settings, "scale": "scheduled", "sampler": "grid"})
     cameras = ring_of_cameras()
     scene = sphere_scene(cameras)
     rendered = []
     for device in ("cpu", "cuda"):
         photos = Photos(cameras, [render(cameras, i)[0] for i in range(8)], None, device)
-        trainer = Trainer(photos, Sightings.from_scene(scene, device), TINY, device)
+        trainer = Trainer(photos, Sightings.from_scene(scene, device), params, device)
         trainer._refresh_cache(trainer.moment(0.3))
         images = torch.arange(8, device=device).repeat(10)
         pixels = torch.tensor([[24.0, 20.0]], device=device).repeat(80, 1)
@@ -248,3 +257,12 @@ def test_a_step_on_cuda_matches_the_cpu():
         rendered.append(trainer.render(batch, 0.3, torch.zeros(0, 3, device=device), None).colors.detach().cpu())
         assert torch.isfinite(trainer.step(0.3)["loss"]).item()
     torch.testing.assert_close(rendered[1], rendered[0], rtol=1e-3, atol=1e-3)
+
+
+def test_gradients_far_from_one_are_warned_of_now_and_then(caplog):
+    numbers = {"loss": 1.0, "gradient_norm": 0.4}
+    train._check(numbers, train.SETTLED + train.LOG_EVERY)
+    train._check({"loss": 1.0, "gradient_norm": 1.1}, train.SETTLED)
+    assert not caplog.records
+    train._check(numbers, train.SETTLED)
+    assert "mean length of 0.40" in caplog.text

@@ -33,18 +33,24 @@ class Sightings:
     weights: torch.Tensor
 
     @staticmethod
-    def from_scene(scene: PosedScene, device: torch.device | str) -> Sightings:
-        """Sightings of points inside the unit sphere; weight 1 / (1 + e^2), e the reprojection error in pixels."""
+    def from_scene(scene: PosedScene, device: torch.device | str, training: np.ndarray | None = None) -> Sightings:
+        """Sightings of points inside the unit sphere; weight 1 / (1 + e^2), e the reprojection error in pixels.
+
+        Of the photos where `training` [I] bool is true only, if it is given.
+        """
         inside = np.linalg.norm(scene.points, axis=1) < 0.98
-        image, point = scene.observations[inside[scene.observations[:, 1]]].T
+        kept = inside[scene.observations[:, 1]]
+        if training is not None:
+            kept &= training[scene.observations[:, 0]]
+        image, point = scene.observations[kept].T
         points = torch.from_numpy(scene.points[point]).float()
         origins = torch.from_numpy(scene.cameras.centers[image]).float()
         distances = torch.linalg.vector_norm(points - origins, dim=1)
         directions = (points - origins) / distances[:, None]
         entry, _, _ = intersect_unit_sphere(origins, directions)
         weights = torch.from_numpy(1 / (1 + scene.point_errors[point] ** 2)).float()
-        kept = (points, directions, (distances - entry).clamp(min=0), weights)
-        return Sightings(*(tensor.to(device) for tensor in kept))
+        lines = (points, directions, (distances - entry).clamp(min=0), weights)
+        return Sightings(*(tensor.to(device) for tensor in lines))
 
     def draw(self, count: int, step: float, generator: torch.Generator) -> tuple[torch.Tensor, torch.Tensor]:
         """Places [4 S, 3] along S random sightings, and the sightings' weights [S]; S is at most `count`.
