@@ -1,20 +1,35 @@
-"""Points per second of the hash encoding and of a whole training step: CPU kernels against plain PyTorch.
+"""How fast a training step is: the CPU kernels against plain PyTorch, and what each part of the method costs.
 
-python -m benchmarks.step_speed
+python -m benchmarks.step_speed                                      both tables
+python -m benchmarks.step_speed kernels                              the first
+python -m benchmarks.step_speed parts --variants all --rounds 20     the second, of these variants of the ablation
 
-Medians over repetitions on this machine, all cores; the two take turns, so that a drifting machine hits both. The
-scene is a ball seen by eight cameras, the networks are those of the default settings.
+Medians over repetitions on this machine, all cores; what is compared takes turns, so that a drifting machine hits all.
+
+The kernels' scene is a ball seen by eight cameras, the networks are those of the default settings.
+
+The parts' scene is a heap of balls seen by 47 cameras. The base learns it for a while, all variants start from what it
+has learned, and they are timed at the middle of the training, when every part is at work. Their learning rates are zero
+then, which saves no work, and holds all of them in that state. What is done every few steps only, the refresh of the
+cached grid, is left out: it is the same for all.
 """
 
 from __future__ import annotations
 
+import argparse
+import math
 import statistics
+import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
 
+from benchmarks import ball_heap
+from benchmarks.ablate import BASE, VARIANTS, settings_of
+from benchmarks.run_sets import markdown_table
+from configs.load import load_config
 from configs.params import TrainParams
 from stages.geometry.cameras import PinholeCameras, PosedScene
 from stages.geometry.similarity import Similarity
@@ -25,6 +40,17 @@ from stages.neural.trainer import Sightings, Trainer
 REPETITIONS = 15
 POINTS = 16384
 PROGRESS = 0.7  # all levels in use
+
+# What is timed if nothing else is asked for: each part alone and all together, then the paper's forms, then choices.
+PARTS = (
+    "ambiguity", "reflection", "planar", "eikonal", "all",
+    "ambiguity-paper", "visibility-paper", "visibility-mesh", "reflection-paper", "planar-paper", "eikonal-paper",
+    "all-paper",
+    "density-neus", "scale-learned", "gradients-numerical", "planar-mlp",
+)  # fmt: skip
+PARTS_PROGRESS = 0.5  # all parts at work
+LEARNING_STEPS = 100
+STEPS_PER_TURN = 2
 
 
 def alternate(*functions: Callable[[], object]) -> list[float]:
@@ -93,7 +119,9 @@ def ball_trainer(params: TrainParams) -> Trainer:
     return Trainer(photos, Sightings.from_scene(scene, "cpu"), params, "cpu")
 
 
-def main() -> None:
+# ---------------------------------------------------------------- kernels
+def print_kernels() -> None:
+    """Table of the encoding's and the step's speed with the kernels and in plain PyTorch."""
     params = TrainParams()
     grid = encodings.HashGrid(params.levels, params.level_features, params.log2_rows, params.coarsest, params.finest)
     cores = torch.get_num_threads()
@@ -101,16 +129,114 @@ def main() -> None:
     reference = (encodings.encode_reference, encodings._reference_features)
     encoding = alternate(encoding_pass(kernels[0], grid), encoding_pass(reference[0], grid))
     steps = alternate(training_step(ball_trainer(params), *kernels), training_step(ball_trainer(params), *reference))
+    fields.encode, fields.encode_features = kernels
     step_points = params.rays * params.samples + 4 * params.sparse_batch + params.free_points
-    print("| what | kernels, kpt/s/core | PyTorch, kpt/s/core | ratio |")
-    print("| --- | --- | --- | --- |")
+    rows = []
     for name, count, (fast, slow) in (
         ("encoding, forward and backward", POINTS, encoding),
         ("training step", step_points, steps),
     ):
         rates = [count / seconds / cores / 1000 for seconds in (fast, slow)]
-        print(f"| {name} | {rates[0]:.0f} | {rates[1]:.0f} | {slow / fast:.1f} |")
+        rows.append([name, *(f"{rate:.0f}" for rate in rates), f"{slow / fast:.1f}"])
+    print(markdown_table(["what", "kernels, kpt/s/core", "PyTorch, kpt/s/core", "ratio"], rows))
+
+
+# ---------------------------------------------------------------- parts of the method
+def variant_trainers(names: Sequence[str]) -> dict[str, Trainer]:
+    """A trainer a variant, with the preset `cpu`: the first one named has learned the scene, the others take it over.
+
+    What a variant has of its own or in another shape is as it was initialised; a learned scale is about what the
+    schedule says.
+    """
+    cameras = ball_heap.dome_of_cameras()
+    photos = Photos(cameras, [ball_heap.render(cameras, i) for i in range(len(cameras))], None, "cpu")
+    sightings = Sightings.from_scene(ball_heap.posed_scene(cameras), "cpu")
+    trainers = {
+        name: Trainer(photos, sightings, load_config("cpu", None, settings_of(VARIANTS[name])).train, "cpu")
+        for name in names
+    }
+    first, *others = trainers.values()
+    for step in range(LEARNING_STEPS):
+        first.step(PARTS_PROGRESS * step / LEARNING_STEPS)
+    learned = first.fields.state_dict()
+    for trainer in others:
+        shapes = {name: value.shape for name, value in trainer.fields.state_dict().items()}
+        shared = {name: value for name, value in learned.items() if shapes.get(name) == value.shape}
+        trainer.fields.load_state_dict(shared, strict=False)
+        trainer.cache.values.copy_(first.cache.values)
+        if trainer.fields.log_scale is not None:
+            torch.nn.init.constant_(trainer.fields.log_scale, math.log(first.moment(PARTS_PROGRESS).width))
+    for trainer in trainers.values():
+        trainer.cache_step = trainer.step_index
+        for group in trainer.optimizer.param_groups:
+            group["base_lr"] = 0.0
+    return trainers
+
+
+def time_in_turn(trainers: dict[str, Trainer], rounds: int) -> dict[str, tuple[float, float]]:
+    """Median seconds of each trainer's step, wall clock and CPU (all threads), over turns of a few steps each."""
+    turns: dict[str, list[tuple[float, float]]] = {name: [] for name in trainers}
+    for turn in range(-1, rounds):  # one to warm up
+        for name, trainer in trainers.items():
+            started = time.perf_counter(), time.process_time()
+            for _ in range(STEPS_PER_TURN):
+                trainer.step(PARTS_PROGRESS)
+            ended = time.perf_counter(), time.process_time()
+            if turn >= 0:
+                turns[name].append((ended[0] - started[0], ended[1] - started[1]))
+            trainer.cache_step = trainer.step_index  # no refresh
+    return {
+        name: (
+            statistics.median(wall for wall, _ in times) / STEPS_PER_TURN,
+            statistics.median(cpu for _, cpu in times) / STEPS_PER_TURN,
+        )
+        for name, times in turns.items()
+    }
+
+
+def parts_table(seconds: dict[str, tuple[float, float]]) -> str:
+    """A row a variant: its step's seconds, wall clock and CPU, and both against the base's."""
+    base = seconds[BASE]
+    rows = [
+        [name, f"{1000 * wall:.0f}", f"{1000 * cpu:.0f}", f"{wall / base[0]:.2f}", f"{cpu / base[1]:.2f}"]
+        for name, (wall, cpu) in seconds.items()
+    ]
+    return markdown_table(["variant", "wall, ms a step", "CPU, ms a step", "wall / base", "CPU / base"], rows)
+
+
+def share_of_terms(seconds: dict[str, tuple[float, float]]) -> str:
+    """What the method's terms take of the step that has them all."""
+    wall, cpu = (100 * (1 - base / everything) for base, everything in zip(seconds[BASE], seconds["all"], strict=True))
+    return f"The method's terms together take {wall:.0f} % of a step's wall time and {cpu:.0f} % of its CPU time."
+
+
+def print_parts(names: Sequence[str], rounds: int) -> None:
+    seconds = time_in_turn(variant_trainers(names), rounds)
+    print(parts_table(seconds))
+    if "all" in seconds:
+        print(f"\n{share_of_terms(seconds)}")
+
+
+# ---------------------------------------------------------------- command
+def main(argv: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("table", nargs="?", choices=["kernels", "parts"], help="default: both")
+    parser.add_argument("--variants", default=",".join(PARTS), help="names, separated by commas")
+    parser.add_argument("--rounds", type=int, default=12, help="turns of each variant")
+    arguments = parser.parse_args(argv)
+    named = arguments.variants.split(",")
+    if unknown := [name for name in named if name not in VARIANTS]:
+        parser.error(f"no variant {', '.join(unknown)}; there are {', '.join(VARIANTS)}")
+    if arguments.rounds < 1:
+        parser.error("--rounds needs at least 1")
+    if arguments.table != "parts":
+        print_kernels()
+    if arguments.table is None:
+        print()
+    if arguments.table != "kernels":
+        print_parts(list(dict.fromkeys([BASE, *named])), arguments.rounds)
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())
