@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
-from sphere_scene import RADIUS
+from sphere_scene import RADIUS, ring_of_cameras
 from test_train import TINY, make_trainer
 
 from configs.load import load_config
 from configs.params import TrainParams
+from stages.neural import visibility
 from stages.neural.trainer import Trainer
 
 FORMS = {
@@ -106,6 +108,46 @@ def test_the_ambiguity_weight_trusts_a_painted_ball_and_doubts_a_shifting_one(vi
     shifting = trust()
     ratio = [weights[upper].mean() / weights[lower].mean() for weights in (consistent, shifting)]
     assert ratio[1] < doubt * ratio[0]  # the paper's visibility leaves few views to disagree
+
+
+def test_the_ambiguity_weight_is_that_of_a_loop_over_rays_and_photos():
+    settings = {"ambiguity": "stable", "sphere_radius": RADIUS, "scale_start": 0.01}
+    trainer = make_trainer(TINY.model_copy(update=settings))
+    photos, moment, cameras = trainer.photos, trainer.moment(0.5), ring_of_cameras()
+    photos.training[3] = False
+    trainer.fields.log_gains.data.copy_(0.1 * torch.randn(8, 3, generator=torch.Generator().manual_seed(0)))
+    gains, precision = trainer.fields.log_gains.exp().detach(), trainer.terms.color_precision
+    trainer._refresh_cache(moment)
+    batch = photos.draw(60, torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        rendered = trainer.render(batch, 0.5, torch.zeros(0, 3), None)
+    surface, normals = rendered.surface(batch)
+    margin = max(moment.voxel, trainer.cache.cell / 2)
+    doubt = []
+    for ray, own in enumerate(batch.images.tolist()):
+        summed, count = 0.0, 0
+        for view in {*range(8)} - {own, 3}:
+            to_camera = torch.nn.functional.normalize(photos.centers[view] - surface[ray], dim=0)
+            facing = (to_camera * normals[ray]).sum()
+            pixel, _ = cameras.project(view, surface[ray, None].double().numpy())
+            x, y = np.floor(pixel[0]).astype(int)
+            in_frame = 0 <= x < 48 and 0 <= y < 40
+            if rendered.opacity[ray] <= 0.5 or facing <= 0 or not in_frame:
+                continue
+            start = visibility.path_margin(facing, moment.width, margin)[None]
+            path = surface[ray, None], photos.centers[view, None]
+            seen = visibility.sdf_visibility(visibility.smallest_sdf_on_paths(trainer.cache, *path, start)).item()
+            if seen > visibility.VISIBLE:
+                color = photos.pixels[photos.first[view] + 48 * y + x] / 255 / gains[view]
+                difference = batch.colors[ray] / gains[own] - color
+                summed += seen * (difference @ precision @ difference).sqrt().item()
+                count += 1
+        doubt.append(summed / max(count, 1))
+    assert 10 < sum(each > 0 for each in doubt) < 50
+    weights, met = 1 / (1 + torch.tensor(doubt)), rendered.opacity > 0.5
+    weights[met] /= weights[met].mean()
+    fast = trainer.terms.trust(batch, rendered, rendered.colors, moment)
+    torch.testing.assert_close(fast, weights, rtol=1e-4, atol=1e-5)
 
 
 def test_masks_take_rays_out_of_the_ambiguity_weight():
