@@ -103,6 +103,16 @@ def test_cache_reads_back_what_was_written():
     torch.testing.assert_close(cache.lookup(axis), torch.tensor([0.5, 2.5, -75]), rtol=1e-4, atol=1e-4)
 
 
+def test_the_lookup_kernel_reads_what_grid_sample_reads_outside_the_cube_too():
+    cache = SdfCache(20, "cpu")
+    generator = torch.Generator().manual_seed(0)
+    cache.values.copy_(torch.randn(cache.values.shape, generator=generator))
+    points = torch.rand(7, 300, 3, generator=generator) * 3 - 1.5
+    found = cache.lookup(points)
+    assert found.shape == (7, 300)
+    torch.testing.assert_close(found, cache.lookup_reference(points), rtol=1e-4, atol=1e-4)
+
+
 def test_band_refresh_touches_only_the_neighbourhood_of_the_surface():
     cache = sphere_cache()
     far = cache.values.clone()

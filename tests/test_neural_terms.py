@@ -92,11 +92,11 @@ def test_the_ambiguity_weight_trusts_a_painted_ball_and_doubts_a_shifting_one(vi
         rendered = trainer.render(batch, 0.5, torch.zeros(0, 3), None)
     on_ball = rendered.opacity > 0.5
     assert 50 < int(on_ball.sum()) < 350
-    height = rendered.surface(batch)[0][:, 2]
+    height = rendered.surface[0][:, 2]
     upper, lower = on_ball & (height > 0.05), on_ball & (height < -0.05)
 
     def trust(progress: float = 0.5) -> torch.Tensor:
-        weights = trainer.terms.trust(batch, rendered, rendered.colors, trainer.moment(progress))
+        weights = trainer.terms.trust(rendered, rendered.colors, trainer.moment(progress))
         assert torch.equal(weights[~on_ball], torch.ones(400)[~on_ball])  # nothing is known there
         return weights
 
@@ -121,7 +121,7 @@ def test_the_ambiguity_weight_is_that_of_a_loop_over_rays_and_photos():
     batch = photos.draw(60, torch.Generator().manual_seed(0))
     with torch.no_grad():
         rendered = trainer.render(batch, 0.5, torch.zeros(0, 3), None)
-    surface, normals = rendered.surface(batch)
+    surface, normals = rendered.surface
     margin = max(moment.voxel, trainer.cache.cell / 2)
     doubt = []
     for ray, own in enumerate(batch.images.tolist()):
@@ -146,7 +146,7 @@ def test_the_ambiguity_weight_is_that_of_a_loop_over_rays_and_photos():
     assert 10 < sum(each > 0 for each in doubt) < 50
     weights, met = 1 / (1 + torch.tensor(doubt)), rendered.opacity > 0.5
     weights[met] /= weights[met].mean()
-    fast = trainer.terms.trust(batch, rendered, rendered.colors, moment)
+    fast = trainer.terms.trust(rendered, rendered.colors, moment)
     torch.testing.assert_close(fast, weights, rtol=1e-4, atol=1e-5)
 
 
@@ -156,7 +156,7 @@ def test_masks_take_rays_out_of_the_ambiguity_weight():
     batch = trainer.photos.draw(400, torch.Generator().manual_seed(0))
     with torch.no_grad():
         rendered = trainer.render(batch, 0.5, torch.zeros(0, 3), None)
-    weights = trainer.terms.trust(batch, rendered, rendered.colors, trainer.moment(0.5))
+    weights = trainer.terms.trust(rendered, rendered.colors, trainer.moment(0.5))
     counted = (rendered.opacity > 0.5) & (batch.masks > 0.5)
     assert int(counted.sum()) < int((rendered.opacity > 0.5).sum())  # the first sphere is larger than the ball
     assert weights[counted].mean().item() == pytest.approx(1)
@@ -170,7 +170,7 @@ def test_the_papers_weight_carries_a_gradient_and_the_stable_one_none():
         trainer._refresh_cache(trainer.moment(0.5))
         batch = trainer.photos.draw(200, torch.Generator().manual_seed(0))
         rendered = trainer.render(batch, 0.5, torch.zeros(0, 3), None)
-        weights = trainer.terms.trust(batch, rendered, rendered.colors, trainer.moment(0.5))
+        weights = trainer.terms.trust(rendered, rendered.colors, trainer.moment(0.5))
         assert weights.requires_grad is carries
 
 
@@ -239,7 +239,7 @@ def test_batches_that_meet_nothing_render(monkeypatch):
     batch = trainer.photos.rays(torch.zeros(3, dtype=torch.long), torch.full((3, 2), -1e6))
     assert len(batch.leave) == 0
     rendered = trainer.render(batch, 0.5, torch.zeros(0, 3), None)
-    assert rendered.colors.shape == rendered.surface(batch)[0].shape == (0, 3)
+    assert rendered.colors.shape == rendered.surface[0].shape == (0, 3)
 
 
 def test_the_papers_preset_steps_with_small_networks():

@@ -337,6 +337,15 @@ def _trilinear(values, x, y, z):
 
 
 @njit(parallel=True, **_OPTIONS)
+def lookup(values, points, found):
+    """Fill found [P] with the cached f at points [P, 3]; places outside the cube read its border."""
+    num_chunks = (len(points) + CHUNK - 1) // CHUNK
+    for chunk in prange(num_chunks):
+        for p in range(chunk * CHUNK, min((chunk + 1) * CHUNK, len(points))):
+            found[p] = _trilinear(values, points[p, 0], points[p, 1], points[p, 2])
+
+
+@njit(parallel=True, **_OPTIONS)
 def smallest_on_paths(values, points, targets, start, solid, smallest):
     """Fill smallest [P] with the least cached f met by sphere tracing from points [P, 3] towards targets [P, 3].
 

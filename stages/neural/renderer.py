@@ -6,6 +6,7 @@ Shapes: R rays, K samples a ray, N = R K points, Q rays that hit something, P bi
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 
@@ -33,6 +34,7 @@ class Rendered:
     """What a batch of rays shows.
 
     Attributes:
+        batch: the rays.
         colors: [R, 3] sRGB with reflections and the background behind, before exposure.
         opacity: [R] of the surface alone.
         weights, distances: [R, K] rendering weights of the samples and where they lie on the ray.
@@ -44,6 +46,7 @@ class Rendered:
         extra_sdf, extra_gradients: f [E] and its gradients [E, 3] at the extra points that were asked for.
     """
 
+    batch: RayBatch
     colors: torch.Tensor
     opacity: torch.Tensor
     weights: torch.Tensor
@@ -61,10 +64,11 @@ class Rendered:
         summed = composite(self.weights, values.view(*self.weights.shape, values.shape[-1]))
         return summed / self.opacity.clamp(min=1e-3)[:, None]
 
-    def surface(self, batch: RayBatch) -> tuple[torch.Tensor, torch.Tensor]:
+    @cached_property
+    def surface(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Mean surface point x_0 and unit normal n_0 of each ray [R, 3]; mean something only where it is opaque."""
         depth = (self.weights * self.distances).sum(1) / self.opacity.clamp(min=1e-3)
-        points = batch.origins + depth[:, None] * batch.directions
+        points = self.batch.origins + depth[:, None] * self.batch.directions
         return points, torch.nn.functional.normalize(self.mean(self.gradients), dim=1)
 
 
@@ -101,10 +105,10 @@ class Renderer:
         if self.fields.background is not None:
             colors = colors + self._background(self.fields.background, batch, transmittance, generator)
         rendered = Rendered(
-            colors, 1 - transmittance, weights, distances, points, gradients[:num_points], features[:num_points],
+            batch, colors, 1 - transmittance, weights, distances, points, gradients[:num_points], features[:num_points],
             torch.zeros(num_rays, device=points.device), proposal, sdf[num_points:], gradients[num_points:],
         )  # fmt: skip
-        return self._with_reflections(rendered, batch, moment, generator)
+        return self._with_reflections(rendered, moment, generator)
 
     def _sample(
         self, batch: RayBatch, moment: Moment, generator: torch.Generator | None
@@ -122,9 +126,7 @@ class Renderer:
         )  # fmt: skip
         return distances, (edges, weights)
 
-    def _with_reflections(
-        self, rendered: Rendered, batch: RayBatch, moment: Moment, generator: torch.Generator | None
-    ) -> Rendered:
+    def _with_reflections(self, rendered: Rendered, moment: Moment, generator: torch.Generator | None) -> Rendered:
         """C' = (1 - rho S) C + rho S g of the rays that met a surface (paper, Self-Reflection Compensation).
 
         In the paper's form S carries a gradient to f along the reflected ray, though not to where the ray lies. In the
@@ -134,9 +136,9 @@ class Renderer:
         if network is None or (params.reflection == "stable" and moment.progress < params.reflection_from):
             return rendered
         hit = torch.nonzero(rendered.opacity.detach() > OPAQUE).squeeze(1)
-        surface, normals = (part.detach()[hit] for part in rendered.surface(batch))
+        surface, normals = (part.detach()[hit] for part in rendered.surface)
         if params.reflection == "paper":
-            dirs = reflection.reflect(batch.directions[hit], normals)
+            dirs = reflection.reflect(rendered.batch.directions[hit], normals)
             along = reflection.uniform_points(
                 surface, dirs, params.reflection_reach, params.reflection_samples, generator
             )
@@ -146,7 +148,7 @@ class Renderer:
             points, gradients = (reflection.nearest_to_surface(sdf, each.view_as(along)) for each in (along, gradients))
             reflectivity = torch.ones_like(probability)
         else:
-            dirs = reflection.reflect(batch.directions[hit], normals)
+            dirs = reflection.reflect(rendered.batch.directions[hit], normals)
             probability, points = reflection.trace_reflections(
                 self.cache, surface, dirs, moment.width, moment.voxel,
                 params.reflection_reach, params.reflection_samples,
@@ -155,7 +157,7 @@ class Renderer:
             hit, normals, dirs, probability, points = (x[met] for x in (hit, normals, dirs, probability, points))
             with torch.no_grad():
                 _, _, gradients = self.fields.sdf(points, moment.levels)
-            facing = (normals * batch.directions[hit]).sum(1)
+            facing = (normals * rendered.batch.directions[hit]).sum(1)
             reflectivity = network.reflectivity(rendered.mean(rendered.features)[hit], facing)
         seen = network(points, torch.nn.functional.normalize(gradients, dim=1), dirs)
         composed = reflection.compose(rendered.colors[hit], seen, probability, reflectivity)

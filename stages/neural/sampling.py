@@ -87,7 +87,19 @@ class SdfCache:
         return len(rows)
 
     def lookup(self, points: torch.Tensor) -> torch.Tensor:
-        """Trilinear f [...] at points [..., 3]; positions outside the cube read its border."""
+        """Trilinear f [...] at points [..., 3], without gradient; positions outside the cube read its border."""
+        if not points.is_cuda:
+            from stages.neural import kernels
+
+            found = torch.empty(points.shape[:-1])
+            kernels.lookup(
+                self.values[0, 0].numpy(), points.detach().float().reshape(-1, 3).numpy(), found.view(-1).numpy()
+            )
+            return found
+        return self.lookup_reference(points)
+
+    def lookup_reference(self, points: torch.Tensor) -> torch.Tensor:
+        """`lookup` in plain torch: the reference of the kernel, and the path on CUDA."""
         values = torch.nn.functional.grid_sample(
             self.values, points.reshape(1, 1, 1, -1, 3), align_corners=True, padding_mode="border"
         )

@@ -16,7 +16,7 @@ import torch
 from configs.params import TrainParams
 from stages.neural import losses, schedules, visibility
 from stages.neural.fields import Fields
-from stages.neural.photos import Photos, RayBatch
+from stages.neural.photos import Photos
 from stages.neural.renderer import OPAQUE, Rendered
 from stages.neural.sampling import SdfCache
 from stages.neural.schedules import Moment
@@ -47,21 +47,21 @@ class Terms:
         return visibility.color_precision(self.photos, generator)
 
     # ------------------------------------------------------------------ ambiguity weight
-    def trust(self, batch: RayBatch, rendered: Rendered, exposed: torch.Tensor, moment: Moment) -> torch.Tensor:
+    def trust(self, rendered: Rendered, exposed: torch.Tensor, moment: Moment) -> torch.Tensor:
         """Weight [R] of each ray's colour error, 1 / (1 + lambda_ambiguity) (paper eq. loss_without_ambiguity).
 
         The stable form compares photos with photos, carries no gradient, has mean 1 over the surface, and is 1 before
         `ambiguity_from`: early on, a pattern seen at a wrong depth would pass for a reflection. The paper's form
         compares the rendered colours `exposed` [R, 3] with the photos, from the first step.
         """
-        params = self.params
+        params, batch = self.params, rendered.batch
         off = params.ambiguity == "off" or (params.ambiguity == "stable" and moment.progress < params.ambiguity_from)
         if off:
             return torch.ones(len(batch.leave), device=self.device)
         weights = torch.ones(len(batch.leave), device=self.device)  # no doubt where no surface was met
         met = rendered.opacity.detach() > OPAQUE
         hit = torch.nonzero(met if batch.masks is None else met & (batch.masks > 0.5)).squeeze(1)
-        colors, seen = self._views(hit, batch, rendered, moment)
+        colors, seen = self._views(hit, rendered, moment)
         if params.ambiguity == "paper":
             distance = visibility.mahalanobis(exposed[hit, None], colors, self.color_precision)
             return weights.index_copy(0, hit, visibility.trust_literal(visibility.ambiguity(seen, distance)))
@@ -71,19 +71,17 @@ class Terms:
         return weights.index_copy(0, hit, visibility.trust(visibility.ambiguity(seen, distance)))
 
     @torch.no_grad()
-    def _views(
-        self, hit: torch.Tensor, batch: RayBatch, rendered: Rendered, moment: Moment
-    ) -> tuple[torch.Tensor, torch.Tensor]:
+    def _views(self, hit: torch.Tensor, rendered: Rendered, moment: Moment) -> tuple[torch.Tensor, torch.Tensor]:
         """What every photo shows at the surface points of rays `hit` [M]: colours [M, I, 3], visibility factor [M, I].
 
         The factor is 0 in the ray's own photo, in those not trained on, and where the point is out of frame.
         """
         params, photos = self.params, self.photos
-        surface, normals = (part[hit] for part in rendered.surface(batch))
+        surface, normals = (part[hit] for part in rendered.surface)
         to_cameras = torch.nn.functional.normalize(photos.centers - surface[:, None], dim=2)
         facing = torch.einsum("ma,mia->mi", normals, to_cameras)
         colors, in_frame = photos.observe(surface)
-        others = torch.arange(len(photos), device=self.device) != batch.images[hit, None]
+        others = torch.arange(len(photos), device=self.device) != rendered.batch.images[hit, None]
         candidates = in_frame & others & photos.training
         literal = params.visibility in ("network", "paper")
         if not literal:
@@ -119,23 +117,23 @@ class Terms:
         return sdf
 
     # ------------------------------------------------------------------ appearance features
-    def appearance_loss(self, batch: RayBatch, rendered: Rendered) -> torch.Tensor:
+    def appearance_loss(self, rendered: Rendered) -> torch.Tensor:
         """Colour error of the feature MLP at the surface points: what trains it in the stable form.
 
         Zero without the MLP, and in the paper's form.
         """
-        mlp, params = self.fields.appearance, self.params
+        mlp, params, batch = self.fields.appearance, self.params, rendered.batch
         hit = torch.nonzero(rendered.opacity.detach() > OPAQUE).squeeze(1)[: params.planar_rays]
         if mlp is None or "stable" not in (params.planar, params.eikonal) or len(hit) == 0:
             return torch.zeros((), device=self.device)
-        surface = rendered.surface(batch)[0].detach()[hit]
+        surface = rendered.surface[0].detach()[hit]
         predicted = mlp.color(mlp(surface, batch.directions[hit]))
         gains = torch.exp(self.fields.log_gains.detach())[batch.images[hit]]
         error = losses.rgb_error(predicted * gains, batch.colors[hit])
         return (error if batch.masks is None else error * batch.masks[hit]).mean()
 
     # ------------------------------------------------------------------ planar term
-    def planar_loss(self, batch: RayBatch, rendered: Rendered, moment: Moment) -> torch.Tensor:
+    def planar_loss(self, rendered: Rendered, moment: Moment) -> torch.Tensor:
         """Mean planar error around the surface points of some of the rays, adaptively weighted (paper L_planar).
 
         The paper's neighbours lie on the ray before the surface; in the stable form half of them do, the others lie on
@@ -148,8 +146,8 @@ class Terms:
         chosen = torch.nonzero(rendered.opacity.detach() > OPAQUE).squeeze(1)[: params.planar_rays]
         if len(chosen) == 0:
             return nothing
-        surface, normals = (part.detach()[chosen] for part in rendered.surface(batch))
-        dirs = batch.directions[chosen]
+        surface, normals = (part.detach()[chosen] for part in rendered.surface)
+        dirs = rendered.batch.directions[chosen]
         radius = params.planar_radius
         if params.planar == "stable":
             finest = 3 * self.fields.shape.sdf_grid.voxel_size()
@@ -192,7 +190,7 @@ class Terms:
         return torch.where(half[None, :, None], on_ray * reach, disk)
 
     # ------------------------------------------------------------------ Eikonal relaxation
-    def relaxation(self, batch: RayBatch, rendered: Rendered, ray_error: torch.Tensor, moment: Moment) -> torch.Tensor:
+    def relaxation(self, rendered: Rendered, ray_error: torch.Tensor, moment: Moment) -> torch.Tensor:
         """Weight omega [N] of the Eikonal term at the rays' samples, ray_error [R] the colour error (paper
         eq. adaptive_weight).
 
@@ -215,8 +213,8 @@ class Terms:
             if self.fields.appearance is None:
                 features, center = rendered.features[places], rendered.mean(rendered.features)[ray]
             else:
-                features = self.fields.appearance(rendered.points[places], batch.directions[ray])
-                center = self.fields.appearance(rendered.surface(batch)[0].detach(), batch.directions)[ray]
+                features = self.fields.appearance(rendered.points[places], rendered.batch.directions[ray])
+                center = self.fields.appearance(rendered.surface[0].detach(), rendered.batch.directions)[ray]
             if params.eikonal == "paper":
                 planarity = self._planarity_scale(moment) * losses.planarity_literal(features[:, None], center)[:, 0]
                 values = losses.eikonal_relaxation_literal(ray_error[ray], planarity, gamma, clip)

@@ -109,14 +109,14 @@ class Trainer:
         if batch.masks is not None:  # outside the masks nothing is known of the colour
             ray_error = ray_error * batch.masks
             mask_loss = losses.mask_error(rendered.opacity, batch.masks).mean()
-        trust = self.terms.trust(batch, rendered, exposed, moment)
+        trust = self.terms.trust(rendered, exposed, moment)
         rgb_loss = (ray_error * trust).mean()
-        omega = self.terms.relaxation(batch, rendered, ray_error, moment)
+        omega = self.terms.relaxation(rendered, ray_error, moment)
         eikonal_loss = torch.cat(
             [omega * losses.eikonal_error(rendered.gradients), losses.eikonal_error(rendered.extra_gradients)]
         ).mean()
-        planar_loss = self.terms.planar_loss(batch, rendered, moment)
-        appearance_loss = self.terms.appearance_loss(batch, rendered)
+        planar_loss = self.terms.planar_loss(rendered, moment)
+        appearance_loss = self.terms.appearance_loss(rendered)
         sparse_loss = sighting_loss(rendered.extra_sdf[: len(places)], sparse_weights, params)
         exposure_loss = losses.exposure_error(self.fields.log_gains).mean()
         proposal_loss = self._proposal_loss(rendered)
@@ -199,7 +199,7 @@ class Trainer:
             batch = self.photos.rays(torch.full_like(part, image), pixels[part])
             rendered = self.render(batch, progress, nothing, None)
             rows = part[batch.drawn].cpu()
-            _, normals = rendered.surface(batch)
+            _, normals = rendered.surface
             photo[rows] = batch.colors.cpu()
             color[rows] = (rendered.colors * torch.exp(self.fields.log_gains[image])).clamp(0, 1).cpu()
             normal[rows] = (normals * 0.5 + 0.5).cpu()
