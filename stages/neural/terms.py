@@ -190,12 +190,15 @@ class Terms:
         return torch.where(half[None, :, None], on_ray * reach, disk)
 
     # ------------------------------------------------------------------ Eikonal relaxation
-    def relaxation(self, rendered: Rendered, ray_error: torch.Tensor, moment: Moment) -> torch.Tensor:
-        """Weight omega [N] of the Eikonal term at the rays' samples, ray_error [R] the colour error (paper
+    def relaxation(
+        self, rendered: Rendered, ray_error: torch.Tensor, trust: torch.Tensor, moment: Moment
+    ) -> torch.Tensor:
+        """Weight omega [N] of the Eikonal term at the rays' samples, from the colour error [R] (paper
         eq. adaptive_weight).
 
-        The paper's form weighs every sample of a ray that meets a surface and carries gradients; the stable form only
-        samples near the surface. 1 elsewhere: there is no x_0 to compare with.
+        The paper's form weighs every sample of a ray that meets a surface and carries gradients. The stable form weighs
+        only samples near the surface, and takes the error times the `trust` [R] in the photo: what a mirror shows is
+        no reason to bend f. 1 elsewhere: there is no x_0 to compare with.
         """
         params = self.params
         omega = torch.ones_like(rendered.weights).view(-1)
@@ -220,5 +223,5 @@ class Terms:
                 values = losses.eikonal_relaxation_literal(ray_error[ray], planarity, gamma, clip)
             else:
                 planarity = losses.planarity(features[:, None], center)[:, 0]
-                values = losses.eikonal_relaxation(ray_error[ray], planarity, gamma, clip)
+                values = losses.eikonal_relaxation((ray_error * trust)[ray], planarity, gamma, clip)
         return omega.index_copy(0, places, values)

@@ -111,7 +111,7 @@ class Trainer:
             mask_loss = losses.mask_error(rendered.opacity, batch.masks).mean()
         trust = self.terms.trust(rendered, exposed, moment)
         rgb_loss = (ray_error * trust).mean()
-        omega = self.terms.relaxation(rendered, ray_error, moment)
+        omega = self.terms.relaxation(rendered, ray_error, trust, moment)
         eikonal_loss = torch.cat(
             [omega * losses.eikonal_error(rendered.gradients), losses.eikonal_error(rendered.extra_gradients)]
         ).mean()
