@@ -128,13 +128,13 @@ class ReportParams(Section):
 class TrainParams(Section):
     """Posed images to a neural signed distance field."""
 
-    steps: int = Field(4000, ge=1, description="optimiser steps (ignored where `minutes` is set)")
+    steps: int = Field(8000, ge=1, description="optimiser steps (ignored where `minutes` is set)")
     minutes: float | None = Field(None, gt=0, description="wall-clock budget in minutes instead of steps")
     seed: int = Field(0, ge=0, description="random seed")
     holdout: int = Field(0, ge=0, description="leave every n-th photo out and report the PSNR on those; 0: none")
-    rays: int = Field(1024, ge=1, description="rays per step")
+    rays: int = Field(512, ge=1, description="rays per step")
     samples: int = Field(16, ge=2, description="samples per ray inside the region of interest")
-    free_points: int = Field(512, ge=0, description="points per step anywhere in the region, for the Eikonal term")
+    free_points: int = Field(256, ge=0, description="points per step anywhere in the region, for the Eikonal term")
 
     backbone: Literal["hineus", "neus2", "hfneus", "neuralangelo"] = Field(
         "hineus", description="set density, gradients, encoding and schedules as that method does; what is named wins"
@@ -184,14 +184,16 @@ class TrainParams(Section):
     sparse_step: float = Field(
         0.01, ge=0, description="the SDF must have changed sign this far before and behind SfM points, scene units"
     )
-    sparse_batch: int = Field(384, ge=0, description="sightings of SfM points per step")
+    sparse_batch: int = Field(256, ge=0, description="sightings of SfM points per step")
     weight_mask: float = Field(0.1, ge=0, description="weight of the mask term, where masks exist")
     weight_exposure: float = Field(0.1, ge=0, description="weight that holds the photos' gains at 1")
 
-    ambiguity: Literal["off", "paper", "stable"] = Field(
-        "off", description="trust photos less where the others that see a place disagree"
+    ambiguity: Literal["off", "paper", "stable", "outlier"] = Field(
+        "off",
+        description="trust photos less where the others that see a place disagree with them (`paper`, `stable`), or "
+        "where the others agree and they do not (`outlier`)",
     )
-    ambiguity_from: float = Field(0.2, ge=0, le=1, description="progress at which the stable form begins")
+    ambiguity_from: float = Field(0.2, ge=0, le=1, description="progress at which all but the paper's form begins")
     visibility: Literal["network", "paper", "stable", "mesh"] = Field(
         "stable",
         description="how the ambiguity weight finds out which photos see a place: the paper's product over the SDF "
