@@ -529,7 +529,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("data", type=Path, nargs="?", help="folder of sets")
     parser.add_argument("sets", nargs="*", help="names of sets; default: all with a known surface or known cameras")
-    parser.add_argument("--steps", type=int, default=1500, help="training steps of every run")
+    parser.add_argument("--steps", type=int, default=2000, help="training steps of every run")
     parser.add_argument("--seeds", type=int, default=2, help="how many seeds, from 0")
     parser.add_argument("--variants", default=",".join(VARIANTS), help="names, separated by commas")
     parser.add_argument("--extra", action="append", default=[], help="NAME:setting=value,...: one more variant")
