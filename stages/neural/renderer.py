@@ -66,10 +66,14 @@ class Rendered:
 
     @cached_property
     def surface(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Mean surface point x_0 and unit normal n_0 of each ray [R, 3]; mean something only where it is opaque."""
-        depth = (self.weights * self.distances).sum(1) / self.opacity.clamp(min=1e-3)
-        points = self.batch.origins + depth[:, None] * self.batch.directions
-        return points, torch.nn.functional.normalize(self.mean(self.gradients), dim=1)
+        """Mean surface point x_0 and unit normal n_0 of each ray [R, 3], without gradient.
+
+        They mean something only where the ray is opaque.
+        """
+        with torch.no_grad():
+            depth = (self.weights * self.distances).sum(1) / self.opacity.clamp(min=1e-3)
+            points = self.batch.origins + depth[:, None] * self.batch.directions
+            return points, torch.nn.functional.normalize(self.mean(self.gradients), dim=1)
 
 
 class Renderer:
@@ -136,7 +140,7 @@ class Renderer:
         if network is None or (params.reflection == "stable" and moment.progress < params.reflection_from):
             return rendered
         hit = torch.nonzero(rendered.opacity.detach() > OPAQUE).squeeze(1)
-        surface, normals = (part.detach()[hit] for part in rendered.surface)
+        surface, normals = (part[hit] for part in rendered.surface)
         if params.reflection == "paper":
             dirs = reflection.reflect(rendered.batch.directions[hit], normals)
             along = reflection.uniform_points(

@@ -132,7 +132,7 @@ class Terms:
         hit = torch.nonzero(rendered.opacity.detach() > OPAQUE).squeeze(1)[: params.planar_rays]
         if mlp is None or "stable" not in (params.planar, params.eikonal) or len(hit) == 0:
             return torch.zeros((), device=self.device)
-        surface = rendered.surface[0].detach()[hit]
+        surface = rendered.surface[0][hit]
         predicted = mlp.color(mlp(surface, batch.directions[hit]))
         gains = torch.exp(self.fields.log_gains.detach())[batch.images[hit]]
         error = losses.rgb_error(predicted * gains, batch.colors[hit])
@@ -152,7 +152,7 @@ class Terms:
         chosen = torch.nonzero(rendered.opacity.detach() > OPAQUE).squeeze(1)[: params.planar_rays]
         if len(chosen) == 0:
             return nothing
-        surface, normals = (part.detach()[chosen] for part in rendered.surface)
+        surface, normals = (part[chosen] for part in rendered.surface)
         dirs = rendered.batch.directions[chosen]
         radius = params.planar_radius
         if params.planar == "stable":
@@ -223,7 +223,7 @@ class Terms:
                 features, center = rendered.features[places], rendered.mean(rendered.features)[ray]
             else:
                 features = self.fields.appearance(rendered.points[places], rendered.batch.directions[ray])
-                center = self.fields.appearance(rendered.surface[0].detach(), rendered.batch.directions)[ray]
+                center = self.fields.appearance(rendered.surface[0], rendered.batch.directions)[ray]
             if params.eikonal == "paper":
                 planarity = self._planarity_scale(moment) * losses.planarity_literal(features[:, None], center)[:, 0]
                 values = losses.eikonal_relaxation_literal(ray_error[ray], planarity, gamma, clip)
