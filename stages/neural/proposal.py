@@ -12,7 +12,7 @@ from torch import nn
 from stages.neural.appearance import positional_encoding
 from stages.neural.mlp import mlp
 from stages.neural.rendering import weights_from_optical_depth
-from stages.neural.sampling import EVEN_SHARE, stratified
+from stages.neural.sampling import EVEN_SHARE, invert_cdf, stratified
 
 # Frequencies of the position's encoding; the finest has a period of 1/16 scene unit, about two of 64 intervals.
 _FREQUENCIES = 6
@@ -53,13 +53,7 @@ def draw_from_weights(
 
     One stratified draw per sample; the strata's centres without a generator.
     """
-    cdf = nn.functional.pad(torch.cumsum(weights, 1), (1, 0))
-    cdf = cdf / cdf[:, -1:]
-    u = stratified(len(edges), num_samples, generator, edges.device)
-    index = torch.searchsorted(cdf, u, right=True).clamp(1, weights.shape[1])
-    low, high = cdf.gather(1, index - 1), cdf.gather(1, index)
-    inside = ((u - low) / (high - low).clamp(min=1e-8)).clamp(0, 1)
-    return torch.lerp(edges.gather(1, index - 1), edges.gather(1, index), inside)
+    return invert_cdf(edges, weights, stratified(len(edges), num_samples, generator, edges.device))
 
 
 def proposal_distances(

@@ -154,14 +154,20 @@ def importance_distances_reference(
     """
     edges = torch.linspace(0, 1, num_bins + 1, device=origins.device)
     distances = entry[:, None] + (leave - entry)[:, None] * edges
-    sdf = cache.lookup(origins[:, None] + distances[..., None] * directions[:, None])
+    sdf = cache.lookup_reference(origins[:, None] + distances[..., None] * directions[:, None])
     delta = (leave - entry)[:, None] / num_bins
     tau = section_optical_depth(sdf[:, :-1], sdf[:, 1:], delta, scale)
     weights, _ = weights_from_optical_depth(tau)
     weights = weights + (EVEN_SHARE * weights.sum(1, keepdim=True) + _EVEN_FLOOR) / num_bins
+    return invert_cdf(distances, weights, places)
+
+
+def invert_cdf(edges: torch.Tensor, weights: torch.Tensor, places: torch.Tensor) -> torch.Tensor:
+    """Positions [R, K] at places [R, K] in [0, 1) of the CDF of a histogram: weights [R, P], sum > 0, between edges
+    [R, P + 1]; evenly spread within an interval."""
     cdf = torch.nn.functional.pad(torch.cumsum(weights, 1), (1, 0))
     cdf = cdf / cdf[:, -1:]
-    index = torch.searchsorted(cdf, places.contiguous(), right=True).clamp(1, num_bins)
+    index = torch.searchsorted(cdf, places.contiguous(), right=True).clamp(1, weights.shape[1])
     low, high = cdf.gather(1, index - 1), cdf.gather(1, index)
     inside = ((places - low) / (high - low).clamp(min=1e-8)).clamp(0, 1)
-    return entry[:, None] + (leave - entry)[:, None] * (index - 1 + inside) / num_bins
+    return torch.lerp(edges.gather(1, index - 1), edges.gather(1, index), inside)
