@@ -329,12 +329,15 @@ def _refusal(error: ValidationError, origins: Mapping[str, str]) -> ConfigError:
     field = known.get(key)
     if field is None:
         return ConfigError(f"{detail['msg']} (in {origin}).", "`hineus config --describe` lists all settings.")
+    help_text = f"{key}: {field.description}. Default: {show_value(field.get_default(call_default_factory=True))}."
+    if detail["type"] == "value_error":  # the schema's own checks say what is wrong
+        return ConfigError(f"`{key}` = {detail['input']!r} in {origin}: {detail['ctx']['error']}.", help_text)
     bounds = _bounds(field)
     problem = "is out of bounds: it must be" if detail["type"] in _BOUND_ERRORS else "is no valid value: it must be"
     wanted = bounds if detail["type"] in _BOUND_ERRORS else f"{_type_name(field.annotation)} {bounds}".strip()
     return ConfigError(
         f"`{key}` = {detail['input']!r} in {origin} {problem} {wanted}.",
-        f"{key}: {field.description}. Default: {show_value(field.get_default(call_default_factory=True))}.",
+        help_text,
     )
 
 

@@ -8,7 +8,9 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, field_validator
+
+from configs.texts import REGION_FORMS, read_distance, read_region
 
 
 class Section(BaseModel):
@@ -54,10 +56,42 @@ class UndistortParams(Section):
     mask_erode: int = Field(
         0, ge=0, description="masks shrink by this many pixels (at the undistorted size), and the object with them"
     )
+    region: str = Field(
+        "auto",
+        description=f"region of interest: {REGION_FORMS}, in the coordinates of the exported PLY and OBJ; "
+        "a box also crops the mesh",
+    )
     roi_scale: float = Field(1.0, gt=0, description="the region of interest found automatically is scaled by this")
     up: Literal["auto", "+x", "-x", "+y", "-y", "+z", "-z"] = Field(
-        "auto", description="up axis in the world frame; auto: from the cameras"
+        "auto", description="up axis in the world frame; auto: from GPS, the ground or the cameras"
     )
+    gps: bool = Field(
+        True, description="where the photos' GPS positions agree with the cameras, the world is metric, x east, y north"
+    )
+    marker_size: float | None = Field(
+        None, gt=0, description="side of printed ArUco markers in the scene, metres; their size gives the scale"
+    )
+    marker_dictionary: Literal[
+        "4X4_50", "4X4_250", "5X5_100", "5X5_250", "6X6_250", "7X7_250", "ARUCO_ORIGINAL", "APRILTAG_36h11"
+    ] = Field("4X4_50", description="the dictionary the markers are from")
+    known_distance: str | None = Field(
+        None,
+        description="two points and the distance between them, 'X1 Y1 Z1 X2 Y2 Z2 METRES', in the coordinates of the "
+        "PLY or OBJ exported without this setting; gives the scale",
+    )
+
+    @field_validator("region")
+    @classmethod
+    def _is_region(cls, text: str) -> str:
+        read_region(text)
+        return text
+
+    @field_validator("known_distance")
+    @classmethod
+    def _is_distance(cls, text: str | None) -> str | None:
+        if text is not None:
+            read_distance(text)
+        return text
 
 
 class ExtractParams(Section):
@@ -84,6 +118,10 @@ class CleanupParams(Section):
     )
     roi_radius: float = Field(
         0.98, gt=0, le=1, description="faces farther from the centre are dropped, in radii of the region of interest"
+    )
+    remove_ground: bool = Field(False, description="cut off the ground or table, where its plane was found")
+    ground_tolerance: float = Field(
+        0.015, gt=0, description="the cut is this far above the ground's plane, in radii of the region of interest"
     )
     mask_hull: bool = Field(True, description="where masks exist, drop faces that lie outside them")
     mask_margin: int = Field(

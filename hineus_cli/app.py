@@ -54,6 +54,7 @@ Workers = Annotated[int | None, typer.Option(min=1, help="CPU threads; default: 
 Time = Annotated[
     str | None, typer.Option(help="Training budget, like 5m or 90s: sets train.minutes.", show_default=False)
 ]
+NoGround = Annotated[bool, typer.Option("--no-ground", help="Cut off the ground or table: sets cleanup.remove_ground.")]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout.")]
 Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Say more.")]
 
@@ -138,6 +139,7 @@ def run(
     device: Device = "auto",
     workers: Workers = None,
     time: Time = None,
+    no_ground: NoGround = False,
     as_json: Json = False,
     verbose: Verbose = False,
 ) -> None:
@@ -158,6 +160,7 @@ def run(
         device=device,
         workers=workers,
         time=time,
+        no_ground=no_ground,
     )
     _run(context.obj, request, as_json, verbose)
 
@@ -178,6 +181,7 @@ def stage_command(stage: Stage) -> Callable[..., None]:
         device: Device = "auto",
         workers: Workers = None,
         time: Time = None,
+        no_ground: NoGround = False,
         as_json: Json = False,
         verbose: Verbose = False,
     ) -> None:
@@ -196,6 +200,7 @@ def stage_command(stage: Stage) -> Callable[..., None]:
             device=device,
             workers=workers,
             time=time,
+            no_ground=no_ground,
         )
         _run(context.obj, request, as_json, verbose)
 

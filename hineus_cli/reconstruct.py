@@ -37,6 +37,7 @@ class Request:
         device: "auto", "cpu" or "cuda".
         workers: CPU threads; default all that this process may use.
         time: training budget, for example "5m".
+        no_ground: cut off the ground; "not said" leaves the settings as they are.
     """
 
     photos: Path | None = None
@@ -52,6 +53,7 @@ class Request:
     device: str = "auto"
     workers: int | None = None
     time: str | None = None
+    no_ground: bool = False
 
 
 @dataclass(frozen=True)
@@ -169,6 +171,8 @@ def choose_config(request: Request, workspace: Workspace) -> tuple[str | None, C
     sets = list(request.sets)
     if request.time is not None:
         sets.append(f"train.minutes={minutes(request.time)}")
+    if request.no_ground:
+        sets.append("cleanup.remove_ground=true")
     kept = request.preset is None and request.config is None and workspace.config_path.exists()
     if not kept:
         named = request.preset or default_preset()

@@ -13,7 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from stages.errors import InputError
-from stages.meshing.evaluation import KnownSurface, align_points, score_surface
+from stages.geometry.similarity import align_points
+from stages.meshing.evaluation import KnownSurface, score_surface
 
 TRUTH_MESH = "gt_mesh.ply"
 TRUTH_CAMERAS = "transforms.json"

@@ -14,6 +14,8 @@ import numpy as np
 
 from stages.errors import WorkspaceError
 from stages.geometry.cameras import PinholeCameras, PosedScene
+from stages.geometry.place import Place
+from stages.geometry.plane import Plane
 from stages.geometry.similarity import Similarity
 
 # ---------------------------------------------------------------- ingest: images/, masks/, images.json
@@ -35,6 +37,7 @@ class ImageRecord:
         blur: variance of the Laplacian of the grey image at <= 1 megapixel; low is blurred.
         has_mask: whether `masks/<name>.png` exists.
         sha256: hash of the source file.
+        gps: latitude and longitude in degrees (WGS 84) and altitude in metres, where EXIF has all three.
     """
 
     name: str
@@ -46,6 +49,7 @@ class ImageRecord:
     blur: float
     has_mask: bool
     sha256: str
+    gps: tuple[float, float, float] | None = None
 
 
 @dataclass(frozen=True)
@@ -158,23 +162,43 @@ def load_registration(folder: Path) -> dict[str, Any]:
     return read_json(folder / REGISTRATION)
 
 
-# ---------------------------------------------------------------- undistort: images/, masks/, scene.json, points.npz
+# ---------------------------------------------------------------- undistort: images/, masks/, scene.json, points.npz,
+# overview.svg
 SCENE = "scene.json"
 POINTS = "points.npz"
+OVERVIEW = "overview.svg"
+
+
+def overview_path(folder: Path) -> Path:
+    """Drawing of cameras, sparse points and the region of interest."""
+    return folder / OVERVIEW
 
 
 def save_scene(folder: Path, scene: PosedScene) -> None:
-    cameras, similarity = scene.cameras, scene.world_from_scene
+    cameras, place, ground = scene.cameras, scene.place, scene.ground
     write_json(
         folder / SCENE,
         {
             "kind": scene.kind,
             "up": scene.up.tolist(),
-            "world_from_scene": {
-                "scale": similarity.scale,
-                "rotation": similarity.rotation.tolist(),
-                "translation": similarity.translation.tolist(),
+            "world_from_scene": _plain_similarity(scene.world_from_scene),
+            "place": place
+            and {
+                "world_from_model": _plain_similarity(place.world_from_model),
+                "metric": place.metric,
+                "scale_from": place.scale_from,
+                "scale_error": place.scale_error,
+                "origin": place.origin,
+                "gps_residual": place.gps_residual,
             },
+            "ground": ground
+            and {
+                "normal": ground.normal.tolist(),
+                "offset": ground.offset,
+                "rms": ground.rms,
+                "share": ground.share,
+            },
+            "box": None if scene.box is None else scene.box.tolist(),
             "cameras": [
                 {
                     "name": name,
@@ -198,8 +222,7 @@ def load_scene(folder: Path) -> PosedScene:
     data = read_json(folder / SCENE)
     with np.load(folder / POINTS) as points:
         sparse = {key: points[key] for key in ("points", "point_errors", "observations")}
-    records = data["cameras"]
-    similarity = data["world_from_scene"]
+    records, place, ground, box = (data[key] for key in ("cameras", "place", "ground", "box"))
     return PosedScene(
         cameras=PinholeCameras(
             names=tuple(record["name"] for record in records),
@@ -207,13 +230,26 @@ def load_scene(folder: Path) -> PosedScene:
             intrinsics=np.array([record["intrinsics"] for record in records]),
             cam_from_scene=np.array([record["cam_from_scene"] for record in records]),
         ),
-        world_from_scene=Similarity(
-            similarity["scale"], np.array(similarity["rotation"]), np.array(similarity["translation"])
-        ),
+        world_from_scene=_similarity(data["world_from_scene"]),
         up=np.array(data["up"]),
         kind=data["kind"],
+        place=place and Place(**{**place, "world_from_model": _similarity(place["world_from_model"])}),
+        ground=ground and Plane(**{**ground, "normal": np.array(ground["normal"])}),
+        box=None if box is None else np.array(box),
         **sparse,
     )
+
+
+def _plain_similarity(similarity: Similarity) -> dict[str, Any]:
+    return {
+        "scale": similarity.scale,
+        "rotation": similarity.rotation.tolist(),
+        "translation": similarity.translation.tolist(),
+    }
+
+
+def _similarity(data: dict[str, Any]) -> Similarity:
+    return Similarity(data["scale"], np.array(data["rotation"]), np.array(data["translation"]))
 
 
 # ---------------------------------------------------------------- train: field.pt, metrics.jsonl, previews/

@@ -12,12 +12,17 @@ import numpy as np
 from stages import artifacts
 from stages.engine.stage import Stage, StageContext
 from stages.errors import ReconstructionError
-from stages.geometry.cameras import PinholeCameras
+from stages.geometry.cameras import PinholeCameras, PosedScene
+from stages.geometry.plane import Plane, fit_plane
+from stages.geometry.similarity import Similarity
 
 logger = logging.getLogger(__name__)
 
 # The visibility test runs on a mesh of this many times the final faces: no slower, and fine enough for clean borders.
 WORKING_FACES = 3
+# Faces that lean less than this from the ground's plane belong to it, and this much area (in the region's radii
+# squared) is enough to fit it.
+GROUND_TILT_DEG, MIN_GROUND_AREA = 15.0, 0.02
 # Specks below this part of `min_component` go before anything is measured. The rest waits until the unseen is gone:
 # a background shell may be the largest piece.
 SPECK = 0.1
@@ -39,7 +44,8 @@ def run(context: StageContext) -> dict[str, Any]:
     from stages.meshing.simplify import decimate
 
     params = context.params
-    cameras = artifacts.load_scene(context.inputs["undistort"]).cameras
+    scene = artifacts.load_scene(context.inputs["undistort"])
+    cameras = scene.cameras
     vertices, faces = artifacts.load_mesh(context.inputs["extract"])
     numbers: dict[str, Any] = {"faces_before": len(faces)}
 
@@ -57,6 +63,8 @@ def run(context: StageContext) -> dict[str, Any]:
     keep(
         inside, "outside_region", "Try `--set undistort.roi_scale=1.5`, or train for longer: `--set train.steps=6000`."
     )
+    vertices, faces = _crop(vertices, faces, scene, params)
+    numbers["ground_removed"] = params.remove_ground and scene.ground is not None
     selection, numbers["specks_dropped"] = cleaning.large_pieces(faces, SPECK * params.min_component)
     keep(selection, "speck_faces", "Try `--set cleanup.min_component=0`.")
     if params.mask_hull:
@@ -103,6 +111,57 @@ def run(context: StageContext) -> dict[str, Any]:
     }
 
 
+def _crop(vertices: np.ndarray, faces: np.ndarray, scene: PosedScene, params: Any) -> tuple[np.ndarray, np.ndarray]:
+    """The mesh within the box and above the ground, where there is a box and the ground is to go."""
+    from stages.meshing import cleaning
+
+    sides = [] if scene.box is None else box_sides(scene.box, scene.world_from_scene)
+    if params.remove_ground:
+        if scene.ground is None:
+            logger.warning("no ground was found in the sparse points, so none is removed")
+        else:
+            sides.append(_cut_above_ground(vertices, faces, scene.ground, params.ground_tolerance))
+    for normal, offset in sides:
+        vertices, faces = cleaning.clip(vertices, faces, normal, offset)
+        if not len(faces):
+            raise ReconstructionError(
+                "Nothing of the mesh is left inside the box and above the ground.",
+                "Look at `undistort.region` and at the report's drawing, or try `--set cleanup.remove_ground=false`.",
+            )
+        if params.keep_closed:
+            vertices, faces = cleaning.close_cut(vertices, faces, normal, offset)
+    return vertices, faces
+
+
+def box_sides(box: np.ndarray, world_from_scene: Similarity) -> list[tuple[np.ndarray, float]]:
+    """Planes (normal [3], offset) in the scene frame, the box's inside above them, of a world box [2, 3]."""
+    sides = []
+    for sign, corner in ((1.0, box[0]), (-1.0, box[1])):
+        for axis in range(3):
+            side = Plane(sign * np.eye(3)[axis], sign * float(corner[axis]), 0.0, 0.0).within(world_from_scene)
+            sides.append((side.normal, side.offset))
+    return sides
+
+
+def _cut_above_ground(
+    vertices: np.ndarray, faces: np.ndarray, ground: Plane, tolerance: float
+) -> tuple[np.ndarray, float]:
+    """Plane (normal [3], offset) a tolerance above the ground, which is fitted anew to the mesh where it shows it."""
+    from stages.meshing.cleaning import face_normals
+
+    centers = vertices[faces].mean(1).astype(np.float64)
+    normals = face_normals(vertices, faces)
+    areas = np.linalg.norm(normals, axis=1)
+    level = normals @ ground.normal > np.cos(np.radians(GROUND_TILT_DEG)) * areas
+    normal, offset = ground.normal, ground.offset
+    for reach in (2 * tolerance, tolerance, tolerance):
+        on_it = level & (np.abs(centers @ normal - offset) < reach)
+        if areas[on_it].sum() / 2 < MIN_GROUND_AREA:
+            return ground.normal, ground.offset + tolerance
+        normal, offset = fit_plane(centers[on_it], ground.normal, areas[on_it])
+    return normal, offset + tolerance
+
+
 def _seen_faces(vertices: np.ndarray, faces: np.ndarray, seen: np.ndarray, params: Any) -> np.ndarray:
     """Faces [F] bool to keep, given which vertices [V] bool are seen: seen ones, their surroundings, small gaps."""
     from stages.meshing import cleaning
@@ -121,7 +180,7 @@ def _seen_faces(vertices: np.ndarray, faces: np.ndarray, seen: np.ndarray, param
 
 CLEANUP = Stage(
     name="cleanup",
-    version=1,
+    version=2,
     needs=("undistort", "extract"),
     params="cleanup",
     run=run,

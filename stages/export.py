@@ -10,8 +10,8 @@ import numpy as np
 from stages import artifacts
 from stages.engine.stage import Stage, StageContext
 from stages.errors import ReconstructionError
+from stages.geometry.cameras import PosedScene
 from stages.geometry.orientation import y_up_rotation
-from stages.geometry.similarity import Similarity
 
 
 def run(context: StageContext) -> dict[str, Any]:
@@ -27,6 +27,7 @@ def run(context: StageContext) -> dict[str, Any]:
     numbers: dict[str, Any] = {
         "vertices": len(vertices),
         "faces": len(atlas.faces),
+        "units": "arbitrary units" if scene.place is None else scene.place.units,
         "extent": [round(float(side), 6) for side in np.ptp(vertices, axis=0)],
     }
     sizes: dict[str, int] = {}
@@ -40,7 +41,7 @@ def run(context: StageContext) -> dict[str, Any]:
                 atlas.faces,
                 texture_png,
                 generator=generator(),
-                extras=provenance(scene.cameras.names, world, gltf_from_world),
+                extras=provenance(scene, gltf_from_world),
             )
             artifacts.glb_path(context.out).write_bytes(data)
             sizes["glb"] = len(data)
@@ -100,19 +101,29 @@ def generator() -> str:
         return "hineus"
 
 
-def provenance(names: tuple[str, ...], world: Similarity, gltf_from_world: np.ndarray) -> dict[str, Any]:
-    """What a GLB says of its origin: the photos' number and the way back to the world and scene frames."""
-    return {
-        "photos": len(names),
-        "units": "world units of the reconstruction",
+def provenance(scene: PosedScene, gltf_from_world: np.ndarray) -> dict[str, Any]:
+    """What a GLB says of its origin: photos, units, place on Earth, and the way back to the other frames."""
+    extras = {
+        "photos": len(scene.cameras),
+        "units": "arbitrary units" if scene.place is None else scene.place.units,
         "gltf_from_world_rotation": gltf_from_world.tolist(),
-        "world_from_scene": world.matrix().tolist(),
+        "world_from_scene": scene.world_from_scene.matrix().tolist(),
     }
+    if scene.place is None:
+        return extras
+    extras["world_from_model"] = scene.place.world_from_model.matrix().tolist()
+    if scene.place.metric:
+        extras |= {"scale_from": scene.place.scale_from, "scale_relative_error": scene.place.scale_error}
+    if scene.place.origin is not None:
+        keys = ("latitude_deg", "longitude_deg", "altitude_m")
+        extras["world_origin"] = dict(zip(keys, scene.place.origin, strict=True))
+        extras["gps_residual_m"] = scene.place.gps_residual
+    return extras
 
 
 EXPORT = Stage(
     name="export",
-    version=1,
+    version=2,
     needs=("undistort", "atlas", "bake"),
     params="export",
     run=run,

@@ -43,6 +43,8 @@ NAMED_IN_ERRORS = 3  # this many file names are spelt out in an error message
 ORIENTATION, MAKE, MODEL, EXIF_IFD = 0x0112, 0x010F, 0x0110, 0x8769
 FOCAL_LENGTH, FOCAL_LENGTH_35MM, LENS_MODEL, EXIF_WIDTH = 0x920A, 0xA405, 0xA434, 0xA002
 FOCAL_PLANE_X_RESOLUTION, FOCAL_PLANE_UNIT = 0xA20E, 0xA210
+GPS_IFD = 0x8825
+GPS_LATITUDE_REF, GPS_LATITUDE, GPS_LONGITUDE_REF, GPS_LONGITUDE, GPS_ALTITUDE_REF, GPS_ALTITUDE = range(1, 7)
 FOCAL_PLANE_UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 
 Item = TypeVar("Item")
@@ -113,6 +115,7 @@ def run(context: StageContext) -> dict[str, Any]:
         "masks": masked,
         "cameras": len({record.camera for record in images}),
         "with_focal": sum(record.focal_px is not None for record in images),
+        "with_gps": sum(record.gps is not None for record in images),
         "median_blur": round(float(np.median([record.blur for record in images])), 1),
     }
 
@@ -269,6 +272,7 @@ def _take_photo(
         blur=_blur(np.asarray(rgb)),
         has_mask=mask is not None,
         sha256=digest,
+        gps=_gps(exif),
     )
 
 
@@ -351,6 +355,25 @@ def _focal_px(exif: Any, size: tuple[int, int]) -> float | None:
         candidates.append(from_35mm)
     plausible = [focal for focal in candidates if 0.2 < focal / max(size) < 20]
     return plausible[0] if plausible else None
+
+
+def _gps(exif: Any) -> tuple[float, float, float] | None:
+    """Latitude, longitude (degrees) and altitude (metres), or None where one of them is missing or no number."""
+    tags = exif.get_ifd(GPS_IFD)
+    try:
+        latitude, longitude = (
+            sum(float(part) / 60**k for k, part in enumerate(tags[tag])) for tag in (GPS_LATITUDE, GPS_LONGITUDE)
+        )
+        altitude = float(tags[GPS_ALTITUDE])
+    except (KeyError, TypeError, ValueError, ZeroDivisionError):
+        return None
+    south, west = (str(tags.get(tag, "")).upper().startswith(side) for tag, side in (
+        (GPS_LATITUDE_REF, "S"), (GPS_LONGITUDE_REF, "W")
+    ))  # fmt: skip
+    below_sea = tags.get(GPS_ALTITUDE_REF) in (1, b"\x01")
+    found = (-latitude if south else latitude, -longitude if west else longitude, -altitude if below_sea else altitude)
+    # 0, 0 is what cameras write that have no fix
+    return found if all(map(math.isfinite, found)) and max(map(abs, found[:2])) > 0 else None
 
 
 def _camera_key(exif: Any, size: tuple[int, int]) -> str:
@@ -440,7 +463,7 @@ def _write_mask(mask: np.ndarray, target: Path, size: tuple[int, int]) -> None:
 
 INGEST = Stage(
     name="ingest",
-    version=1,
+    version=2,
     needs=(),
     params="ingest",
     run=run,

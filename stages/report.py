@@ -30,6 +30,7 @@ THUMBNAIL_SIDE = 200
 STILL_SIDE = 480
 PICTURE_SIDE = 768
 MAX_PREVIEWS = 4
+SVG = "http://www.w3.org/2000/svg"
 CHART_POINTS = 240
 # Training numbers worth a curve where they are logged, in the order of the page.
 CURVES = ("psnr", "loss", "rgb", "eikonal", "mask", "scale")
@@ -65,6 +66,9 @@ def run(context: StageContext) -> dict[str, Any]:
     context.progress(3, steps, "writing the page")
     page |= {
         "numbers": headline(scene, atlas, manifests),
+        # part of a page, the drawing needs no namespace
+        "overview": read_text(artifacts.overview_path(inputs["undistort"])).replace(f' xmlns="{SVG}"', ""),
+        "where": describe_where(scene, manifests.get("undistort", {}).get("numbers") or {}),
         "charts": training_charts(artifacts.metrics_path(inputs["train"])),
         "previews": training_previews(artifacts.previews_path(inputs["train"])),
         "stages": [stage_row(name, manifest) for name, manifest in manifests.items() if manifest],
@@ -125,6 +129,21 @@ def headline(scene: PosedScene, atlas: AtlasMesh, manifests: dict[str, dict[str,
     return [{"label": label, "value": value} for label, value in numbers]
 
 
+def describe_where(scene: PosedScene, numbers: dict[str, Any]) -> list[str]:
+    """Sentences on the region of interest, the ground, up, the scale and the place."""
+    radius = scene.world_from_scene.scale
+    metric = scene.place is not None and scene.place.metric
+    sentences = [
+        f"The region of interest (orange) has a radius of {radius:.4g}{' m' if metric else ''}, from "
+        f"{numbers.get('region_from', 'elsewhere')}. Sparse points inside it are green, cameras blue."
+    ]
+    if scene.ground is not None:
+        sentences.append(f"The ground (dashed) holds {100 * scene.ground.share:.0f} % of the sparse points near it.")
+    if "up_from" in numbers:
+        sentences.append(f"Up is from {numbers['up_from']}.")
+    return [*sentences, scene.place.describe()] if scene.place is not None else sentences
+
+
 def stage_row(name: str, manifest: dict[str, Any]) -> dict[str, str]:
     """One line of the stage table."""
     numbers = manifest.get("numbers") or {}
@@ -167,6 +186,11 @@ def plain(value: float | str) -> str:
     if isinstance(value, float):
         return f"{value:.4g}"
     return f"{value:,}" if isinstance(value, int) else value
+
+
+def read_text(path: Path) -> str:
+    """The file's text; empty where there is none."""
+    return path.read_text(encoding="utf-8") if path.exists() else ""
 
 
 # ---------------------------------------------------------------- pictures
@@ -365,7 +389,7 @@ def training_previews(folder: Path) -> list[dict[str, str]]:
 
 REPORT = Stage(
     name="report",
-    version=2,
+    version=3,
     needs=("ingest", "sfm", "undistort", "train", "extract", "cleanup", "atlas", "bake", "export"),
     params="report",
     run=run,

@@ -1,22 +1,35 @@
-"""Undistort: poses + photos -> pinhole images, masks warped by the same maps, the normalised scene."""
+"""Undistort: poses + photos -> pinhole images, masks warped by the same maps, the normalised scene.
+
+The scene: where the photos were taken and how large (place), what they are about (region), what it stands on
+(ground), which way is up.
+"""
 
 from __future__ import annotations
 
 import logging
 from collections import Counter
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
-from pathlib import PurePosixPath
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
 
+from configs.texts import read_distance, read_region
 from stages import artifacts
 from stages.engine.stage import Stage, StageContext
-from stages.errors import ReconstructionError
-from stages.geometry import normalisation
+from stages.errors import InputError, ReconstructionError
 from stages.geometry.cameras import PinholeCameras, PosedScene
+from stages.geometry.markers import detect_markers, measure_markers
+from stages.geometry.normalisation import into_scene, scene_frame
+from stages.geometry.overview import overview_svg
+from stages.geometry.place import Located, Place, locate
+from stages.geometry.plane import Plane, find_ground
+from stages.geometry.region import RegionOfInterest, find_region, given_region, grown_alone
+from stages.geometry.similarity import Similarity
+from stages.geometry.up import Up, choose_up, estimate_up
 
 log = logging.getLogger(__name__)
 
@@ -56,8 +69,8 @@ def run(context: StageContext) -> dict[str, Any]:
 
     done = 0
 
-    def warp(job: tuple[str, str, int]) -> np.ndarray | None:
-        """Writes one image (and its mask) and returns the mask."""
+    def warp(job: tuple[str, str, int]) -> tuple[np.ndarray | None, dict[int, np.ndarray]]:
+        """Writes one image (and its mask); returns the mask and the markers seen."""
         nonlocal done
         source, name, camera_id = job
         maps = maps_of(camera_id)
@@ -69,26 +82,43 @@ def run(context: StageContext) -> dict[str, Any]:
             artifacts.write_png(artifacts.mask_path(context.out, name), mask, PNG_COMPRESSION)
         done += 1
         context.progress(done, len(photos) + 1, source)
-        return mask
+        return mask, detect_markers(pixels, params.marker_dictionary) if params.marker_size else {}
 
     before = cv2.getNumThreads()
     cv2.setNumThreads(1)  # the pool below is the parallelism
     try:
         with ThreadPoolExecutor(max_workers=max(1, context.workers)) as pool:
             jobs = [(photo.name, name, photo.camera_id) for photo, name in zip(photos, names, strict=True)]
-            masks = list(pool.map(warp, jobs))
+            masks, markers = zip(*pool.map(warp, jobs), strict=True)
     finally:
         cv2.setNumThreads(before)
 
-    world_cameras = PinholeCameras(
+    cameras = PinholeCameras(
         names=tuple(names),
         sizes=np.array([warps[photo.camera_id].size for photo in photos], dtype=np.int64),
         intrinsics=np.stack([warps[photo.camera_id].intrinsics for photo in photos]),
         cam_from_scene=np.stack([photo.cam_from_world().matrix() for photo in photos]),
     )
     points, errors, observations = _sparse_points(model, photos)
-    scene, region = _normalise(world_cameras, points, errors, observations, masks, params)
+    positions = _gps_positions(ingest, [photo.name for photo in photos]) if params.gps else {}
+    place, located = _find_place(cameras, positions, markers, params)
+    cameras, points = into_scene(cameras, place.world_from_model.inverse()), place.world_from_model.apply(points)
+    region, ground, up = _find_region(cameras, points, masks, located, params)
+    world_from_scene = scene_frame(region.center, region.radius, up.direction)
+    scene = PosedScene(
+        cameras=into_scene(cameras, world_from_scene),
+        world_from_scene=world_from_scene,
+        points=world_from_scene.inverse().apply(points).astype(np.float32),
+        point_errors=errors,
+        observations=observations,
+        up=np.array([0.0, 0.0, 1.0]),
+        kind=region.kind,
+        place=place,
+        ground=ground and ground.within(world_from_scene),
+        box=region.box,
+    )
     artifacts.save_scene(context.out, scene)
+    artifacts.overview_path(context.out).write_text(overview_svg(scene), encoding="utf-8")
     context.progress(len(photos) + 1, len(photos) + 1, "done")
 
     inside = np.linalg.norm(scene.points, axis=1) < 1
@@ -99,6 +129,12 @@ def run(context: StageContext) -> dict[str, Any]:
         "masks": sum(mask is not None for mask in masks),
         "kind": scene.kind,
         "region_from": region.source,
+        "up_from": up.source,
+        "ground": ground is not None,
+        "units": place.units,
+        "scale_from": place.scale_from or "nothing",
+        "scale_error_percent": place.scale_error and round(100 * place.scale_error, 3),
+        "gps_residual_m": place.gps_residual and round(place.gps_residual, 3),
         "points": len(points),
         "points_inside": int(inside.sum()),
         "camera_distance": round(float(np.median(np.linalg.norm(scene.cameras.centers, axis=1))), 3),
@@ -192,41 +228,106 @@ def _sparse_points(model: Any, photos: list[Any]) -> tuple[np.ndarray, np.ndarra
     return points, errors, np.array(sorted(seen), dtype=np.int32).reshape(-1, 2)
 
 
-def _normalise(
+# ---------------------------------------------------------------- scale and place
+def _gps_positions(ingest: Path, names: list[str]) -> dict[int, tuple[float, float, float]]:
+    """GPS position of each photo that has one, by the photo's index."""
+    gps = {record.name: record.gps for record in artifacts.load_image_set(ingest).images}
+    return {i: found for i, name in enumerate(names) if (found := gps.get(name)) is not None}
+
+
+def _find_place(
+    cameras: PinholeCameras,
+    positions: dict[int, tuple[float, float, float]],
+    markers: Sequence[dict[int, np.ndarray]],
+    params: Any,
+) -> tuple[Place, Located | None]:
+    """Scale and place of the world from all that is known: a stated distance over markers over GPS."""
+    place, located = Place(Similarity.identity()), None
+    if positions:
+        indices = list(positions)
+        try:
+            located = locate(cameras.centers[indices], np.array([positions[i] for i in indices]))
+        except ValueError as error:
+            log.warning("GPS is not used: %s", error)
+    if located is not None:
+        log.info("GPS: %d of %d positions used, residual %.2g m", located.used, len(positions), located.residual)
+        place = Place(
+            world_from_model=located.world_from_model,
+            metric=True,
+            scale_from="GPS",
+            scale_error=located.scale_error,
+            origin=located.origin,
+            gps_residual=located.residual,
+        )
+    if params.marker_size is not None:
+        found = measure_markers(cameras, markers, params.marker_size)
+        if found is None:
+            seen, kind = sum(bool(each) for each in markers), params.marker_dictionary
+            raise InputError(
+                f"No marker could be measured: {seen} of {len(cameras)} photos show any of {kind}, and two "
+                " that see the same marker from different sides are needed.",
+                "Check `undistort.marker_dictionary`, or leave markers out: `--set undistort.marker_size=null`.",
+            )
+        factor = found.factor / place.world_from_model.scale
+        if place.metric:
+            _compare(factor, np.hypot(found.error, place.scale_error or 0), "Markers", "GPS")
+        source = f"{found.markers} marker{'s' if found.markers > 1 else ''} ({found.sides} sides)"
+        place = place.rescaled(factor, source, found.error)
+    if params.known_distance is not None:
+        first, second, metres = read_distance(params.known_distance)
+        factor = metres / float(np.linalg.norm(np.subtract(first, second)))
+        if place.metric:
+            _compare(factor, place.scale_error or 0, "The known distance", place.scale_from)
+        place = place.rescaled(factor, "a known distance", None)
+    centers = place.world_from_model.apply(cameras.centers)
+    middle = np.median(centers, axis=0)
+    return place.near(middle, float(np.median(np.linalg.norm(centers - middle, axis=1)))), located
+
+
+def _compare(factor: float, error: float, this: str, other: str) -> None:
+    """Warn where two sources of scale do not agree within their errors (and a percent)."""
+    if abs(factor - 1) > 3 * error + 0.01:
+        log.warning("%s and %s disagree on the scale by %.1f %%; the first is used", this, other, 100 * (factor - 1))
+
+
+# ---------------------------------------------------------------- region, ground, up
+def _find_region(
     cameras: PinholeCameras,
     points: np.ndarray,
-    errors: np.ndarray,
-    observations: np.ndarray,
-    masks: list[np.ndarray | None],
+    masks: Sequence[np.ndarray | None],
+    located: Located | None,
     params: Any,
-) -> tuple[PosedScene, normalisation.RegionOfInterest]:
+) -> tuple[RegionOfInterest, Plane | None, Up]:
+    """Region, ground and up in the world frame, that of the cameras and points [P, 3]."""
+    held = estimate_up(cameras)
     try:
-        region = normalisation.find_region(cameras, points, masks)
+        region = find_region(cameras, points, masks)
     except ValueError as error:
         raise ReconstructionError(
             f"No region of interest found from {len(cameras)} cameras and {len(points)} points ({error}).",
-            "Photograph the object from more sides, or try `--set sfm.matcher=exhaustive`.",
+            "Photograph the object from more sides, try `--set sfm.matcher=exhaustive`, or say where it is: "
+            "`--set 'undistort.region=sphere X Y Z RADIUS'`.",
         ) from error
-    if params.up == "auto":
-        up = normalisation.estimate_up(cameras)
+    ground = find_ground(points, cameras.centers, held.direction, region.center, region.radius)
+    if ground is None:
+        region = grown_alone(region, points)
+    form, numbers = read_region(params.region)
+    if form != "auto":
+        region = given_region(form, numbers, region.kind)
     else:
-        up = np.eye(3)["xyz".index(params.up[1])] * (1.0 if params.up[0] == "+" else -1.0)
-    world_from_scene = normalisation.scene_frame(region.center, region.radius * params.roi_scale, up)
-    scene = PosedScene(
-        cameras=normalisation.into_scene(cameras, world_from_scene),
-        world_from_scene=world_from_scene,
-        points=world_from_scene.inverse().apply(points).astype(np.float32),
-        point_errors=errors,
-        observations=observations,
-        up=np.array([0.0, 0.0, 1.0]),
-        kind=region.kind,
-    )
-    return scene, region
+        region = replace(region, radius=region.radius * params.roi_scale)
+    if params.up != "auto":
+        direction = np.eye(3)["xyz".index(params.up[1])] * (1.0 if params.up[0] == "+" else -1.0)
+        return region, ground, Up(direction, "the settings")
+    normal = None if ground is None else ground.normal
+    if located is None:
+        return region, ground, choose_up(held, normal, None, 0.0)
+    return region, ground, choose_up(held, normal, np.array([0.0, 0.0, 1.0]), located.tilt_error_deg)
 
 
 UNDISTORT = Stage(
     name="undistort",
-    version=1,
+    version=2,
     needs=("ingest", "sfm"),
     params="undistort",
     run=run,

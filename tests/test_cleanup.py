@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -11,6 +13,7 @@ from stages.cleanup import CLEANUP
 from stages.engine.stage import StageContext
 from stages.errors import ReconstructionError
 from stages.geometry.cameras import PinholeCameras, PosedScene
+from stages.geometry.plane import Plane
 from stages.geometry.similarity import Similarity
 from stages.meshing import cleaning
 from stages.meshing.isosurface import extract_isosurface
@@ -56,13 +59,13 @@ def stage(tmp_path):
     """Runs cleanup on a mesh; returns its numbers, vertices and faces."""
     undistort, extract, out = (tmp_path / name for name in ("undistort", "extract", "out"))
 
-    def run(vertices, faces, masks=None, **params):
+    def run(vertices, faces, masks=None, scene_extras=None, **params):
         for folder in (undistort, extract, out):
             folder.mkdir()
         cameras = ring_of_cameras()
         empty = np.zeros((0, 2), dtype=np.int32)
         scene = PosedScene(cameras, Similarity.identity(), np.zeros((0, 3)), np.zeros(0), empty, np.array([0, 0, 1.0]))
-        artifacts.save_scene(undistort, scene)
+        artifacts.save_scene(undistort, replace(scene, **(scene_extras or {})))
         artifacts.save_mesh(extract, vertices, faces)
         if masks is not None:
             import cv2
@@ -298,3 +301,78 @@ def test_stage_says_when_nothing_is_left(stage):
         stage(*ball(), masks=empty)
     assert "outside_masks" in caught.value.message
     assert "--set cleanup.mask_hull=false" in caught.value.hint
+
+
+# ---------------------------------------------------------------- box and ground
+def test_clipping_a_ball_cuts_at_the_plane_and_keeps_the_rest():
+    vertices, faces = ball(0.5, resolution=48)
+    normal = np.array([0.6, 0.0, 0.8])
+    above, kept = cleaning.clip(vertices, faces, normal, 0.2)
+    heights = above @ normal
+    assert heights.min() == pytest.approx(0.2, abs=1e-6)
+    assert heights.max() == pytest.approx(0.5, abs=1e-3)
+    state = cleaning.mesh_state(kept)
+    assert state.manifold
+    rim = np.abs(heights - 0.2) < 1e-6
+    assert 100 < state.open_edges <= rim.sum()
+    np.testing.assert_allclose(np.linalg.norm(above[rim], axis=1), 0.5, atol=2e-3)
+    below, rest = cleaning.clip(vertices, faces, -normal, -0.2)
+    area = lambda v, f: np.linalg.norm(cleaning.face_normals(v, f), axis=1).sum()  # noqa: E731
+    assert area(above, kept) + area(below, rest) == pytest.approx(area(vertices, faces), rel=1e-5)
+    assert len(cleaning.clip(vertices, faces, normal, 0.6)[1]) == 0
+    np.testing.assert_array_equal(cleaning.clip(vertices, faces, normal, -0.6)[1], faces)
+
+
+def test_a_cut_is_closed_and_other_holes_are_not():
+    vertices, faces = ball(0.5, resolution=48)
+    top = vertices[faces].mean(1)[:, 2].argmax()
+    vertices, faces = cleaning.clip(vertices, np.delete(faces, top, axis=0), np.array([0.0, 0.0, 1.0]), -0.1)
+    closed, filled = cleaning.close_cut(vertices, faces, np.array([0.0, 0.0, 1.0]), -0.1)
+    assert cleaning.mesh_state(filled) == cleaning.MeshState(3, 0, 0)
+    lid = closed[filled][(np.abs(closed[filled][:, :, 2] + 0.1) < 1e-5).all(1)]
+    normals = np.cross(lid[:, 1] - lid[:, 0], lid[:, 2] - lid[:, 0])
+    assert normals[:, 2].max() <= 1e-9  # faces down
+    assert np.abs(normals[:, 2]).sum() / 2 == pytest.approx(np.pi * (0.25 - 0.01), rel=0.01)
+
+
+def table_with_ball(tilt=0.02):
+    """A ball of radius 0.4 that stands on a slab whose upper side is z = tilt x - 0.35."""
+    sides = lambda p: np.abs(p[:, 2] - tilt * p[:, 0] + 0.4) - 0.05  # noqa: E731
+    surface = extract_isosurface(lambda p: np.minimum(np.linalg.norm(p, axis=1) - 0.4, sides(p)), 64)
+    return surface.vertices, surface.faces
+
+
+@pytest.mark.parametrize("keep_closed", [False, True])
+def test_stage_removes_the_ground_on_request(stage, keep_closed):
+    ground = Plane(np.array([0.0, 0, 1]), -0.36, 0.01, 0.5)  # a little off: it is fitted anew
+    numbers, vertices, _ = stage(
+        *table_with_ball(), scene_extras={"ground": ground}, remove_ground=True, keep_closed=keep_closed
+    )
+    assert numbers["ground_removed"]
+    assert np.linalg.norm(vertices[:, :2], axis=1).max() < 0.42
+    heights = vertices[:, 2] - 0.02 * vertices[:, 0] + 0.35
+    assert heights.min() == pytest.approx(0.015, abs=0.005)
+    assert vertices[:, 2].max() > 0.38
+    assert numbers["watertight"] == keep_closed
+
+
+def test_stage_keeps_the_ground_where_none_was_found_and_says_so(stage, caplog):
+    numbers, vertices, _ = stage(*table_with_ball(), remove_ground=True)
+    assert not numbers["ground_removed"]
+    assert np.linalg.norm(vertices[:, :2], axis=1).max() > 0.85
+    assert "no ground was found" in caplog.text
+
+
+def test_stage_crops_to_the_box_of_the_world(stage):
+    turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    world = Similarity(2.0, turn, np.array([10.0, 0, 0]))
+    box = np.array([[9.6, -1.0, -0.2], [10.4, 0.4, 5.0]])
+    _, vertices, _ = stage(*ball(0.5, resolution=64), scene_extras={"world_from_scene": world, "box": box})
+    corners = world.apply(vertices.astype(float))
+    np.testing.assert_allclose(corners.min(0), [9.6, -1.0, -0.2], atol=0.01)
+    np.testing.assert_allclose(corners.max(0), [10.4, 0.4, 1.0], atol=0.01)
+
+
+def test_stage_says_when_the_box_is_empty(stage):
+    with pytest.raises(ReconstructionError, match="inside the box"):
+        stage(*ball(), scene_extras={"box": np.array([[0.7, 0.7, 0.7], [0.8, 0.8, 0.8]])})

@@ -123,6 +123,17 @@ def test_time_sets_the_training_budget(folder: Path) -> None:
     assert "minutes: 1.5" in (folder / "photos_hineus" / "config.yaml").read_text()
 
 
+def test_no_ground_sets_the_cut_and_is_remembered(folder: Path) -> None:
+    config = folder / "photos_hineus" / "config.yaml"
+    hineus("run", "photos")
+    assert "remove_ground: false" in config.read_text()
+    hineus("run", "photos", "--no-ground")
+    hineus("run", "photos")
+    assert "remove_ground: true" in config.read_text()
+    hineus("run", "photos", "--set", "cleanup.remove_ground=false")
+    assert "remove_ground: false" in config.read_text()
+
+
 @pytest.mark.parametrize(
     ("text", "expected"), [("5m", 5), ("90s", 1.5), ("1h30m", 90), ("5", 5), ("0.5h", 30), ("2min", 2)]
 )

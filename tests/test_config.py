@@ -149,3 +149,29 @@ def test_a_backbone_over_a_file_that_states_everything_wins_and_below_it_does_no
 def test_an_unknown_backbone_is_refused_with_those_there_are():
     with pytest.raises(ConfigError, match=r"hineus \| neus2"):
         load_config("cpu", None, ["train.backbone=../presets/cpu"])
+
+
+@pytest.mark.parametrize("text", ["auto", "sphere 1 -2.5 3e1 0.5", "box -1 -1 0 1 1 2"])
+def test_regions(text: str) -> None:
+    assert load_config(sets=[f"undistort.region={text}"]).undistort.region == text
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("undistort.region=ball 1 2 3 4", "it must be auto, 'sphere X Y Z RADIUS' or 'box X0 Y0 Z0 X1 Y1 Z1'"),
+        ("undistort.region=sphere 1 2 3", "'sphere' takes 4 numbers, got 3"),
+        ("undistort.region=sphere 1 2 3 -1", "the sphere's radius must be positive, not -1"),
+        ("undistort.region=box 0 0 0 1 1 0", "each of the box's X1 Y1 Z1 must be larger"),
+        ("undistort.region=box 0 0 0 1 1 wide", "'box' takes 6 numbers, got '0 0 0 1 1 wide'"),
+        ("undistort.region=sphere 0 0 0 .inf", "'sphere' takes 4 numbers, got"),
+        ("undistort.known_distance=0 0 0 1 0 0", "takes 7 numbers, got 6"),
+        ("undistort.known_distance=0 0 0 0 0 0 2", "the two points must not be the same"),
+        ("undistort.known_distance=0 0 0 1 0 0 0", "the distance must be positive, not 0 metres"),
+    ],
+)
+def test_wrong_regions_and_distances_are_refused(text: str, message: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        load_config(sets=[text])
+    assert message in caught.value.message
+    assert text.partition("=")[0] in caught.value.message

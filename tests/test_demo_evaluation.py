@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 
 from stages.errors import InputError
-from stages.geometry.similarity import Similarity
+from stages.geometry.similarity import Similarity, align_points
 from stages.meshing.evaluation import (
     KnownSurface,
-    align_points,
     sample_surface,
     score_surface,
     seen_surface,

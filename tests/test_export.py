@@ -7,6 +7,7 @@ import os
 import shutil
 import struct
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +23,7 @@ from stages.errors import ReconstructionError
 from stages.export import EXPORT, unit_normals
 from stages.geometry.cameras import PinholeCameras, PosedScene
 from stages.geometry.orientation import y_up_rotation
+from stages.geometry.place import Place
 from stages.geometry.similarity import Similarity
 from stages.meshing.writing import glb_bytes, obj_text, ply_bytes
 
@@ -149,6 +151,29 @@ def test_glb_read_by_open3d(exported):
     assert len(mesh.triangles) == 4
     assert mesh.has_triangle_uvs()
     np.testing.assert_allclose(np.asarray(mesh.vertices).min(0), to_gltf(CORNERS).min(0), atol=1e-4)
+
+
+def test_the_glb_says_its_units_and_where_on_earth_it_is(tmp_path):
+    context = workspace(tmp_path)
+    scene = artifacts.load_scene(context.inputs["undistort"])
+    assert extras_of(context)["units"] == "arbitrary units"
+    model = Similarity(3.0, np.eye(3), np.array([1.0, 2, 3]))
+    located = Place(model, True, "GPS", 0.01, (47.0, 8.5, 400.0), 1.2)
+    for place, units in ((Place(model), "arbitrary units"), (located, "metres")):
+        artifacts.save_scene(context.inputs["undistort"], replace(scene, place=place))
+        extras = extras_of(context)
+        assert extras["units"] == units
+        np.testing.assert_allclose(extras["world_from_model"], model.matrix())
+    assert extras["scale_from"] == "GPS"
+    assert extras["scale_relative_error"] == 0.01
+    assert extras["world_origin"] == {"latitude_deg": 47.0, "longitude_deg": 8.5, "altitude_m": 400.0}
+    assert extras["gps_residual_m"] == 1.2
+
+
+def extras_of(context: StageContext) -> dict:
+    EXPORT.run(context)
+    data = artifacts.glb_path(context.out).read_bytes()
+    return json.loads(data[20 : 20 + struct.unpack("<I", data[12:16])[0]])["asset"]["extras"]
 
 
 def test_obj_read_by_pymeshlab_is_in_the_world_frame(exported):

@@ -375,3 +375,30 @@ def test_real_photos_are_kept_with_the_focal_length_their_exif_gives(tmp_path, d
     context = StageContext({}, {"photos": data_dir / name / "images"}, out, tmp_path, IngestParams())
     numbers = INGEST.run(context)
     assert (numbers["images"], numbers["skipped"], numbers["with_focal"]) == (count, 0, with_focal)
+
+
+# ---------------------------------------------------------------- GPS
+def gps_exif(ref: str = "NE", altitude: float | None = 408.5, below_sea: bool = False) -> Image.Exif:
+    exif = Image.Exif()
+    exif[0x0110] = "Drone"  # without any tag of its own, Pillow writes none to PNG
+    tags = exif.get_ifd(0x8825)
+    tags[1], tags[2] = ref[0], (47.0, 22.0, 36.84)
+    tags[3], tags[4] = ref[1], (8.0, 32.0, 30.12)
+    if altitude is not None:
+        tags[5], tags[6] = b"\x01" if below_sea else b"\x00", altitude
+    return exif
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png", ".webp"])
+def test_gps_positions_are_read(photos: Path, suffix: str):
+    write_photos(photos)
+    picture(7).save(photos / f"z{suffix}", exif=gps_exif())
+    picture(8).save(photos / f"y{suffix}", exif=gps_exif("SW", below_sea=True))
+    picture(9).save(photos / f"x{suffix}", exif=gps_exif(altitude=None))
+    images, _, numbers = ingest(photos)
+    gps = {Path(record.source).stem: record.gps for record in images.images}
+    assert gps["z"] == pytest.approx((47.3769, 8.5417, 408.5), abs=1e-6)
+    assert gps["y"] == pytest.approx((-47.3769, -8.5417, -408.5), abs=1e-6)
+    assert gps["x"] is None
+    assert gps["000"] is None
+    assert numbers["with_gps"] == 2

@@ -8,6 +8,7 @@ import re
 import shutil
 import subprocess
 import xml.etree.ElementTree as ET
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -20,6 +21,9 @@ from stages.artifacts import AtlasMesh, ImageRecord, ImageSet, SkippedImage, wri
 from stages.engine.stage import StageContext
 from stages.geometry.cameras import PinholeCameras, PosedScene
 from stages.geometry.orientation import y_up_rotation
+from stages.geometry.overview import overview_svg
+from stages.geometry.place import Place
+from stages.geometry.plane import Plane
 from stages.geometry.similarity import Similarity
 from stages.report import REPORT, draw_stills, duration, line_chart, pack_viewer
 
@@ -95,6 +99,16 @@ def full(context) -> StageContext:
     kinds = np.zeros((16, 16), np.uint8)
     kinds[:4, :12], kinds[4:8, :4] = 255, 128
     write_png(artifacts.provenance_path(inputs["bake"]), kinds)
+    random = np.random.default_rng(0)
+    scene = replace(
+        artifacts.load_scene(inputs["undistort"]),
+        points=random.normal(size=(300, 3)),
+        place=Place(Similarity.identity(), True, "2 markers (8 sides)", 0.0042),
+        ground=Plane(UP, -0.2, 0.01, 0.5),
+        box=np.array([[-0.5, -0.5, -0.2], [0.5, 0.5, 0.6]]),
+    )
+    artifacts.save_scene(inputs["undistort"], scene)
+    artifacts.overview_path(inputs["undistort"]).write_text(overview_svg(scene))
     for stage in REPORT.needs:
         (inputs[stage] / "manifest.json").write_text(manifest(stage, faces=1234, share=0.123456))
     return context
@@ -155,9 +169,29 @@ def test_the_page_says_it_all_and_refers_to_nothing_outside(full):
         "&#34;speed&#34;: 3",
         "hineus 0.1.0",
         "75.0 %",
+        "Lengths are in metres ± 0.42 %, from 2 markers (8 sides).",
+        "The ground (dashed) holds 50 %",
+        "has a radius of 1 m, from",
+        "from the side</text>",
     ):
         assert text in html, text
     assert html.count("<polyline") == 2  # psnr and loss; rgb is never a number, mask never changes
+
+
+def test_the_overview_shows_each_camera_from_both_sides(full):
+    drawing = ET.fromstring(artifacts.overview_path(full.inputs["undistort"]).read_text())
+    views = drawing.findall("{*}svg")
+    assert [view.find("{*}text").text for view in views] == ["from above", "from the side"]
+    for view, height in zip(views, (0.0, -3.0), strict=True):  # the camera is at z = -3
+        camera = view.find("{*}g/{*}circle")
+        reach = 1.08 * 3
+        assert float(camera.get("cx")) == pytest.approx(180, abs=0.1)
+        assert float(camera.get("cy")) == pytest.approx(180 * (1 - height / reach), abs=0.1)
+        region = view.find("{*}circle")
+        assert float(region.get("r")) == pytest.approx(180 / reach, abs=0.1)
+        strokes = "".join(path.get("d") for path in view.findall("{*}path"))
+        assert 200 < strokes.count("h1") <= 300
+    assert len(views[1].findall("{*}path")) == len(views[0].findall("{*}path")) + 1  # the ground
 
 
 def test_photos_left_out_come_first_and_the_number_is_capped(full):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -12,7 +13,10 @@ from configs.params import UndistortParams
 from stages import artifacts
 from stages.artifacts import ImageRecord, ImageSet
 from stages.engine.stage import StageContext
+from stages.errors import InputError
 from stages.geometry.cameras import PinholeCameras, PosedScene
+from stages.geometry.place import Place
+from stages.geometry.plane import Plane
 from stages.undistort import UNDISTORT, _png_names
 
 WIDTH, HEIGHT, FOCAL = 320, 240, 300.0
@@ -213,3 +217,159 @@ def test_png_names_stay_unique():
     assert _png_names(["a.jpg", "b.png", "c/a.jpg"]) == ["a.png", "b.png", "c/a.png"]
     assert _png_names(["a.jpg", "a.png", "b.jpg"]) == ["a.jpg.png", "a.png.png", "b.png"]
     assert _png_names(["a.jpg", "a.png", "a.jpg.png"]) == ["a.jpg.png", "a.png.png", "a.jpg.png.png"]
+
+
+# ---------------------------------------------------------------- region, scale and place
+def test_a_given_sphere_is_the_unit_sphere(tmp_path: Path):
+    inputs = write_capture(tmp_path, *MODELS[0], masks=False)
+    scene, out, numbers = undistort(inputs, tmp_path, region="sphere 2.5 -1 0.5 0.75", roi_scale=3.0)
+    assert scene.world_from_scene.scale == 0.75
+    np.testing.assert_allclose(scene.world_from_scene.translation, [2.5, -1, 0.5])
+    assert scene.box is None
+    assert numbers["region_from"] == "the given sphere"
+    assert artifacts.overview_path(out).read_text().startswith("<svg")
+
+
+def test_a_given_box_is_kept_for_the_crop(tmp_path: Path):
+    inputs = write_capture(tmp_path, *MODELS[0], masks=False)
+    scene, _, _ = undistort(inputs, tmp_path, region="box 1 -2 0 3 0 1")
+    np.testing.assert_array_equal(scene.box, [[1, -2, 0], [3, 0, 1]])
+    corners = scene.world_from_scene.inverse().apply(scene.box)
+    assert np.linalg.norm(corners, axis=1).max() < 0.98
+
+
+GROWTH = 4.0  # metres a model unit
+
+
+def with_gps(inputs: dict[str, Path], noise: float) -> None:
+    """Records with positions: the model's -y is up, its z is north."""
+    import pycolmap
+
+    earth = pycolmap.GPSTransform(pycolmap.GPSTransformEllipsoid.WGS84)
+    random = np.random.default_rng(0)
+    records = []
+    for i, record in enumerate(artifacts.load_image_set(inputs["ingest"]).images):
+        pose = cam_from_world(i)
+        x, y, z = -pose[:, :3].T @ pose[:, 3] * GROWTH + noise * random.normal(size=3)
+        position = earth.enu_to_ellipsoid(np.array([[x, z, -y]]), 47.0, 8.5, 400.0)[0]
+        records.append(replace(record, gps=tuple(position)))
+    artifacts.save_image_set(inputs["ingest"], ImageSet(tuple(records)))
+
+
+def test_gps_makes_the_world_metric_with_z_up(tmp_path: Path):
+    inputs = write_capture(tmp_path, *MODELS[0], masks=False)
+    with_gps(inputs, noise=0.05)
+    scene, _, numbers = undistort(inputs, tmp_path)
+    assert (numbers["units"], numbers["scale_from"], numbers["up_from"]) == ("metres", "GPS", "GPS")
+    assert 0.02 < numbers["gps_residual_m"] < 0.2
+    world = scene.world_from_scene
+    assert scene.place.world_from_model.scale == pytest.approx(GROWTH, rel=0.02)
+    np.testing.assert_allclose(world.rotation @ [0, 0, 1], [0, 0, 1], atol=1e-6)
+    dots = world.apply(scene.points.astype(float))
+    expected = GROWTH * (DOTS - DOTS[0]) @ np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0.0]])  # east, north, up
+    np.testing.assert_allclose(dots - dots[0], expected, atol=0.1)
+    assert scene.place.origin == pytest.approx((47.0, 8.5, 400.0), abs=10)
+    assert np.abs(world.translation).max() < 30
+    for i in range(len(scene.cameras)):  # the photos still agree
+        pixels, _ = scene.cameras.project(i, scene.points)
+        pose = cam_from_world(i)
+        seen = DOTS @ pose[:, :3].T + pose[:, 3]
+        np.testing.assert_allclose(pixels, FOCAL * seen[:, :2] / seen[:, 2:] + [WIDTH / 2, HEIGHT / 2], atol=1e-2)
+
+
+def test_gps_worse_than_the_spread_is_not_used(tmp_path: Path, caplog):
+    inputs = write_capture(tmp_path, *MODELS[0], masks=False)
+    with_gps(inputs, noise=20.0)
+    scene, _, numbers = undistort(inputs, tmp_path)
+    assert "GPS is not used: GPS positions miss the cameras" in caplog.text
+    assert numbers["units"] == "arbitrary units"
+    np.testing.assert_array_equal(scene.place.world_from_model.matrix(), np.eye(4))
+    assert scene.place.origin is None
+
+
+def test_gps_can_be_left_out(tmp_path: Path):
+    inputs = write_capture(tmp_path, *MODELS[0], masks=False)
+    with_gps(inputs, noise=0.0)
+    assert undistort(inputs, tmp_path, gps=False)[2]["units"] == "arbitrary units"
+
+
+def draw_markers(inputs: dict[str, Path], side: float) -> None:
+    """A marker of `side` model units lies at the centre in every photo."""
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_100)
+    page = np.full((280, 280), 255, np.uint8)
+    page[40:240, 40:240] = cv2.aruco.generateImageMarker(dictionary, 3, 200)
+    reach = 0.5 * side * 280 / 200
+    corners = CENTER + reach * np.array([[-1, 0, 1], [1, 0, 1], [1, 0, -1], [-1, 0, -1.0]])
+    for i in range(NUM_CAMERAS):
+        pose = cam_from_world(i)
+        seen = corners @ pose[:, :3].T + pose[:, 3]
+        target = FOCAL * seen[:, :2] / seen[:, 2:] + [WIDTH / 2, HEIGHT / 2] - 0.5
+        source = np.array([[0, 0], [280, 0], [280, 280], [0, 280.0]]) - 0.5
+        H = cv2.getPerspectiveTransform(source.astype(np.float32), target.astype(np.float32))
+        photo = cv2.warpPerspective(page, H, (WIDTH, HEIGHT), flags=cv2.INTER_AREA, borderValue=90)
+        assert cv2.imwrite(str(artifacts.image_path(inputs["ingest"], f"photo_{i}.jpg")), photo)
+
+
+def test_a_marker_gives_the_scale_with_its_error(tmp_path: Path):
+    inputs = write_capture(tmp_path, *MODELS[0], masks=False)
+    draw_markers(inputs, side=1.2)
+    scene, _, numbers = undistort(inputs, tmp_path, marker_size=0.3, marker_dictionary="5X5_100")
+    assert numbers["units"] == "metres"
+    assert numbers["scale_from"] == "1 marker (4 sides)"
+    assert scene.place.world_from_model.scale == pytest.approx(0.25, rel=0.01)
+    assert 0 < scene.place.scale_error < 0.02
+    np.testing.assert_allclose(scene.world_from_scene.apply(scene.points.astype(float)), 0.25 * DOTS, atol=0.02)
+
+
+def test_missing_markers_are_an_error(tmp_path: Path):
+    inputs = write_capture(tmp_path, *MODELS[0], masks=False)
+    with pytest.raises(InputError, match="No marker could be measured: 0 of 8 photos") as caught:
+        undistort(inputs, tmp_path, marker_size=0.3)
+    assert "marker_dictionary" in caught.value.hint
+
+
+def test_a_known_distance_gives_the_scale(tmp_path: Path):
+    inputs = write_capture(tmp_path, *MODELS[0], masks=False)
+    a, b = DOTS[0], DOTS[1]  # 0.4 apart
+    text = " ".join(f"{value}" for value in [*a, *b, 1.0])
+    scene, _, numbers = undistort(inputs, tmp_path, known_distance=text)
+    dots = scene.world_from_scene.apply(scene.points.astype(float))
+    assert np.linalg.norm(dots[0] - dots[1]) == pytest.approx(1.0, rel=1e-5)
+    assert numbers["scale_from"] == "a known distance"
+    assert numbers["scale_error_percent"] is None
+
+
+def test_a_distance_that_contradicts_gps_is_believed_and_told(tmp_path: Path, caplog):
+    inputs = write_capture(tmp_path, *MODELS[0], masks=False)
+    with_gps(inputs, noise=0.01)
+    scene, _, _ = undistort(inputs, tmp_path, known_distance="0 0 0 1 0 0 1.2")
+    assert "The known distance and GPS disagree on the scale by 20.0 %" in caplog.text
+    assert scene.place.world_from_model.scale == pytest.approx(1.2 * GROWTH, rel=0.01)
+    assert scene.place.origin is not None
+
+
+def test_coordinates_far_from_the_origin_keep_their_precision(tmp_path: Path, monkeypatch):
+    far = np.array([465123.0, 5247811.0, 410.0])
+    monkeypatch.setitem(globals(), "CENTER", CENTER + far)
+    monkeypatch.setitem(globals(), "DOTS", DOTS + far)
+    inputs = write_capture(tmp_path, *MODELS[0], masks=False)
+    scene, _, _ = undistort(inputs, tmp_path)
+    model_from_world = scene.place.world_from_model.inverse()
+    assert np.abs(scene.world_from_scene.translation).max() < 5
+    world = scene.world_from_scene.apply(scene.points.astype(float)).astype(np.float32)
+    np.testing.assert_allclose(model_from_world.apply(world.astype(float)), DOTS, atol=1e-5)
+
+
+def test_scene_records_survive_saving(tmp_path: Path):
+    inputs = write_capture(tmp_path, *MODELS[0], masks=False)
+    scene, _, _ = undistort(inputs, tmp_path)
+    place = Place(scene.world_from_scene, True, "GPS", 0.01, (47.0, 8.5, 400.0), 1.5)
+    full = replace(scene, place=place, ground=Plane(np.array([0.0, 0, 1]), -0.3, 0.01, 0.4), box=np.eye(3)[:2])
+    artifacts.save_scene(tmp_path, full)
+    loaded = artifacts.load_scene(tmp_path)
+    np.testing.assert_array_equal(loaded.ground.normal, [0, 0, 1])
+    assert (loaded.ground.offset, loaded.ground.rms, loaded.ground.share) == (-0.3, 0.01, 0.4)
+    np.testing.assert_array_equal(loaded.box, full.box)
+    np.testing.assert_array_equal(loaded.place.world_from_model.matrix(), place.world_from_model.matrix())
+    assert tuple(loaded.place.origin) == place.origin
+    assert loaded.place.describe() == place.describe()

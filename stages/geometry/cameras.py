@@ -11,6 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from stages.geometry.place import Place
+from stages.geometry.plane import Plane
 from stages.geometry.similarity import Similarity
 
 
@@ -71,12 +73,15 @@ class PosedScene:
 
     Attributes:
         cameras: the registered, undistorted images.
-        world_from_scene: similarity from the normalised frame to the SfM (or imported) world frame.
+        world_from_scene: similarity from the normalised frame to the world frame, that of the results.
         points: [P, 3] float32 sparse points in the scene frame.
         point_errors: [P] float32 mean reprojection error in pixels.
         observations: [M, 2] int32 rows (image index, point index): which image saw which point.
         up: [3] unit vector, the estimated up direction in the scene frame.
-        kind: "object" (cameras around one thing) or "forward" (forward-facing or aerial).
+        kind: "object" (cameras around one thing) or "forward" (a room, a facade, a survey flight).
+        place: how the world frame stands to the poses' own frame, to metres and to the Earth; None: not looked for.
+        ground: plane of the ground or table in the scene frame, or None where none was found.
+        box: [2, 3] lowest and highest corner in the world frame of the box the mesh is cropped to, or None.
     """
 
     cameras: PinholeCameras
@@ -86,3 +91,6 @@ class PosedScene:
     observations: np.ndarray
     up: np.ndarray
     kind: str = "object"
+    place: Place | None = None
+    ground: Plane | None = None
+    box: np.ndarray | None = None

@@ -49,3 +49,27 @@ class Similarity:
         matrix[:3, :3] = self.scale * self.rotation
         matrix[:3, 3] = self.translation
         return matrix
+
+
+def align_points(source: np.ndarray, target: np.ndarray) -> Similarity:
+    """The similarity `target_from_source` with the least squared error between paired points [P, 3].
+
+    Source: Umeyama, "Least-squares estimation of transformation parameters between two point patterns", 1991.
+
+    Raises:
+        ValueError: fewer than 3 pairs, or all source points on one line.
+    """
+    if source.shape != target.shape or source.ndim != 2 or source.shape[1] != 3:
+        raise ValueError(f"paired points [P, 3] expected, got {source.shape} and {target.shape}")
+    if len(source) < 3:
+        raise ValueError(f"at least 3 pairs are needed to align, got {len(source)}")
+    source_mean, target_mean = source.mean(0), target.mean(0)
+    centered = source - source_mean
+    covariance = (target - target_mean).T @ centered / len(source)
+    left, singular, right = np.linalg.svd(covariance)
+    if singular[1] < 1e-12 * max(singular[0], 1e-300):
+        raise ValueError("the points lie on one line: the rotation about it cannot be found")
+    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(left) * np.linalg.det(right))])
+    rotation = (left * signs) @ right
+    scale = float((singular * signs).sum() / (centered**2).sum(1).mean())
+    return Similarity(scale, rotation, target_mean - scale * rotation @ source_mean)

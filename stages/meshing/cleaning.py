@@ -198,6 +198,50 @@ def inside_ball(vertices: np.ndarray, faces: np.ndarray, radius: float) -> np.nd
     return (np.linalg.norm(vertices, axis=1) <= radius)[faces].all(1)
 
 
+def clip(vertices: np.ndarray, faces: np.ndarray, normal: np.ndarray, offset: float) -> tuple[np.ndarray, np.ndarray]:
+    """The part of the mesh with normal . x >= offset; faces across the plane are cut at it. Unused vertices go."""
+    heights = vertices.astype(np.float64) @ normal - offset
+    inside = heights >= 0
+    corners_inside = inside[faces].sum(1)
+    whole, across = faces[corners_inside == 3], faces[(corners_inside > 0) & (corners_inside < 3)]
+    if not len(across):
+        return compact(vertices, whole)
+    # turned so that the corner alone on its side comes first
+    alone = inside[across] == (inside[across].sum(1) == 1)[:, None]
+    start = alone.argmax(1)[:, None]
+    a, b, c = np.take_along_axis(across, (start + np.arange(3)) % 3, axis=1).T
+    edges = np.sort(np.stack([np.stack([a, b], 1), np.stack([a, c], 1)]), axis=2)
+    unique, index = np.unique(edges.reshape(-1, 2), axis=0, return_inverse=True)
+    low, high = heights[unique[:, 0]], heights[unique[:, 1]]
+    part = (low / (low - high))[:, None]
+    cut = vertices[unique[:, 0]] * (1 - part) + vertices[unique[:, 1]] * part
+    ab, ac = len(vertices) + index.reshape(2, -1)
+    tips = inside[a]
+    new = [np.stack([a, ab, ac], 1)[tips], np.stack([ab, b, c], 1)[~tips], np.stack([ab, c, ac], 1)[~tips]]
+    return compact(np.concatenate([vertices, cut.astype(vertices.dtype)]), np.concatenate([whole, *new]))
+
+
+def close_cut(
+    vertices: np.ndarray, faces: np.ndarray, normal: np.ndarray, offset: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """The mesh with the holes that `clip` left at this plane closed, each by itself. All else is as it was."""
+    import pymeshlab
+
+    on_plane = np.abs(vertices @ normal - offset) < 1e-5
+    if not on_plane.any():
+        return vertices, faces
+    meshes = pymeshlab.MeshSet()
+    meshes.add_mesh(
+        pymeshlab.Mesh(
+            vertices.astype(np.float64), faces, f_scalar_array=(on_plane[faces].sum(1) >= 2).astype(np.float64)
+        )
+    )
+    meshes.compute_selection_by_condition_per_face(condselect="fq > 0.5")
+    meshes.meshing_close_holes(maxholesize=len(faces), selected=True, selfintersection=False)
+    closed = meshes.current_mesh()
+    return closed.vertex_matrix().astype(vertices.dtype), closed.face_matrix().astype(faces.dtype)
+
+
 def raycaster(vertices: np.ndarray, faces: np.ndarray) -> Any:
     """Open3D's RaycastingScene of one mesh."""
     import open3d as o3d

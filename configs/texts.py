@@ -1,0 +1,50 @@
+"""Settings that are written as a line of text, and what they say."""
+
+from __future__ import annotations
+
+import math
+
+REGION_FORMS = "auto, 'sphere X Y Z RADIUS' or 'box X0 Y0 Z0 X1 Y1 Z1'"
+
+
+def read_region(text: str) -> tuple[str, tuple[float, ...]]:
+    """("auto", ()), ("sphere", (x, y, z, radius)) or ("box", (x0, y0, z0, x1, y1, z1)).
+
+    Raises:
+        ValueError: it is none of these, or has no volume.
+    """
+    form, *rest = text.split() or [""]
+    expected = {"auto": 0, "sphere": 4, "box": 6}.get(form)
+    if expected is None:
+        raise ValueError(f"it must be {REGION_FORMS}")
+    numbers = _numbers(rest, expected, f"'{form}'")
+    if form == "sphere" and numbers[3] <= 0:
+        raise ValueError(f"the sphere's radius must be positive, not {numbers[3]:g}")
+    if form == "box" and any(high <= low for low, high in zip(numbers[:3], numbers[3:], strict=True)):
+        raise ValueError("each of the box's X1 Y1 Z1 must be larger than its X0 Y0 Z0")
+    return form, numbers
+
+
+def read_distance(text: str) -> tuple[tuple[float, ...], tuple[float, ...], float]:
+    """Two points and the metres between them, from 'X1 Y1 Z1 X2 Y2 Z2 METRES'.
+
+    Raises:
+        ValueError: it is not that, the points are one, or the length is not positive.
+    """
+    numbers = _numbers(text.split(), 7, "'X1 Y1 Z1 X2 Y2 Z2 METRES'")
+    first, second, metres = numbers[:3], numbers[3:6], numbers[6]
+    if first == second:
+        raise ValueError("the two points must not be the same")
+    if metres <= 0:
+        raise ValueError(f"the distance must be positive, not {metres:g} metres")
+    return first, second, metres
+
+
+def _numbers(words: list[str], expected: int, what: str) -> tuple[float, ...]:
+    try:
+        numbers = tuple(float(word) for word in words)
+    except ValueError:
+        raise ValueError(f"{what} takes {expected} numbers, got {' '.join(words)!r}") from None
+    if len(numbers) != expected or not all(map(math.isfinite, numbers)):
+        raise ValueError(f"{what} takes {expected} numbers, got {len(numbers)}")
+    return numbers

@@ -1,0 +1,182 @@
+"""Where on Earth and how large: from the frame of the poses to a local frame in metres.
+
+The poses' own frame is called "model". "world" is the frame of the results: that of the model where nothing is known,
+else metres, and with GPS east, north, up from an origin near the photos.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from stages.geometry.similarity import Similarity, align_points
+
+# WGS 84: semi-major axis in metres and flattening.
+EARTH_RADIUS, FLATTENING = 6378137.0, 1 / 298.257223563
+MIN_LOCATED = 4
+# Photos within this narrow a strip (part of its length) leave the turn about it open.
+MIN_STRIP = 0.05
+# The residual may be this part of the positions' spread: a larger one says that GPS wanders as far as the photographer.
+MAX_RESIDUAL = 0.25
+SAMPLES, OUTLIER_SIGMAS = 500, 3.0
+# Coordinates keep this part of the region's radius in 32 bits; where they would not, the origin moves.
+PRECISION = 1e-5
+
+
+@dataclass(frozen=True)
+class Place:
+    """How the world of the results stands to the poses' own frame, to metres and to the Earth.
+
+    Attributes:
+        world_from_model: from the frame of the poses.
+        metric: whether world units are metres.
+        scale_from: what the scale was found from, in words; empty where it is not known.
+        scale_error: relative standard error of the scale, or None where it is not known.
+        origin: latitude and longitude in degrees and altitude in metres of the world's origin (x east, y north,
+            z up), or None.
+        gps_residual: root mean square distance in metres of the cameras from their GPS positions, or None.
+    """
+
+    world_from_model: Similarity
+    metric: bool = False
+    scale_from: str = ""
+    scale_error: float | None = None
+    origin: tuple[float, float, float] | None = None
+    gps_residual: float | None = None
+
+    @property
+    def units(self) -> str:
+        return "metres" if self.metric else "arbitrary units"
+
+    def describe(self) -> str:
+        """One sentence on the scale, one on the place."""
+        if not self.metric:
+            return "The scale is not known: lengths are in arbitrary units."
+        error = "" if self.scale_error is None else f" ± {100 * self.scale_error:.2g} %"
+        text = f"Lengths are in metres{error}, from {self.scale_from}."
+        if self.origin is not None:
+            latitude, longitude, altitude = self.origin
+            text += (
+                f" The origin is at latitude {latitude:.6f}, longitude {longitude:.6f}, altitude {altitude:.1f} m; "
+                f"x points east, y north, z up (GPS residual {self.gps_residual:.2g} m)."
+            )
+        return text
+
+    def rescaled(self, factor: float, scale_from: str, scale_error: float | None) -> Place:
+        """The same place with all lengths multiplied by `factor`, the origin where it was."""
+        stretch = Similarity(factor, np.eye(3), np.zeros(3))
+        world_from_model = stretch.compose(self.world_from_model)
+        return Place(world_from_model, True, scale_from, scale_error, self.origin, self.gps_residual)
+
+    def near(self, center: np.ndarray, radius: float) -> Place:
+        """The same place with its origin near `center` (world) where 32-bit coordinates would lose precision."""
+        if np.abs(center).max() * np.finfo(np.float32).eps < PRECISION * radius:
+            return self
+        shift = Similarity(1.0, np.eye(3), -np.round(center))
+        moved = shift.compose(self.world_from_model)
+        return Place(moved, self.metric, self.scale_from, self.scale_error, None, self.gps_residual)
+
+
+# ---------------------------------------------------------------- GPS
+@dataclass(frozen=True)
+class Located:
+    """A model aligned to GPS.
+
+    Attributes:
+        world_from_model: to metres east, north, up of `origin`.
+        origin: latitude, longitude (degrees), altitude (metres).
+        residual: root mean square distance in metres of the photos used, corrected for the freedom of the fit.
+        scale_error: relative standard error of the scale.
+        tilt_error_deg: standard error of up, degrees.
+        used: photos whose position fits, of those that carry one.
+    """
+
+    world_from_model: Similarity
+    origin: tuple[float, float, float]
+    residual: float
+    scale_error: float
+    tilt_error_deg: float
+    used: int
+
+    @property
+    def up(self) -> np.ndarray:
+        """[3] unit, in the model's frame."""
+        return self.world_from_model.rotation[2]
+
+
+def east_north_up(positions: np.ndarray, origin: tuple[float, float, float]) -> np.ndarray:
+    """[N, 3] metres east, north and up of `origin` of positions [N, 3]: latitude, longitude (degrees), altitude (m)."""
+    latitude, longitude = np.radians(origin[:2])
+    east = np.array([-np.sin(longitude), np.cos(longitude), 0.0])
+    up = np.array([np.cos(latitude) * np.cos(longitude), np.cos(latitude) * np.sin(longitude), np.sin(latitude)])
+    return (_earth_centred(positions) - _earth_centred(np.array([origin]))) @ np.stack([east, np.cross(up, east), up]).T
+
+
+def _earth_centred(positions: np.ndarray) -> np.ndarray:
+    """[N, 3] metres from the Earth's centre (WGS 84)."""
+    latitude, longitude = np.radians(positions[:, :2]).T
+    altitude = positions[:, 2]
+    squared_eccentricity = FLATTENING * (2 - FLATTENING)
+    normal_radius = EARTH_RADIUS / np.sqrt(1 - squared_eccentricity * np.sin(latitude) ** 2)
+    across = (normal_radius + altitude) * np.cos(latitude)
+    along_axis = (normal_radius * (1 - squared_eccentricity) + altitude) * np.sin(latitude)
+    return np.stack([across * np.cos(longitude), across * np.sin(longitude), along_axis], 1)
+
+
+def locate(centers: np.ndarray, positions: np.ndarray, seed: int = 0) -> Located:
+    """Align camera centres to their GPS positions.
+
+    The least median of squares over triples, then least squares over the photos that fit.
+
+    Args:
+        centers: [N, 3] in the model's frame.
+        positions: [N, 3] latitude, longitude (degrees), altitude (metres).
+        seed: of the triples.
+
+    Raises:
+        ValueError: why GPS does not tell the place, with the numbers found.
+    """
+    if len(centers) < MIN_LOCATED:
+        raise ValueError(f"{len(centers)} photos carry a GPS position with altitude, {MIN_LOCATED} are needed")
+    latitude, longitude, altitude = (float(value) for value in np.median(positions, axis=0))
+    origin = latitude, longitude, altitude
+    targets = east_north_up(positions, origin)
+    _, lengths, _ = np.linalg.svd(centers - centers.mean(0))
+    if lengths[1] < MIN_STRIP * lengths[0]:
+        raise ValueError("the photos were taken from one line, and the turn about it stays open")
+    kept = _agreeing(centers, targets, seed)
+    world_from_model = align_points(centers[kept], targets[kept])
+    misses = world_from_model.apply(centers[kept]) - targets[kept]
+    count = int(kept.sum())
+    # a similarity has seven parameters: with few photos it bends to their errors
+    residual = float(np.sqrt((misses**2).sum() / count * 3 * count / (3 * count - 7)))
+    spread = np.linalg.svd(targets[kept] - targets[kept].mean(0))[1] / np.sqrt(count)
+    total = float(np.linalg.norm(spread))
+    if residual > MAX_RESIDUAL * total:
+        raise ValueError(
+            f"GPS positions miss the cameras by {residual:.2g} m while they spread over {total:.2g} m "
+            f"(at most {MAX_RESIDUAL * total:.2g} m would do)"
+        )
+    per_axis = residual / np.sqrt(3 * count)
+    tilt = np.degrees(per_axis / max(float(spread[1]), 1e-9))
+    return Located(world_from_model, origin, residual, per_axis / total, float(tilt), count)
+
+
+def _agreeing(centers: np.ndarray, targets: np.ndarray, seed: int) -> np.ndarray:
+    """[N] bool: photos whose position agrees with the similarity that most agree with."""
+    random = np.random.default_rng(seed)
+    best, best_misses = np.inf, np.zeros(len(centers))
+    for _ in range(SAMPLES):
+        triple = random.choice(len(centers), 3, replace=False)
+        try:
+            found = align_points(centers[triple], targets[triple])
+        except ValueError:
+            continue
+        misses = np.linalg.norm(found.apply(centers) - targets, axis=1)
+        # the three of the sample fit of themselves: the median of all N would be theirs where N is small
+        median = np.sort(misses)[min(len(misses) - 1, (len(misses) + 3) // 2)]
+        if median < best:
+            best, best_misses = float(median), misses
+    kept = best_misses <= max(OUTLIER_SIGMAS * best, 1e-9)
+    return kept if kept.sum() >= MIN_LOCATED else np.ones(len(centers), dtype=bool)

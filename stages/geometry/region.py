@@ -1,0 +1,259 @@
+"""Which part of the world is reconstructed: a sphere, found from cameras, sparse points and masks, or given.
+
+Cameras are given in the world frame, as `PinholeCameras` whose "scene" is the world.
+
+Two kinds of capture:
+- "object": the cameras look at one place. The sphere is centred where their optical axes meet and a little
+  larger than what the views show whole; where silhouettes are known, it encloses their visual hull instead.
+- "forward": the optical axes are nearly parallel, or meet behind the cameras (a facade, a room, a survey
+  flight). The sphere encloses the sparse points, outliers aside.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from stages.geometry.cameras import PinholeCameras
+
+# Axes that spread less than this (root mean square angle to their mean) are "nearly parallel".
+MIN_AXIS_SPREAD_DEG = 8.0
+# The meeting point must lie in front of this part of the cameras ...
+MIN_IN_FRONT = 0.8
+# ... and the axes must pass it within this part of its distance (median): else they do not meet.
+MAX_MISS_RATIO = 0.5
+# The sphere of an object capture comes from the median of the largest spheres each camera sees whole, but is
+# no smaller than this part of the distance to the cameras (close-ups see little whole).
+MIN_RADIUS_RATIO = 0.05
+# People fill the frame with the object, and its far ends stick out of the largest sphere the short side shows:
+# on three captures with known geometry they reached 0.95, 1.04 and 1.14 of its radius. Enlarged by this.
+SEEN_WHOLE_MARGIN = 1.2
+# An object without surroundings (a turntable before black cloth, a model larger than the frame): no ground, and
+# nearly all sparse points within this many seen-whole radii. Then they are the object, all of it and little else.
+ALONE_RADII, ALONE_SHARE = 2.5, 0.97
+ALONE_PERCENTILES, ALONE_MARGIN = (0.5, 99.5), 1.05
+# Free space around silhouettes' visual hull: 10 % of the radius.
+HULL_MARGIN = 1.1
+# A voxel belongs to the hull when it is inside the silhouette in this part of the views it projects into;
+# less than 1, because a mask or a pose may be wrong.
+HULL_AGREEMENT = 0.9
+HULL_CELLS = 48
+# Robust range of the sparse points of a forward capture, percent.
+FORWARD_PERCENTILES = (1.0, 99.0)
+FORWARD_MARGIN = 1.05
+# Points farther from the nearest camera than this many times the median are horizon, not what was photographed.
+FORWARD_DEPTHS = 4.0
+# The sphere about a given box has some air at the corners, because the mesh is cut off near the sphere.
+BOX_MARGIN = 1.05
+FROM_FRUSTA, FROM_POINTS = "the frusta of the cameras", "the sparse points"
+IRLS_STEPS = 30
+TINY = 1e-12  # keeps divisions finite; far below any length that occurs
+
+
+@dataclass(frozen=True)
+class RegionOfInterest:
+    """The sphere that becomes the unit sphere.
+
+    Attributes:
+        center: [3] world frame.
+        radius: world units.
+        kind: "object" or "forward".
+        source: what the sphere was found from, in words.
+        box: [2, 3] lowest and highest corner in the world frame of the box that the sphere encloses, or None.
+    """
+
+    center: np.ndarray
+    radius: float
+    kind: str
+    source: str
+    box: np.ndarray | None = None
+
+
+def meeting_point(origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Point with the least summed distance to N lines (L1, by iteratively re-weighted squares).
+
+    Minimises sum_i |(I - d_i d_i^T)(p - o_i)|; L1 so that a few photos taken of something else do not count.
+
+    Args:
+        origins: [N, 3]. directions: [N, 3] unit.
+
+    Returns:
+        The point [3] and each line's distance to it [N].
+
+    Raises:
+        ValueError: fewer than two lines, or all of them parallel.
+    """
+    if len(origins) < 2:
+        raise ValueError(f"got {len(origins)} lines, expected at least 2")
+    projectors = np.eye(3) - directions[:, :, None] * directions[:, None, :]
+    if np.linalg.eigvalsh(projectors.mean(0))[0] < TINY:
+        raise ValueError("got parallel lines, expected lines that meet")
+    weights = np.ones(len(origins))
+    scale = np.linalg.norm(origins - origins.mean(0), axis=1).max() + TINY
+    for _ in range(IRLS_STEPS):
+        normal = np.einsum("n,nij->ij", weights, projectors)
+        point = np.linalg.solve(normal, np.einsum("n,nij,nj->i", weights, projectors, origins))
+        misses = np.linalg.norm(np.einsum("nij,nj->ni", projectors, point - origins), axis=1)
+        weights = 1.0 / np.maximum(misses, 1e-4 * scale)
+    return point, misses
+
+
+def axis_spread_deg(directions: np.ndarray) -> float:
+    """Root mean square angle in degrees of unit directions [N, 3] to their principal axis (sign ignored)."""
+    largest = np.linalg.eigvalsh(directions.T @ directions / len(directions))[-1]
+    return float(np.degrees(np.arcsin(np.sqrt(np.clip(1.0 - largest, 0.0, 1.0)))))
+
+
+def seen_whole_radii(cameras: PinholeCameras, center: np.ndarray) -> np.ndarray:
+    """[N] radius of the largest sphere about `center` [3] that each camera sees whole.
+
+    The least distance from the centre to the four side planes of the frustum; <= 0 where the centre itself is
+    out of view.
+    """
+    radii = np.empty(len(cameras))
+    for i in range(len(cameras)):
+        in_cam = cameras.cam_from_scene[i, :, :3] @ center + cameras.cam_from_scene[i, :, 3]
+        K, (width, height) = cameras.intrinsics[i], cameras.sizes[i]
+        left, right = -K[0, 2] / K[0, 0], (width - K[0, 2]) / K[0, 0]
+        top, bottom = -K[1, 2] / K[1, 1], (height - K[1, 2]) / K[1, 1]
+        # inward normals of the planes x = left * z and so on
+        planes = np.array([[1, 0, -left], [-1, 0, right], [0, 1, -top], [0, -1, bottom]])
+        radii[i] = (planes @ in_cam / np.linalg.norm(planes, axis=1)).min()
+        if in_cam[2] <= 0:
+            radii[i] = min(radii[i], 0.0)
+    return radii
+
+
+def visual_hull_sphere(
+    cameras: PinholeCameras, masks: Sequence[np.ndarray | None], center: np.ndarray, radius: float
+) -> tuple[np.ndarray, float] | None:
+    """Sphere about the visual hull of silhouettes, looked for in the cube `center` +- `radius`.
+
+    The cube is carved on a coarse grid, then once more on the hull's own box; without margin.
+
+    Args:
+        masks: one [H, W] bool (or 0/255) array per camera, of the camera's size, or None where there is none.
+
+    Returns:
+        Centre [3] and radius, or None where nothing is left after carving.
+    """
+    low, high = center - radius, center + radius
+    for _ in range(2):
+        cell = (high - low) / HULL_CELLS
+        axes = [low[k] + (np.arange(HULL_CELLS) + 0.5) * cell[k] for k in range(3)]
+        grid = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+        inside = _inside_silhouettes(cameras, masks, grid)
+        if not inside.any():
+            return None
+        kept = grid[inside]
+        low, high = kept.min(0) - cell, kept.max(0) + cell
+    hull_center = (kept.min(0) + kept.max(0)) / 2
+    # a cell's own half diagonal, because the grid holds centres of cells
+    hull_radius = np.linalg.norm(kept - hull_center, axis=1).max() + np.linalg.norm(cell) / 2
+    return hull_center, float(hull_radius)
+
+
+def _inside_silhouettes(cameras: PinholeCameras, masks: Sequence[np.ndarray | None], points: np.ndarray) -> np.ndarray:
+    """[P] whether points [P, 3] lie inside the silhouettes of nearly all the views they project into."""
+    seen, inside = np.zeros(len(points)), np.zeros(len(points))
+    masked = [i for i, mask in enumerate(masks) if mask is not None]
+    for i in masked:
+        pixels, depth = cameras.project(i, points)
+        width, height = cameras.sizes[i]
+        u, v = np.floor(pixels[:, 0]), np.floor(pixels[:, 1])
+        visible = (depth > 0) & (u >= 0) & (v >= 0) & (u < width) & (v < height)
+        rows, columns = v[visible].astype(int), u[visible].astype(int)
+        seen += visible
+        inside[visible] += np.asarray(masks[i])[rows, columns] > 0
+    # a voxel most views do not see is no part of what they were pointed at
+    return (seen >= max(1.0, 0.5 * len(masked))) & (inside >= HULL_AGREEMENT * seen)
+
+
+def robust_sphere(
+    points: np.ndarray, percentiles: tuple[float, float] = FORWARD_PERCENTILES
+) -> tuple[np.ndarray, float]:
+    """Centre [3] and radius of a sphere about points [P, 3] with the extremes of each axis cut off."""
+    if len(points) == 0:
+        raise ValueError("got 0 points, expected at least 1")
+    low, high = np.percentile(points, percentiles, axis=0)
+    center = (low + high) / 2
+    kept = np.all((points >= low) & (points <= high), axis=1)
+    distances = np.linalg.norm(points[kept] - center, axis=1) if kept.any() else np.zeros(1)
+    return center, float(distances.max())
+
+
+def find_region(
+    cameras: PinholeCameras, points: np.ndarray, masks: Sequence[np.ndarray | None] | None = None
+) -> RegionOfInterest:
+    """The sphere the capture is about; of an object without ground, see `grown_alone`.
+
+    Args:
+        cameras: at least two, in the world frame.
+        points: [P, 3] sparse points in the world frame.
+        masks: one [H, W] silhouette per camera (or None for it), or None without masks.
+
+    Raises:
+        ValueError: fewer than two cameras, or no sphere of positive size can be found.
+    """
+    if len(cameras) < 2:
+        raise ValueError(f"got {len(cameras)} cameras, expected at least 2")
+    found = _object_sphere(cameras)
+    if found is not None:
+        center, seen_whole = found
+        if masks is not None and any(mask is not None for mask in masks):
+            # The silhouettes may be larger than what every view shows whole: look in a cube twice as wide.
+            hull = visual_hull_sphere(cameras, masks, center, 2.0 * SEEN_WHOLE_MARGIN * seen_whole)
+            if hull is not None:
+                return RegionOfInterest(hull[0], hull[1] * HULL_MARGIN, "object", "the visual hull of the masks")
+        return RegionOfInterest(center, SEEN_WHOLE_MARGIN * seen_whole, "object", FROM_FRUSTA)
+    if len(points) == 0:
+        raise ValueError("got 0 sparse points and optical axes that do not meet, expected either")
+    from scipy.spatial import cKDTree
+
+    distances, _ = cKDTree(cameras.centers).query(points)
+    center, radius = robust_sphere(points[distances <= FORWARD_DEPTHS * np.median(distances)])
+    if radius <= 0:
+        raise ValueError(f"got sparse points within a radius of {radius}, expected a positive one")
+    return RegionOfInterest(center, radius * FORWARD_MARGIN, "forward", FROM_POINTS)
+
+
+def grown_alone(region: RegionOfInterest, points: np.ndarray) -> RegionOfInterest:
+    """The region about the sparse points [P, 3] where these are one object and nothing else; else as it was.
+
+    Only for a capture where no ground was found: a table around the object lies as near as its far ends do.
+    """
+    if region.source != FROM_FRUSTA or len(points) == 0:
+        return region
+    distances = np.linalg.norm(points - region.center, axis=1)
+    near = points[distances < ALONE_RADII * region.radius / SEEN_WHOLE_MARGIN]
+    if len(near) < ALONE_SHARE * len(points):
+        return region
+    center, radius = robust_sphere(near, ALONE_PERCENTILES)
+    if ALONE_MARGIN * radius < region.radius:
+        return region
+    return RegionOfInterest(center, ALONE_MARGIN * radius, "object", "the sparse points of an object alone")
+
+
+def given_region(form: str, numbers: Sequence[float], kind: str) -> RegionOfInterest:
+    """The region a user wrote: "sphere" (x, y, z, radius) or "box" (x0, y0, z0, x1, y1, z1), in the world frame."""
+    if form == "sphere":
+        return RegionOfInterest(np.array(numbers[:3]), float(numbers[3]), kind, "the given sphere")
+    box = np.array(numbers, dtype=np.float64).reshape(2, 3)
+    radius = BOX_MARGIN * float(np.linalg.norm(box[1] - box[0])) / 2
+    return RegionOfInterest(box.mean(0), radius, kind, "the given box", box)
+
+
+def _object_sphere(cameras: PinholeCameras) -> tuple[np.ndarray, float] | None:
+    """Where the optical axes meet, and the sphere about it that the views show whole; None where they do not meet."""
+    centers, forward = cameras.centers, cameras.forward
+    if axis_spread_deg(forward) < MIN_AXIS_SPREAD_DEG:
+        return None
+    point, misses = meeting_point(centers, forward)
+    depths = np.einsum("ni,ni->n", point - centers, forward)
+    in_front = depths > 0
+    if in_front.mean() < MIN_IN_FRONT or np.median(misses[in_front] / depths[in_front]) > MAX_MISS_RATIO:
+        return None
+    seen_whole = float(np.median(seen_whole_radii(cameras, point)))
+    return point, max(seen_whole, MIN_RADIUS_RATIO * float(np.median(depths[in_front])))

@@ -1,0 +1,77 @@
+"""Which way is up: from GPS, from the ground's plane, or from how the cameras are held.
+
+EXIF carries no gravity that could be trusted: its orientation flag is a multiple of 90 degrees. Ingest turns the
+photos by it, and that is what makes the cameras' own up worth something.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from stages.geometry.cameras import PinholeCameras
+
+IRLS_STEPS = 30
+TINY = 1e-12  # keeps divisions finite; far below any length that occurs
+# Where the cameras' up directions cancel to less than this, they look down (or up), and say nothing of up.
+MIN_MEAN_UP = 0.3
+# The ground is level where it agrees with the cameras to this; beyond it is a slope, and the cameras are believed.
+MAX_SLOPE_DEG = 10.0
+# GPS is believed where it knows up to this.
+MAX_GPS_TILT_DEG = 2.0
+
+
+@dataclass(frozen=True)
+class Up:
+    """Attributes:
+    direction: [3] unit.
+    source: what it was found from, in words.
+    sure: whether the cameras were held level in enough directions to tell (of the cameras' estimate).
+    """
+
+    direction: np.ndarray
+    source: str
+    sure: bool = True
+
+
+def estimate_up(cameras: PinholeCameras) -> Up:
+    """Up in the world frame, from how cameras are held.
+
+    People hold cameras level: image rows are horizontal, so up is perpendicular to all camera x axes whatever
+    the pitch. Where the x axes do not span a plane (photos from one side) it is the mean of the cameras' up, or,
+    where those cancel (a drone that looks down and flies to and fro), against the mean viewing direction.
+    """
+    right, mean_up = cameras.cam_from_scene[:, 0, :3], -cameras.cam_from_scene[:, 1, :3].mean(0)
+    if np.linalg.norm(mean_up) < MIN_MEAN_UP:
+        mean_up = -cameras.forward.mean(0)
+    mean_up /= max(np.linalg.norm(mean_up), TINY)
+    weights = np.ones(len(right))
+    for _ in range(IRLS_STEPS):
+        spread, axes = np.linalg.eigh((weights[:, None] * right).T @ right / weights.sum())
+        up = axes[:, 0]
+        weights = 1.0 / np.maximum(np.abs(right @ up), 0.02)
+    if spread[1] < 0.05 or spread[1] < 4 * spread[0] or abs(up @ mean_up) < 0.5:
+        return Up(mean_up, "the mean of the cameras' up", sure=False)
+    return Up(up if up @ mean_up > 0 else -up, "level cameras")
+
+
+def choose_up(cameras: Up, ground: np.ndarray | None, gps: np.ndarray | None, gps_tilt_deg: float) -> Up:
+    """Which to believe: GPS where it is sure, then level ground, then the cameras.
+
+    Args:
+        cameras: see `estimate_up`.
+        ground: [3] unit normal of the ground's plane, or None.
+        gps: [3] unit direction away from the Earth, or None.
+        gps_tilt_deg: standard error of `gps`, degrees.
+    """
+    if gps is not None and gps_tilt_deg <= MAX_GPS_TILT_DEG:
+        return Up(gps, "GPS")
+    if ground is not None and (not cameras.sure or angle_deg(ground, cameras.direction) <= MAX_SLOPE_DEG):
+        return Up(ground, "the ground's plane")
+    return cameras
+
+
+def angle_deg(a: np.ndarray, b: np.ndarray) -> float:
+    """Angle in degrees between unit vectors [3]."""
+    return float(np.degrees(np.arccos(np.clip(a @ b, -1, 1))))

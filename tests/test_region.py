@@ -1,0 +1,163 @@
+"""Region, ground and up of whole captures: an object on a table, a room, a survey flight, a facade."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from rigs import UP, capture, dome_on_a_table, facade, flight, look_at, ring, room
+
+from stages.geometry.normalisation import rotation_onto
+from stages.geometry.plane import find_ground
+from stages.geometry.region import find_region, given_region, grown_alone
+from stages.geometry.similarity import Similarity
+from stages.geometry.up import Up, angle_deg, choose_up, estimate_up
+
+
+def found(rig):
+    cameras, points = rig
+    up = estimate_up(cameras)
+    region = find_region(cameras, points)
+    return cameras, points, region, up, find_ground(points, cameras.centers, up.direction, region.center, region.radius)
+
+
+def inside(region, points) -> float:
+    return float((np.linalg.norm(points - region.center, axis=1) < region.radius).mean())
+
+
+# ---------------------------------------------------------------- regions
+def test_a_dome_about_an_object():
+    _, points, region, _, _ = found(dome_on_a_table())
+    assert region.kind == "object"
+    assert np.linalg.norm(region.center - [0, 0, 1]) < 0.05
+    assert inside(region, points[:600]) == 1  # the ball
+    assert 1.0 < region.radius < 2.2
+
+
+def test_a_room_from_within():
+    _, points, region, _, _ = found(room())
+    assert region.kind == "forward"
+    assert np.linalg.norm(region.center - [0, 0, 1.25]) < 0.2
+    assert inside(region, points) > 0.97
+    assert region.radius < 1.15 * np.linalg.norm([3.0, 2.5, 1.25])
+
+
+@pytest.mark.parametrize("tilt_deg", [0.5, 3.0, 12.0])
+def test_a_survey_flight_without_its_horizon(tilt_deg: float):
+    _, points, region, _, _ = found(flight(tilt_deg=tilt_deg))
+    assert region.kind == "forward"
+    assert np.linalg.norm(region.center[:2]) < 10
+    assert inside(region, points[:3300]) > 0.95
+    assert region.radius < 150  # half the diagonal is 125; the horizon reaches 2000
+
+
+def test_a_facade_without_the_trees_behind():
+    _, points, region, _, _ = found(facade())
+    assert region.kind == "forward"
+    assert inside(region, points[:2500]) > 0.97
+    assert region.radius < 13  # half the diagonal is 10.8
+
+
+def test_a_given_box_and_sphere():
+    sphere = given_region("sphere", (1, 2, 3, 4), "object")
+    assert (*sphere.center, sphere.radius) == (1, 2, 3, 4)
+    box = given_region("box", (0, 0, 0, 2, 4, 4), "object")
+    np.testing.assert_array_equal(box.box, [[0, 0, 0], [2, 4, 4]])
+    np.testing.assert_array_equal(box.center, [1, 2, 2])
+    assert 3.0 / box.radius < 0.98  # the corners survive the cut near the sphere
+
+
+# ---------------------------------------------------------------- ground
+def test_the_table_under_the_object():
+    _, _, _, _, ground = found(dome_on_a_table())
+    assert angle_deg(ground.normal, UP) < 0.2
+    assert abs(ground.offset) < 0.005
+    assert ground.rms < 0.01
+    assert 0.4 < ground.share < 0.8
+
+
+def test_the_table_is_found_in_any_frame():
+    cameras, points, region, _, _ = found(dome_on_a_table())
+    turn = Similarity(3.0, rotation_onto(UP, np.array([0.6, 0.48, 0.64])), np.array([10.0, -20, 5]))
+    there = find_ground(
+        turn.apply(points),
+        turn.apply(cameras.centers),
+        turn.rotation @ UP,
+        turn.apply(region.center),
+        3 * region.radius,
+    )
+    back = there.within(turn)
+    assert angle_deg(back.normal, UP) < 0.2
+    assert abs(back.offset) < 0.005
+    np.testing.assert_allclose(back.heights(points), there.heights(turn.apply(points)) / 3, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["no points", "an object alone", "a facade", "only a row", "beneath much else"])
+def test_no_ground_where_there_is_none(name: str):
+    cameras, points, region, up, _ = found(dome_on_a_table())
+    if name == "a facade":
+        assert found(facade())[4] is None
+        return
+    heap = np.random.default_rng(3).uniform([-1, -1, 0], [1, 1, 2], (900, 3))
+    points = {
+        "no points": np.zeros((0, 3)),
+        "an object alone": points[:600],
+        "only a row": np.concatenate([points[:600], np.linspace([-2, 0, 0], [2, 0.01, 0], 400)]),
+        # the top of a box is not the ground
+        "beneath much else": np.concatenate([points[600:1000] + 2 * UP, heap]),
+    }[name]
+    assert find_ground(points, cameras.centers, up.direction, region.center, region.radius) is None
+
+
+def test_a_larger_plane_above_the_cameras_is_no_ground():
+    cameras, points, region, up, _ = found(dome_on_a_table())
+    ceiling = np.random.default_rng(0).uniform([-3, -3, 4.2], [3, 3, 4.2], (4000, 3))
+    ground = find_ground(
+        np.concatenate([points, ceiling]), cameras.centers, up.direction, region.center, 2 * region.radius
+    )
+    assert abs(ground.offset) < 0.02
+
+
+def test_an_object_on_a_table_does_not_grow_over_it():
+    _, points, region, _, ground = found(dome_on_a_table())
+    assert ground is not None
+    assert grown_alone(region, points[:600]).radius >= region.radius
+
+
+# ---------------------------------------------------------------- up
+def test_up_of_a_drone_that_flies_to_and_fro():
+    for tilt in (0.5, 5.0):
+        _, _, _, up, ground = found(flight(tilt_deg=tilt))
+        chosen = choose_up(up, None if ground is None else ground.normal, None, 0.0)
+        assert angle_deg(chosen.direction, UP) < 5
+
+
+def test_level_ground_refines_the_cameras_up_and_a_slope_does_not():
+    held = Up(_leaning(4), "level cameras")
+    assert choose_up(held, UP, None, 0.0).source == "the ground's plane"
+    np.testing.assert_array_equal(choose_up(held, UP, None, 0.0).direction, UP)
+    assert choose_up(held, _leaning(-20), None, 0.0) is held
+
+
+def test_ground_is_believed_where_the_cameras_do_not_know():
+    cameras = capture([look_at(np.array([x, -5.0, 2.0]), np.zeros(3)) for x in (0.0, 0.01)])
+    held = estimate_up(cameras)
+    assert not held.sure
+    assert angle_deg(held.direction, UP) > 10
+    np.testing.assert_array_equal(choose_up(held, UP, None, 0.0).direction, UP)
+
+
+def test_gps_is_believed_before_all_else_where_it_is_sure():
+    held = Up(_leaning(5), "level cameras")
+    assert choose_up(held, _leaning(3), UP, 0.5).source == "GPS"
+    assert choose_up(held, _leaning(3), UP, 5.0).source == "the ground's plane"
+    assert choose_up(held, None, None, 0.0) is held
+
+
+def test_up_of_level_cameras_says_that_it_is_sure():
+    up = estimate_up(capture(ring(np.zeros(3), UP)))
+    assert up.sure
+    assert angle_deg(up.direction, UP) < 0.1
+
+
+def _leaning(degrees: float) -> np.ndarray:
+    return np.array([np.sin(np.radians(degrees)), 0.0, np.cos(np.radians(degrees))])
