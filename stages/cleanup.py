@@ -23,6 +23,9 @@ WORKING_FACES = 3
 # Faces that lean less than this from the ground's plane belong to it, and this much area (in the region's radii
 # squared) is enough to fit it.
 GROUND_TILT_DEG, MIN_GROUND_AREA = 15.0, 0.02
+# Pieces that rise above the cut by less than this many tolerances, and have less than this part of the largest one's
+# area, are bumps of the ground.
+BUMP_TOLERANCES, BUMP_AREA = 5.0, 0.05
 # Specks below this part of `min_component` go before anything is measured. The rest waits until the unseen is gone:
 # a background shell may be the largest piece.
 SPECK = 0.1
@@ -130,7 +133,23 @@ def _crop(vertices: np.ndarray, faces: np.ndarray, scene: PosedScene, params: An
             )
         if params.keep_closed:
             vertices, faces = cleaning.close_cut(vertices, faces, normal, offset)
+    if params.remove_ground and scene.ground is not None:
+        vertices, faces = _without_bumps(vertices, faces, *sides[-1], BUMP_TOLERANCES * params.ground_tolerance)
     return vertices, faces
+
+
+def _without_bumps(
+    vertices: np.ndarray, faces: np.ndarray, normal: np.ndarray, offset: float, height: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """The mesh without what a bumpy ground leaves above its cut: small pieces that rise by less than `height`."""
+    from stages.meshing import cleaning
+
+    labels = cleaning.label_pieces(len(faces), cleaning.face_adjacency(faces))
+    areas = np.bincount(labels, np.linalg.norm(cleaning.face_normals(vertices, faces), axis=1))
+    tops = np.full(len(areas), -np.inf)
+    np.maximum.at(tops, labels, (vertices @ normal - offset)[faces].max(1))
+    bumps = (tops < height) & (areas < BUMP_AREA * areas.max())
+    return cleaning.compact(vertices, faces[~bumps[labels]])
 
 
 def box_sides(box: np.ndarray, world_from_scene: Similarity) -> list[tuple[np.ndarray, float]]:

@@ -30,6 +30,7 @@ def run(context: StageContext) -> dict[str, Any]:
         "units": "arbitrary units" if scene.place is None else scene.place.units,
         "extent": [round(float(side), 6) for side in np.ptp(vertices, axis=0)],
     }
+    note = "" if scene.place is None else scene.place.describe().replace("±", "+-")
     sizes: dict[str, int] = {}
     try:
         if "glb" in context.params.formats:
@@ -49,12 +50,12 @@ def run(context: StageContext) -> dict[str, Any]:
             texture_path, mtl = artifacts.obj_texture_path(context.out), artifacts.mtl_path(context.out)
             texture_path.write_bytes(texture_png)
             mtl.write_text(mtl_text(texture_path.name), encoding="utf-8")
-            text = obj_text(vertices, normals, atlas.uvs, atlas.faces, mtl.name)
+            text = obj_text(vertices, normals, atlas.uvs, atlas.faces, mtl.name, note)
             artifacts.obj_path(context.out).write_text(text, encoding="utf-8")
             sizes["obj"] = len(text)
         if "ply" in context.params.formats:
             colors = vertex_colors(texture_png, atlas.uvs)
-            data = ply_bytes(vertices, normals, colors, atlas.faces)
+            data = ply_bytes(vertices, normals, colors, atlas.faces, note)
             artifacts.ply_path(context.out).write_bytes(data)
             sizes["ply"] = len(data)
     except ValueError as error:

@@ -75,6 +75,15 @@ def room(seed: int = 0) -> tuple[PinholeCameras, np.ndarray]:
     return capture(poses, focal=400.0), points + floor
 
 
+def room_from_its_walls(seed: int = 0) -> tuple[PinholeCameras, np.ndarray]:
+    """The same room, seen from along its walls: the axes meet in the empty middle."""
+    _, points = room(seed)
+    random = np.random.default_rng(seed)
+    around = [(x, y, 1.5) for x in (-2.5, -1, 0.5, 2.5) for y in (-2, 2)] + [(x, 0.0, 1.5) for x in (-2.6, 2.6)]
+    poses = [look_at(np.array(center), np.array([0, 0, 1.3]) + 0.2 * random.normal(size=3)) for center in around]
+    return capture(poses, focal=400.0), points
+
+
 def flight(seed: int = 0, tilt_deg: float = 3.0) -> tuple[PinholeCameras, np.ndarray]:
     """A drone that looks down on 200 x 150 from 80, to and fro, on hills of 4, with houses and a little horizon."""
     random = np.random.default_rng(seed)

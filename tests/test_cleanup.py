@@ -345,8 +345,9 @@ def table_with_ball(tilt=0.02):
 @pytest.mark.parametrize("keep_closed", [False, True])
 def test_stage_removes_the_ground_on_request(stage, keep_closed):
     ground = Plane(np.array([0.0, 0, 1]), -0.36, 0.01, 0.5)  # a little off: it is fitted anew
+    bumps = [ball(0.06, (x, 0.5, 0.02 * x - 0.35), resolution=64) for x in (-0.5, 0.5)]
     numbers, vertices, _ = stage(
-        *table_with_ball(), scene_extras={"ground": ground}, remove_ground=True, keep_closed=keep_closed
+        *join(table_with_ball(), *bumps), scene_extras={"ground": ground}, remove_ground=True, keep_closed=keep_closed
     )
     assert numbers["ground_removed"]
     assert np.linalg.norm(vertices[:, :2], axis=1).max() < 0.42

@@ -168,6 +168,12 @@ def test_the_glb_says_its_units_and_where_on_earth_it_is(tmp_path):
     assert extras["scale_relative_error"] == 0.01
     assert extras["world_origin"] == {"latitude_deg": 47.0, "longitude_deg": 8.5, "altitude_m": 400.0}
     assert extras["gps_residual_m"] == 1.2
+    for name in ("model.obj", "model.ply"):
+        head = (context.out / name).read_bytes()[:300].decode("ascii")
+        assert "Lengths are in metres +- 1 %, from GPS. The origin is at latitude 47.000000" in head
+    import trimesh
+
+    assert len(trimesh.load(context.out / "model.ply", process=False).faces) == 4
 
 
 def extras_of(context: StageContext) -> dict:

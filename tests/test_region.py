@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
-from rigs import UP, capture, dome_on_a_table, facade, flight, look_at, ring, room
+from rigs import UP, capture, dome_on_a_table, facade, flight, look_at, ring, room, room_from_its_walls
 
 from stages.geometry.normalisation import rotation_onto
 from stages.geometry.plane import find_ground
@@ -33,8 +35,9 @@ def test_a_dome_about_an_object():
     assert 1.0 < region.radius < 2.2
 
 
-def test_a_room_from_within():
-    _, points, region, _, _ = found(room())
+@pytest.mark.parametrize("rig", [room, room_from_its_walls])
+def test_a_room(rig):
+    _, points, region, _, _ = found(rig())
     assert region.kind == "forward"
     assert np.linalg.norm(region.center - [0, 0, 1.25]) < 0.2
     assert inside(region, points) > 0.97
@@ -161,3 +164,23 @@ def test_up_of_level_cameras_says_that_it_is_sure():
 
 def _leaning(degrees: float) -> np.ndarray:
     return np.array([np.sin(np.radians(degrees)), 0.0, np.cos(np.radians(degrees))])
+
+
+# ---------------------------------------------------------------- captures with a known object
+@pytest.mark.data
+@pytest.mark.parametrize("name", ["synth_helmet", "synth_plaster", "synth_spotmetal"])
+def test_known_objects_on_a_table_lie_in_the_region(data_dir, name: str):
+    import trimesh
+
+    record = json.loads((data_dir / name / "transforms.json").read_text())
+    poses = [np.array(frame["w2c_opencv"])[:3] for frame in record["frames"]]
+    cameras = capture(poses, (record["w"], record["h"]), record["fl_x"])
+    thing = np.asarray(trimesh.load(data_dir / name / "gt_mesh.ply").vertices)
+    random = np.random.default_rng(0)
+    table = random.uniform(-1.6, 1.6, (2000, 3)) * (1, 1, 0)
+    points = np.concatenate([thing[random.integers(0, len(thing), 500)], table])
+    _, _, region, up, ground = found((cameras, points))
+    far_end = np.linalg.norm(thing - region.center, axis=1).max()
+    assert 0.7 < far_end / region.radius < 0.98
+    assert angle_deg(ground.normal, UP) < 0.1
+    assert angle_deg(up.direction, UP) < 1

@@ -5,8 +5,8 @@ Cameras are given in the world frame, as `PinholeCameras` whose "scene" is the w
 Two kinds of capture:
 - "object": the cameras look at one place. The sphere is centred where their optical axes meet and a little
   larger than what the views show whole; where silhouettes are known, it encloses their visual hull instead.
-- "forward": the optical axes are nearly parallel, or meet behind the cameras (a facade, a room, a survey
-  flight). The sphere encloses the sparse points, outliers aside.
+- "forward": the optical axes are nearly parallel (a facade, a survey flight), meet behind the cameras (a room), or
+  meet in empty space (a room from its walls). The sphere encloses the sparse points, outliers aside.
 """
 
 from __future__ import annotations
@@ -24,6 +24,10 @@ MIN_AXIS_SPREAD_DEG = 8.0
 MIN_IN_FRONT = 0.8
 # ... and the axes must pass it within this part of its distance (median): else they do not meet.
 MAX_MISS_RATIO = 0.5
+# There is something where they meet: of the points in the middle of the photos (half the width and height), this part
+# at least lies at that distance (give or take half of it). Too few points say nothing of it.
+MIN_PRESENT, PRESENT_DEPTHS, MIN_JUDGED = 0.03, (0.5, 1.5), 100
+MAX_JUDGED = 4000
 # The sphere of an object capture comes from the median of the largest spheres each camera sees whole, but is
 # no smaller than this part of the distance to the cameras (close-ups see little whole).
 MIN_RADIUS_RATIO = 0.05
@@ -126,6 +130,19 @@ def seen_whole_radii(cameras: PinholeCameras, center: np.ndarray) -> np.ndarray:
     return radii
 
 
+def present_share(cameras: PinholeCameras, points: np.ndarray, place: np.ndarray) -> float:
+    """Part of the points [P, 3] in the middle of the photos that lie about as far away as `place` [3]; median photo."""
+    thinned = points[:: -(-len(points) // MAX_JUDGED)]
+    shares = []
+    for i, distance in enumerate(np.linalg.norm(cameras.centers - place, axis=1)):
+        pixels, depth = cameras.project(i, thinned)
+        central = (depth > 0) & (np.abs(pixels / cameras.sizes[i] - 0.5) < 0.25).all(1)
+        low, high = PRESENT_DEPTHS
+        if central.any():
+            shares.append(np.mean((depth[central] > low * distance) & (depth[central] < high * distance)))
+    return float(np.median(shares)) if shares else 0.0
+
+
 def visual_hull_sphere(
     cameras: PinholeCameras, masks: Sequence[np.ndarray | None], center: np.ndarray, radius: float
 ) -> tuple[np.ndarray, float] | None:
@@ -200,7 +217,7 @@ def find_region(
     if len(cameras) < 2:
         raise ValueError(f"got {len(cameras)} cameras, expected at least 2")
     found = _object_sphere(cameras)
-    if found is not None:
+    if found is not None and (len(points) < MIN_JUDGED or present_share(cameras, points, found[0]) >= MIN_PRESENT):
         center, seen_whole = found
         if masks is not None and any(mask is not None for mask in masks):
             # The silhouettes may be larger than what every view shows whole: look in a cube twice as wide.

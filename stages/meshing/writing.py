@@ -118,10 +118,18 @@ def glb_bytes(
     )
 
 
-def obj_text(vertices: np.ndarray, normals: np.ndarray, uvs: np.ndarray, faces: np.ndarray, mtl_name: str) -> str:
-    """An OBJ with positions, UVs (bottom-left origin), normals, and the material "textured" of `mtl_name`."""
+def obj_text(
+    vertices: np.ndarray,
+    normals: np.ndarray,
+    uvs: np.ndarray,
+    faces: np.ndarray,
+    mtl_name: str,
+    comment: str = "",
+) -> str:
+    """An OBJ with positions, UVs (bottom-left origin), normals, the material "textured" of `mtl_name`, a comment."""
     vertices, normals, uvs, faces = _checked(vertices, normals, uvs, faces)
-    lines = [f"mtllib {mtl_name}", "o model"]
+    lines = [f"# {comment}"] if comment else []
+    lines += [f"mtllib {mtl_name}", "o model"]
     lines += [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in vertices.tolist()]
     lines += [f"vt {u:.7g} {v:.7g}" for u, v in uvs.tolist()]
     lines += [f"vn {x:.6g} {y:.6g} {z:.6g}" for x, y, z in normals.tolist()]
@@ -135,13 +143,16 @@ def mtl_text(texture_name: str) -> str:
     return f"newmtl textured\nKa 0 0 0\nKd 1 1 1\nKs 0 0 0\nillum 1\nPr {ROUGHNESS}\nPm 0\nmap_Kd {texture_name}\n"
 
 
-def ply_bytes(vertices: np.ndarray, normals: np.ndarray, colors: np.ndarray, faces: np.ndarray) -> bytes:
+def ply_bytes(
+    vertices: np.ndarray, normals: np.ndarray, colors: np.ndarray, faces: np.ndarray, comment: str = ""
+) -> bytes:
     """A binary PLY with vertex normals and colours; vertices at one position (UV seams) are joined.
 
     Args:
         vertices, normals: [V, 3].
         colors: [V, 3] 0..255.
         faces: [F, 3].
+        comment: one line of ASCII for the header.
     """
     joined, first, inverse = np.unique(
         np.ascontiguousarray(vertices, dtype=np.float32), axis=0, return_index=True, return_inverse=True
@@ -156,7 +167,8 @@ def ply_bytes(vertices: np.ndarray, normals: np.ndarray, colors: np.ndarray, fac
     face = np.empty(len(faces), dtype=[("count", np.uint8), ("corners", "<i4", 3)])
     face["count"] = 3
     face["corners"] = inverse[faces]
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertex)}"]
+    header = ["ply", "format binary_little_endian 1.0", *([f"comment {comment}"] if comment else [])]
+    header.append(f"element vertex {len(vertex)}")
     header += [f"property float {axis}" for axis in ("x", "y", "z", "nx", "ny", "nz")]
     header += [f"property uchar {channel}" for channel in ("red", "green", "blue")]
     header += [f"element face {len(face)}", "property list uchar int vertex_indices", "end_header"]
