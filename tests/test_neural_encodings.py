@@ -142,6 +142,15 @@ def test_interpolation_reproduces_a_linear_function_on_dense_levels():
     torch.testing.assert_close(vjp(last), torch.tensor([[1.0, 2, -1]]).expand(200, 3), rtol=1e-4, atol=1e-4)
 
 
+def test_gradients_of_several_queries_add_up_in_the_table():
+    points, table, other = random_points(50), *(noise_table(GRID).requires_grad_() for _ in range(2))
+    for part in points.split(25):
+        encode(part, table, GRID, 4)[0].sum().backward()
+    (encode_features(points[:25], other, GRID, 4).sum() + encode(points[25:], other, GRID, 4)[0].sum()).backward()
+    assert table.grad.abs().max() > 0
+    torch.testing.assert_close(table.grad, other.grad, rtol=1e-5, atol=1e-5)
+
+
 def test_gradient_does_not_depend_on_the_thread_count():
     numba = pytest.importorskip("numba")
     points, gradients = random_points(5000), []

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from stages.neural.density import laplace_density, section_optical_depth
-from stages.neural.rendering import composite, sample_optical_depths, weights_from_optical_depth
+from stages.neural.rendering import composite, rendering_weights, sample_optical_depths, weights_from_optical_depth
 from stages.neural.sampling import (
     SdfCache,
     importance_distances,
@@ -56,6 +56,27 @@ def test_weights_match_a_slow_loop_and_sum_to_one():
             transmittance *= 1 - alpha
         assert left[r].item() == pytest.approx(transmittance, abs=1e-6)
     torch.testing.assert_close(weights.sum(1) + left, torch.ones(5))
+
+
+@pytest.mark.parametrize("scale", [0.1, 0.02, 0.001])
+def test_the_kernel_weighs_samples_and_pulls_on_f_as_the_reference_does(scale):
+    generator = torch.Generator().manual_seed(0)
+    distances = torch.sort(1.5 * torch.rand(200, 16, generator=generator), 1).values
+    sdf = 0.4 - distances + 0.05 * torch.randn(200, 16, generator=generator)
+    sdf[:20], sdf[20:30] = 0.01 * torch.randn(20, 16, generator=generator), -0.02  # grazing, and flat inside
+    pull = torch.randn(200, 17, generator=generator)
+    results = []
+    for precision in (torch.float32, torch.float64):  # the kernel takes the first
+        f = sdf.to(precision, copy=True).requires_grad_()
+        weights, left = rendering_weights(f, distances.to(precision), scale)
+        ((weights * pull[:, :16]).sum() + (left * pull[:, 16]).sum()).backward()
+        results.append((weights.float(), left.float(), f.grad.float()))
+    (weights, left, gradient), (expected_weights, expected_left, expected_gradient) = results
+    torch.testing.assert_close(weights, expected_weights, rtol=0, atol=1e-6)
+    torch.testing.assert_close(left, expected_left, rtol=0, atol=1e-6)
+    largest = float(expected_gradient.abs().max())
+    assert largest > 1
+    torch.testing.assert_close(gradient, expected_gradient, rtol=0, atol=2e-5 * largest)
 
 
 @pytest.mark.parametrize("num_samples", [8, 16, 200])

@@ -7,7 +7,7 @@ A normal is then the vjp of the MLP's gradient with respect to its inputs. Both 
 table and to what the vjp is given, so training needs first-order autograd only.
 
 Two implementations agree to 1e-5: `encode_reference` (pure torch, any device) and the numba kernels behind
-`encode` on the CPU.
+`encode` on the CPU, which add the table's gradient to `table.grad` themselves: `torch.autograd.grad` does not see it.
 
 Layout: C channels, level-major. A hash grid's `table` is [rows, features]; level l owns the rows
 offsets[l] .. offsets[l + 1]. A level whose full lattice fits its share is indexed densely, else by the spatial hash.
@@ -265,17 +265,26 @@ class _KernelEncode(torch.autograd.Function):
         points, table = ctx.saved_tensors
         grid = ctx.grid
         arguments = (points.detach().numpy(), grid.resolutions, grid.offsets, grid.dense, ctx.active_levels)
-        grad_table = torch.zeros_like(table)
         if grad_gradients is None:
-            kernels.features_backward(*arguments, grad_features.contiguous().numpy(), grad_table.numpy())
+            kernels.features_backward(*arguments, grad_features.contiguous().numpy(), _grad_of(table))
         else:
             if grad_features is None:
                 grad_features = torch.zeros_like(cotangent)
             kernels.encode_backward(
                 *arguments, grad_features.contiguous().numpy(), grad_gradients.contiguous().numpy(),
-                cotangent.contiguous().numpy(), grad_table.numpy(),
+                cotangent.contiguous().numpy(), _grad_of(table),
             )  # fmt: skip
-        return None, grad_table, None, None
+        return None, None, None, None
+
+
+def _grad_of(table: torch.Tensor) -> np.ndarray:
+    """The table's gradient [rows, F], which the kernels add to where it lies.
+
+    Through autograd each query of the encoding would make and add a gradient as large as the table.
+    """
+    if table.grad is None:
+        table.grad = torch.zeros_like(table)
+    return table.grad.numpy()
 
 
 class _KernelVjp(torch.autograd.Function):
@@ -326,9 +335,8 @@ class _KernelFeatures(torch.autograd.Function):
 
         points, table = ctx.saved_tensors
         grid = ctx.grid
-        grad_table = torch.zeros_like(table)
         kernels.features_backward(
             points.detach().numpy(), grid.resolutions, grid.offsets, grid.dense, ctx.active_levels,
-            grad_features.contiguous().numpy(), grad_table.numpy(),
+            grad_features.contiguous().numpy(), _grad_of(table),
         )  # fmt: skip
-        return None, grad_table, None, None
+        return None, None, None, None

@@ -10,9 +10,7 @@ import numpy as np
 import torch
 
 from stages.neural.encodings import Encoding, Frequencies, HashGrid
-from stages.neural.fields import Fields, FieldShape
-
-CHUNK = 1 << 16  # points evaluated at a time: bounds the memory of one call
+from stages.neural.fields import Fields, FieldShape, points_at_a_time
 
 
 class TrainedField:
@@ -51,8 +49,9 @@ class TrainedField:
     @torch.no_grad()
     def _chunked(self, function, *arrays: np.ndarray) -> np.ndarray:
         parts = []
-        for first in range(0, max(len(arrays[0]), 1), CHUNK):
-            chunk = [torch.from_numpy(np.ascontiguousarray(a[first : first + CHUNK], dtype=np.float32)) for a in arrays]
+        count = points_at_a_time(self.device)
+        for first in range(0, max(len(arrays[0]), 1), count):
+            chunk = [torch.from_numpy(np.ascontiguousarray(a[first : first + count], dtype=np.float32)) for a in arrays]
             parts.append(function(*(c.to(self.device) for c in chunk)).cpu().numpy())
         return np.concatenate(parts)
 

@@ -428,3 +428,79 @@ def importance_distances(
                     k += 1
                 inside = min(max((place - cdf[k]) / (cdf[k + 1] - cdf[k]), zero), one)
                 distances[r, i] = start + length * (np.float32(k) + inside) / np.float32(num_bins)
+
+
+@njit(inline="always")
+def _laplace_cdf(sdf, scale):
+    """Psi_b(-f): b times `stages.neural.density.laplace_density`."""
+    decay = np.float32(0.5) * np.exp(-abs(sdf) / scale) if abs(sdf) < np.float32(25) * scale else np.float32(0)
+    return decay if sdf >= np.float32(0) else np.float32(1) - decay
+
+
+@njit(inline="always")
+def _section(start, end, scale, flat):
+    """Mean of Psi_b(-f) over a section on which f runs linearly from start to end."""
+    change = end - start
+    if abs(change) < flat:
+        return _laplace_cdf(np.float32(0.5) * (start + end), scale)
+    return (_density_integral(start, scale) - _density_integral(end, scale)) / change
+
+
+@njit(inline="always")
+def _section_slopes(start, end, scale, flat):
+    """The derivatives of `_section` with respect to start and end."""
+    change = end - start
+    if abs(change) < flat:
+        middle = _laplace_cdf(np.float32(0.5) * (start + end), scale)
+        slope = np.float32(-0.5) * min(middle, np.float32(1) - middle) / scale
+        return slope, slope
+    mean = (_density_integral(start, scale) - _density_integral(end, scale)) / change
+    return (mean - _laplace_cdf(start, scale)) / change, (_laplace_cdf(end, scale) - mean) / change
+
+
+@njit(parallel=True, **_OPTIONS)
+def ray_weights_forward(sdf, distances, scale, flat, weights, transmittance):
+    """Fill weights [R, K] and transmittance [R]: `stages.neural.rendering.rendering_weights`."""
+    num_rays, num_samples = sdf.shape
+    b, half, flat_change = np.float32(scale), np.float32(0.5), np.float32(flat * scale)
+    for r in prange(num_rays):
+        left, far = np.float32(1), np.float32(0)  # far: optical depth of the half section before sample k
+        for k in range(num_samples):
+            depth = far
+            if k + 1 < num_samples:
+                stretch = half * (distances[r, k + 1] - distances[r, k]) / b
+                middle = half * (sdf[r, k] + sdf[r, k + 1])
+                depth += stretch * _section(sdf[r, k], middle, b, flat_change)
+                far = stretch * _section(middle, sdf[r, k + 1], b, flat_change)
+            weight = -left * np.expm1(-depth)
+            weights[r, k] = weight
+            left -= weight
+        transmittance[r] = left
+
+
+@njit(parallel=True, **_OPTIONS)
+def ray_weights_backward(
+    sdf, distances, scale, flat, weights, transmittance, grad_weights, grad_transmittance, grad_sdf
+):
+    """Fill grad_sdf [R, K] given the gradients of weights [R, K] and transmittance [R].
+
+    The transmittance T_m before sample m falls with every optical depth before it, so that a depth's gradient sums over
+    all T_m behind it: rays are walked from their ends.
+    """
+    num_rays, num_samples = sdf.shape
+    b, half, flat_change = np.float32(scale), np.float32(0.5), np.float32(flat * scale)
+    for r in prange(num_rays):
+        left = transmittance[r]
+        grad_far = -left * (grad_transmittance[r] - grad_weights[r, num_samples - 1])  # of sample k + 1's depth
+        grad_sdf[r, num_samples - 1] = np.float32(0)
+        for k in range(num_samples - 2, -1, -1):
+            left += weights[r, k + 1]
+            grad_near = grad_far - left * (grad_weights[r, k + 1] - grad_weights[r, k])  # of sample k's
+            stretch = half * (distances[r, k + 1] - distances[r, k]) / b
+            middle = half * (sdf[r, k] + sdf[r, k + 1])
+            near_start, near_end = _section_slopes(sdf[r, k], middle, b, flat_change)
+            far_start, far_end = _section_slopes(middle, sdf[r, k + 1], b, flat_change)
+            of_middle = half * (grad_near * near_end + grad_far * far_start)
+            grad_sdf[r, k] = stretch * (grad_near * near_start + of_middle)
+            grad_sdf[r, k + 1] += stretch * (grad_far * far_end + of_middle)
+            grad_far = grad_near

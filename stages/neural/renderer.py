@@ -15,7 +15,7 @@ from stages.neural import reflection
 from stages.neural.fields import BackgroundNetwork, Fields
 from stages.neural.photos import RayBatch
 from stages.neural.proposal import proposal_distances
-from stages.neural.rendering import composite, sample_optical_depths, weights_from_optical_depth
+from stages.neural.rendering import composite, rendering_weights, weights_from_optical_depth
 from stages.neural.sampling import SdfCache, importance_distances, stratified
 from stages.neural.schedules import Moment
 
@@ -94,10 +94,9 @@ class Renderer:
         points = (batch.origins[:, None] + distances[..., None] * batch.directions[:, None]).reshape(-1, 3)
         num_points = len(points)
         sdf, features, gradients = self.fields.sdf(torch.cat([points, extra]), moment.levels)
-        tau = sample_optical_depths(
+        weights, transmittance = rendering_weights(
             sdf[:num_points].view(num_rays, num_samples), distances, moment.scale, self.params.density
         )
-        weights, transmittance = weights_from_optical_depth(tau)
 
         seen = torch.nonzero(weights.detach().view(-1) > _COLOR_THRESHOLD).squeeze(1)
         ray = seen // num_samples

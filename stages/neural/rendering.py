@@ -7,7 +7,20 @@ from __future__ import annotations
 
 import torch
 
-from stages.neural.density import logistic_section_optical_depth, section_optical_depth
+from stages.neural.density import FLAT, logistic_section_optical_depth, section_optical_depth
+
+
+def rendering_weights(
+    sdf: torch.Tensor, distances: torch.Tensor, scale: torch.Tensor | float, density: str = "laplace"
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Rendering weights [R, K] of samples with f [R, K] at distances [R, K], and the transmittance [R] behind them.
+
+    `weights_from_optical_depth` of `sample_optical_depths`; on the CPU in one pass each way where the scale is a number
+    and the density that of "laplace".
+    """
+    if density == "laplace" and isinstance(scale, float) and sdf.device.type == "cpu" and sdf.dtype == torch.float32:
+        return _KernelWeights.apply(sdf, distances, scale)
+    return weights_from_optical_depth(sample_optical_depths(sdf, distances, scale, density))
 
 
 def sample_optical_depths(
@@ -43,3 +56,33 @@ def weights_from_optical_depth(tau: torch.Tensor) -> tuple[torch.Tensor, torch.T
 def composite(weights: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
     """Sum over samples of weights [R, K] times values [R, K, D] -> [R, D]."""
     return (weights.unsqueeze(-1) * values).sum(1)
+
+
+class _KernelWeights(torch.autograd.Function):
+    """`rendering_weights` in one pass each way; gradients with respect to f only."""
+
+    @staticmethod
+    def forward(ctx, sdf, distances, scale):
+        from stages.neural import kernels
+
+        sdf, distances = sdf.contiguous(), distances.contiguous()
+        weights, transmittance = torch.empty(sdf.shape), torch.empty(len(sdf))
+        kernels.ray_weights_forward(
+            sdf.detach().numpy(), distances.numpy(), scale, FLAT, weights.numpy(), transmittance.numpy()
+        )
+        ctx.save_for_backward(sdf, distances, weights, transmittance)
+        ctx.scale = scale
+        return weights, transmittance
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, grad_weights, grad_transmittance):
+        from stages.neural import kernels
+
+        sdf, distances, weights, transmittance = ctx.saved_tensors
+        grad_sdf = torch.empty(sdf.shape)
+        kernels.ray_weights_backward(
+            sdf.numpy(), distances.numpy(), ctx.scale, FLAT, weights.numpy(), transmittance.numpy(),
+            grad_weights.contiguous().numpy(), grad_transmittance.contiguous().numpy(), grad_sdf.numpy(),
+        )  # fmt: skip
+        return grad_sdf, None, None

@@ -75,14 +75,16 @@ class SdfCache:
         return torch.stack([x, y, z], 1).float() * self.cell - 1
 
     @torch.no_grad()
-    def refresh(self, sdf: Callable[[torch.Tensor], torch.Tensor], band: float | None = None) -> int:
+    def refresh(
+        self, sdf: Callable[[torch.Tensor], torch.Tensor], band: float | None = None, at_a_time: int = 1 << 13
+    ) -> int:
         """Evaluate sdf([M, 3]) -> [M] on the grid: everywhere, or where |cached f| < band. Returns M."""
         flat = self.values.view(-1)
         if band is None:
             rows = torch.arange(flat.numel(), device=flat.device)
         else:
             rows = torch.nonzero(flat.abs() < band).squeeze(1)
-        for chunk in rows.split(1 << 17):
+        for chunk in rows.split(at_a_time):
             flat[chunk] = sdf(self.points(chunk))
         return len(rows)
 

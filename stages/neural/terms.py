@@ -15,7 +15,7 @@ import torch
 
 from configs.params import TrainParams
 from stages.neural import losses, schedules, visibility
-from stages.neural.fields import Fields
+from stages.neural.fields import Fields, points_at_a_time
 from stages.neural.photos import Photos
 from stages.neural.renderer import OPAQUE, Rendered
 from stages.neural.sampling import SdfCache
@@ -23,8 +23,6 @@ from stages.neural.schedules import Moment
 
 # Samples that weigh more than this count as near the surface for the relaxed Eikonal term.
 _NEAR_SURFACE_WEIGHT = 0.01
-# Points of visibility paths that the network is asked for in one go: bounds the memory.
-_POINTS_AT_A_TIME = 1 << 18
 
 
 class Terms:
@@ -117,7 +115,7 @@ class Terms:
         """f [...] of the network at points [..., 3], in parts: they are many."""
 
         def sdf(points: torch.Tensor) -> torch.Tensor:
-            parts = points.reshape(-1, 3).split(_POINTS_AT_A_TIME)
+            parts = points.reshape(-1, 3).split(points_at_a_time(self.device))
             return torch.cat([self.fields.sdf.sdf(part, moment.levels) for part in parts]).view(points.shape[:-1])
 
         return sdf

@@ -13,7 +13,7 @@ import torch
 from configs.params import TrainParams
 from stages.neural import losses, schedules
 from stages.neural.encodings import Frequencies, HashGrid
-from stages.neural.fields import Fields, FieldShape
+from stages.neural.fields import Fields, FieldShape, points_at_a_time
 from stages.neural.photos import Photos, RayBatch
 from stages.neural.proposal import interlevel_loss, sample_edges, updates_now
 from stages.neural.renderer import Rendered, Renderer
@@ -131,7 +131,7 @@ class Trainer:
             + appearance_loss
             + proposal_loss
         )
-        self.optimizer.zero_grad(set_to_none=True)
+        self._forget_gradients()
         loss.backward()
         decay = schedules.warm_up_then_decay if params.lr_decay == "cosine" else schedules.warm_up_then_exponential
         factor = decay(progress, params.lr_warm_up, params.lr_final)
@@ -161,6 +161,14 @@ class Trainer:
                 "trust": trust.detach().min(),
             }
 
+    def _forget_gradients(self) -> None:
+        """None for all gradients, but zero for the tables' on the CPU: making them anew takes longer than filling."""
+        kept = self.fields.tables() if self.device.type == "cpu" else []
+        gradients = [table.grad for table in kept]
+        self.optimizer.zero_grad(set_to_none=True)
+        for table, gradient in zip(kept, gradients, strict=True):
+            table.grad = None if gradient is None else gradient.zero_()
+
     def _proposal_loss(self, rendered: Rendered) -> torch.Tensor:
         """What trains the proposal network, in the steps that train it; zero where a grid guides the samples."""
         if rendered.proposal is None or not updates_now(self.step_index, self.params.proposal_updates):
@@ -182,7 +190,8 @@ class Trainer:
             return
         refreshes = self.step_index // every
         full = self.step_index <= 4 * every or refreshes % 8 == 0
-        self.cache.refresh(lambda p: self.fields.sdf.sdf(p, moment.levels), None if full else 4 * self.cache.cell)
+        band = None if full else 4 * self.cache.cell
+        self.cache.refresh(lambda p: self.fields.sdf.sdf(p, moment.levels), band, points_at_a_time(self.device))
         self.cache_step = self.step_index
 
     # ------------------------------------------------------------------ previews, checkpoints
