@@ -64,6 +64,13 @@ def test_wild_positions_do_not_move_the_place():
     assert found.used <= 0.8 * len(model) + 1
 
 
+def test_positions_of_another_walk_are_refused():
+    cameras = capture(ring(np.zeros(3), distance=20.0, count=8))
+    elsewhere = np.random.default_rng(2).uniform(-20, 20, (8, 3))
+    with pytest.raises(ValueError, match=r"agree with the cameras|GPS positions miss"):
+        locate(model_of(cameras).centers, gps_of(elsewhere))
+
+
 def test_a_phone_around_a_chair_is_refused_with_both_numbers():
     cameras = capture(ring(np.zeros(3), distance=2.0, count=30))
     with pytest.raises(ValueError, match=r"GPS positions miss the cameras by .* while they spread over"):

@@ -15,6 +15,8 @@ from stages.geometry.similarity import Similarity, align_points
 # WGS 84: semi-major axis in metres and flattening.
 EARTH_RADIUS, FLATTENING = 6378137.0, 1 / 298.257223563
 MIN_LOCATED = 4
+# This part of the positions at least must agree on one place.
+MIN_AGREEING = 0.6
 # Photos within this narrow a strip (part of its length) leave the turn about it open.
 MIN_STRIP = 0.05
 # The residual may be this part of the positions' spread: a larger one says that GPS wanders as far as the photographer.
@@ -146,11 +148,14 @@ def locate(centers: np.ndarray, positions: np.ndarray, seed: int = 0) -> Located
     if lengths[1] < MIN_STRIP * lengths[0]:
         raise ValueError("the photos were taken from one line, and the turn about it stays open")
     kept = _agreeing(centers, targets, seed)
+    if kept.sum() < max(MIN_LOCATED, MIN_AGREEING * len(centers)):
+        raise ValueError(f"only {kept.sum()} of {len(centers)} GPS positions agree with the cameras and each other")
     world_from_model = align_points(centers[kept], targets[kept])
     misses = world_from_model.apply(centers[kept]) - targets[kept]
     count = int(kept.sum())
     # a similarity has seven parameters: with few photos it bends to their errors
-    residual = float(np.sqrt((misses**2).sum() / count * 3 * count / (3 * count - 7)))
+    freedom = np.sqrt(3 * count / (3 * count - 7))
+    residual = float(freedom * np.sqrt((misses**2).sum(1).mean()))
     spread = np.linalg.svd(targets[kept] - targets[kept].mean(0))[1] / np.sqrt(count)
     total = float(np.linalg.norm(spread))
     if residual > MAX_RESIDUAL * total:
@@ -158,9 +163,9 @@ def locate(centers: np.ndarray, positions: np.ndarray, seed: int = 0) -> Located
             f"GPS positions miss the cameras by {residual:.2g} m while they spread over {total:.2g} m "
             f"(at most {MAX_RESIDUAL * total:.2g} m would do)"
         )
-    per_axis = residual / np.sqrt(3 * count)
-    tilt = np.degrees(per_axis / max(float(spread[1]), 1e-9))
-    return Located(world_from_model, origin, residual, per_axis / total, float(tilt), count)
+    vertical = freedom * np.sqrt((misses[:, 2] ** 2).mean())  # GPS knows heights less well than the rest
+    tilt = np.degrees(vertical / np.sqrt(count) / max(float(spread[1]), 1e-9))
+    return Located(world_from_model, origin, residual, residual / np.sqrt(3 * count) / total, float(tilt), count)
 
 
 def _agreeing(centers: np.ndarray, targets: np.ndarray, seed: int) -> np.ndarray:
@@ -178,5 +183,4 @@ def _agreeing(centers: np.ndarray, targets: np.ndarray, seed: int) -> np.ndarray
         median = np.sort(misses)[min(len(misses) - 1, (len(misses) + 3) // 2)]
         if median < best:
             best, best_misses = float(median), misses
-    kept = best_misses <= max(OUTLIER_SIGMAS * best, 1e-9)
-    return kept if kept.sum() >= MIN_LOCATED else np.ones(len(centers), dtype=bool)
+    return best_misses <= max(OUTLIER_SIGMAS * best, 1e-9)
