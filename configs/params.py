@@ -197,6 +197,10 @@ class TrainParams(Section):
         "analytic", description="SDF gradients by differentiation, or central differences one active voxel to each side"
     )
     sphere_radius: float = Field(0.5, gt=0, lt=1, description="the SDF is this sphere before training, scene units")
+    init: Literal["sphere", "hull"] = Field(
+        "sphere",
+        description="the SDF before training: a sphere, or the visual hull of the masks (every photo needs one)",
+    )
 
     density: Literal["laplace", "neus"] = Field(
         "laplace", description="optical depth from the SDF: Laplace CDF (VolSDF), or the logistic alpha of NeuS"

@@ -222,7 +222,8 @@ def load_scene(folder: Path) -> PosedScene:
     data = read_json(folder / SCENE)
     with np.load(folder / POINTS) as points:
         sparse = {key: points[key] for key in ("points", "point_errors", "observations")}
-    records, place, ground, box = (data[key] for key in ("cameras", "place", "ground", "box"))
+    records = data["cameras"]
+    place, ground, box = (data.get(key) for key in ("place", "ground", "box"))  # folders of 0.1.0 have none
     return PosedScene(
         cameras=PinholeCameras(
             names=tuple(record["name"] for record in records),

@@ -14,7 +14,8 @@ import numpy as np
 
 from stages import artifacts
 from stages.engine.stage import Stage, StageContext
-from stages.errors import ConfigError, ReconstructionError
+from stages.errors import ConfigError, InputError, ReconstructionError
+from stages.geometry.cameras import PinholeCameras
 
 log = logging.getLogger(__name__)
 
@@ -40,13 +41,16 @@ def run(context: StageContext) -> dict[str, Any]:
     scene = artifacts.load_scene(folder)
     held_out = left_out(len(scene.cameras), params.holdout)
     _check_hold_out(len(held_out), int(held_out.sum()), params.holdout)
-    photos = Photos(scene.cameras, *_load_images(folder, scene.cameras.names), context.device, ~held_out)
+    images, masks = _load_images(folder, scene.cameras.names)
+    photos = Photos(scene.cameras, images, masks, context.device, ~held_out)
     sightings = Sightings.from_scene(scene, context.device, (~held_out).numpy())
     trainer = Trainer(photos, sightings, params, context.device)
 
     checkpoint = artifacts.checkpoint_path(context.scratch)
     metrics = artifacts.metrics_path(context.scratch)
     spent = _resume(trainer, checkpoint, metrics)
+    if params.init == "hull" and trainer.step_index == 0:
+        _start_from_hull(trainer, scene.cameras, masks, held_out.tolist())
     started = saved = time.monotonic()
     previewed = _progress(trainer.step_index, spent, params)
     with metrics.open("a", encoding="utf-8") as lines:
@@ -101,6 +105,26 @@ def _load_images(folder: Path, names: tuple[str, ...]) -> tuple[list[np.ndarray]
     if 0 < len(masks) < len(images):
         log.warning("only %d of %d photos have a mask: training goes without masks", len(masks), len(images))
     return images, masks if len(masks) == len(images) else None
+
+
+def _start_from_hull(
+    trainer: Any, cameras: PinholeCameras, masks: list[np.ndarray] | None, held_out: list[bool]
+) -> None:
+    """The SDF starts as the visual hull of the masks of the photos that are trained on.
+
+    Raises:
+        InputError: a photo has no mask, or the masks leave nothing.
+    """
+    from stages.geometry.hull import hull_distances
+
+    advice = "Give a mask for each photo (`--masks FOLDER`), or start from a sphere: `--set train.init=sphere`."
+    if masks is None:
+        raise InputError(f"`train.init` = hull needs masks for all {len(cameras)} photos, and some have none.", advice)
+    known = [None if left_out else mask for mask, left_out in zip(masks, held_out, strict=True)]
+    distances = hull_distances(cameras, known)
+    if distances is None:
+        raise InputError(f"The {len(cameras)} masks have no visual hull within the region of interest.", advice)
+    log.info("the SDF starts from the masks' visual hull, met to %.4f on average", trainer.start_from(distances))
 
 
 def _check_hold_out(num_photos: int, num_held_out: int, every: int) -> None:

@@ -13,6 +13,8 @@ from sphere_scene import RADIUS, render, ring_of_cameras, sphere_scene, write_un
 from configs.params import TrainParams
 from stages import artifacts, train
 from stages.engine.stage import StageContext
+from stages.errors import InputError
+from stages.geometry.hull import hull_distances
 from stages.neural import encodings
 from stages.neural import fields as fields_module
 from stages.neural.field import load_field
@@ -266,3 +268,42 @@ def test_gradients_far_from_one_are_warned_of_now_and_then(caplog):
     assert not caplog.records
     train._check(numbers, train.SETTLED)
     assert "mean length of 0.40" in caplog.text
+
+
+# ---------------------------------------------------------------- the visual hull
+def test_the_hull_of_a_ball_is_a_little_more_than_the_ball():
+    cameras = ring_of_cameras(count=16)
+    distances = hull_distances(cameras, [render(cameras, i)[1] for i in range(len(cameras))], cells=40)
+    axis = (np.arange(40) + 0.5) / 20 - 1
+    radius = np.linalg.norm(np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1), axis=-1)
+    assert distances[radius < RADIUS - 0.06].max() < 0
+    assert distances[radius > RADIUS + 0.25].min() > 0
+    assert distances.min() == pytest.approx(-RADIUS, abs=0.1)
+    far = radius > 0.9
+    np.testing.assert_allclose(distances[far], radius[far] - RADIUS, atol=0.2)
+    assert hull_distances(cameras, [np.zeros((40, 48), np.uint8)] * 16, cells=20) is None
+
+
+def test_training_can_start_from_the_hull(caplog):
+    trainer = make_trainer(TINY.model_copy(update={"sphere_radius": 0.8}), masks=True)
+    cameras = ring_of_cameras()
+    train._start_from_hull(trainer, cameras, [render(cameras, i)[1] for i in range(len(cameras))], [False] * 8)
+    levels = trainer.moment(0.0).levels
+    points = torch.nn.functional.normalize(torch.randn(300, 3, generator=torch.Generator().manual_seed(0)), dim=1)
+    with torch.no_grad():
+        assert trainer.fields.sdf.sdf((RADIUS - 0.12) * points, levels).max() < 0
+        assert trainer.fields.sdf.sdf(0.75 * points, levels).min() > 0  # the sphere of 0.8 is gone
+    assert trainer.step_index == 0
+    assert all(len(state) == 0 for state in trainer.optimizer.state.values())
+    numbers = trainer.step(0.0)
+    assert np.isfinite(float(numbers["loss"]))
+
+
+def test_a_hull_without_masks_is_refused(tmp_path):
+    write_undistorted(tmp_path / "undistort", ring_of_cameras(), masks=False)
+    for name in ("out", "scratch"):
+        (tmp_path / name).mkdir()
+    params = TINY.model_copy(update={"init": "hull"})
+    context = StageContext({"undistort": tmp_path / "undistort"}, {}, tmp_path / "out", tmp_path / "scratch", params)
+    with pytest.raises(InputError, match="needs masks for all 8 photos"):
+        train.TRAIN.run(context)

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from stages.geometry.cameras import PinholeCameras
+from stages.geometry.hull import visual_hull_sphere
 
 # Axes that spread less than this (root mean square angle to their mean) are "nearly parallel".
 MIN_AXIS_SPREAD_DEG = 8.0
@@ -40,10 +41,6 @@ ALONE_RADII, ALONE_SHARE = 2.5, 0.97
 ALONE_PERCENTILES, ALONE_MARGIN = (0.5, 99.5), 1.05
 # Free space around silhouettes' visual hull: 10 % of the radius.
 HULL_MARGIN = 1.1
-# A voxel belongs to the hull when it is inside the silhouette in this part of the views it projects into;
-# less than 1, because a mask or a pose may be wrong.
-HULL_AGREEMENT = 0.9
-HULL_CELLS = 48
 # Robust range of the sparse points of a forward capture, percent.
 FORWARD_PERCENTILES = (1.0, 99.0)
 FORWARD_MARGIN = 1.05
@@ -141,51 +138,6 @@ def present_share(cameras: PinholeCameras, points: np.ndarray, place: np.ndarray
         if central.any():
             shares.append(np.mean((depth[central] > low * distance) & (depth[central] < high * distance)))
     return float(np.median(shares)) if shares else 0.0
-
-
-def visual_hull_sphere(
-    cameras: PinholeCameras, masks: Sequence[np.ndarray | None], center: np.ndarray, radius: float
-) -> tuple[np.ndarray, float] | None:
-    """Sphere about the visual hull of silhouettes, looked for in the cube `center` +- `radius`.
-
-    The cube is carved on a coarse grid, then once more on the hull's own box; without margin.
-
-    Args:
-        masks: one [H, W] bool (or 0/255) array per camera, of the camera's size, or None where there is none.
-
-    Returns:
-        Centre [3] and radius, or None where nothing is left after carving.
-    """
-    low, high = center - radius, center + radius
-    for _ in range(2):
-        cell = (high - low) / HULL_CELLS
-        axes = [low[k] + (np.arange(HULL_CELLS) + 0.5) * cell[k] for k in range(3)]
-        grid = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
-        inside = _inside_silhouettes(cameras, masks, grid)
-        if not inside.any():
-            return None
-        kept = grid[inside]
-        low, high = kept.min(0) - cell, kept.max(0) + cell
-    hull_center = (kept.min(0) + kept.max(0)) / 2
-    # a cell's own half diagonal, because the grid holds centres of cells
-    hull_radius = np.linalg.norm(kept - hull_center, axis=1).max() + np.linalg.norm(cell) / 2
-    return hull_center, float(hull_radius)
-
-
-def _inside_silhouettes(cameras: PinholeCameras, masks: Sequence[np.ndarray | None], points: np.ndarray) -> np.ndarray:
-    """[P] whether points [P, 3] lie inside the silhouettes of nearly all the views they project into."""
-    seen, inside = np.zeros(len(points)), np.zeros(len(points))
-    masked = [i for i, mask in enumerate(masks) if mask is not None]
-    for i in masked:
-        pixels, depth = cameras.project(i, points)
-        width, height = cameras.sizes[i]
-        u, v = np.floor(pixels[:, 0]), np.floor(pixels[:, 1])
-        visible = (depth > 0) & (u >= 0) & (v >= 0) & (u < width) & (v < height)
-        rows, columns = v[visible].astype(int), u[visible].astype(int)
-        seen += visible
-        inside[visible] += np.asarray(masks[i])[rows, columns] > 0
-    # a voxel most views do not see is no part of what they were pointed at
-    return (seen >= max(1.0, 0.5 * len(masked))) & (inside >= HULL_AGREEMENT * seen)
 
 
 def robust_sphere(

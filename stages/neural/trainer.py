@@ -22,6 +22,9 @@ from stages.neural.schedules import Moment
 from stages.neural.sightings import Sightings, sighting_loss
 from stages.neural.terms import Terms
 
+# The regression to a hull before training: long enough for an error of about a cell of its grid.
+HULL_STEPS, HULL_POINTS = 200, 2048
+
 
 def field_shape(params: TrainParams, num_images: int, background: bool) -> FieldShape:
     """The networks' shape for these settings."""
@@ -73,6 +76,34 @@ class Trainer:
         self.terms = Terms(self.fields, photos, self.cache, params, self.generator)
         self.step_index = 0
         self.cache_step = -(10**9)
+
+    def start_from(self, distances: np.ndarray) -> float:
+        """Bring the SDF to given distances before the first step; returns the mean error at the end.
+
+        A short regression with an optimiser of its own: half of the points anywhere in the cube, half near the surface.
+
+        Args:
+            distances: [n, n, n] at the centres of a grid over [-1, 1]^3, axes x, y, z.
+        """
+        grid = torch.from_numpy(distances).to(self.device)
+        cells = len(grid)
+        near = torch.nonzero(grid.abs() < 3 * 2 / cells)
+        levels = self.moment(0.0).levels
+        groups = [{"params": group["params"], "lr": group["base_lr"]} for group in self.optimizer.param_groups]
+        optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-15)
+        for step in range(HULL_STEPS):
+            for group, settings in zip(optimizer.param_groups, self.optimizer.param_groups, strict=True):
+                group["lr"] = settings["base_lr"] * (1 - step / HULL_STEPS)
+            anywhere = torch.randint(cells, (HULL_POINTS, 3), generator=self.generator, device=self.device)
+            rows = torch.randint(len(near), (HULL_POINTS,), generator=self.generator, device=self.device)
+            picks = torch.cat([anywhere, near[rows]])
+            points = (picks + 0.5) * (2 / cells) - 1
+            error = (self.fields.sdf.sdf(points, levels) - grid[picks[:, 0], picks[:, 1], picks[:, 2]]).abs().mean()
+            optimizer.zero_grad(set_to_none=True)
+            error.backward()
+            optimizer.step()
+        self._forget_gradients()
+        return error.item()
 
     # ------------------------------------------------------------------ schedules
     def moment(self, progress: float) -> Moment:

@@ -1,0 +1,85 @@
+"""The visual hull: the largest shape that silhouettes allow."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from stages.geometry.cameras import PinholeCameras
+
+# A voxel belongs to the hull when it is inside the silhouette in this part of the views it projects into;
+# less than 1, because a mask or a pose may be wrong.
+HULL_AGREEMENT = 0.9
+HULL_CELLS = 48
+DISTANCE_CELLS = 64
+
+
+def visual_hull_sphere(
+    cameras: PinholeCameras, masks: Sequence[np.ndarray | None], center: np.ndarray, radius: float
+) -> tuple[np.ndarray, float] | None:
+    """Sphere about the visual hull of silhouettes, looked for in the cube `center` +- `radius`.
+
+    The cube is carved on a coarse grid, then once more on the hull's own box; without margin.
+
+    Args:
+        masks: one [H, W] bool (or 0/255) array per camera, of the camera's size, or None where there is none.
+
+    Returns:
+        Centre [3] and radius, or None where nothing is left after carving.
+    """
+    low, high = center - radius, center + radius
+    for _ in range(2):
+        cell = (high - low) / HULL_CELLS
+        axes = [low[k] + (np.arange(HULL_CELLS) + 0.5) * cell[k] for k in range(3)]
+        grid = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+        inside = _inside_silhouettes(cameras, masks, grid)
+        if not inside.any():
+            return None
+        kept = grid[inside]
+        low, high = kept.min(0) - cell, kept.max(0) + cell
+    hull_center = (kept.min(0) + kept.max(0)) / 2
+    # a cell's own half diagonal, because the grid holds centres of cells
+    hull_radius = np.linalg.norm(kept - hull_center, axis=1).max() + np.linalg.norm(cell) / 2
+    return hull_center, float(hull_radius)
+
+
+def _inside_silhouettes(cameras: PinholeCameras, masks: Sequence[np.ndarray | None], points: np.ndarray) -> np.ndarray:
+    """[P] whether points [P, 3] lie inside the silhouettes of nearly all the views they project into."""
+    seen, inside = np.zeros(len(points)), np.zeros(len(points))
+    masked = [i for i, mask in enumerate(masks) if mask is not None]
+    for i in masked:
+        pixels, depth = cameras.project(i, points)
+        width, height = cameras.sizes[i]
+        u, v = np.floor(pixels[:, 0]), np.floor(pixels[:, 1])
+        visible = (depth > 0) & (u >= 0) & (v >= 0) & (u < width) & (v < height)
+        rows, columns = v[visible].astype(int), u[visible].astype(int)
+        seen += visible
+        inside[visible] += np.asarray(masks[i])[rows, columns] > 0
+    # a voxel most views do not see is no part of what they were pointed at
+    return (seen >= max(1.0, 0.5 * len(masked))) & (inside >= HULL_AGREEMENT * seen)
+
+
+def hull_distances(
+    cameras: PinholeCameras, masks: Sequence[np.ndarray | None], cells: int = DISTANCE_CELLS
+) -> np.ndarray | None:
+    """Signed distance to the hull, negative inside, at the centres of a grid over the cube [-1, 1]^3.
+
+    Args:
+        masks: one [H, W] array per camera, not zero on the object, or None where there is none.
+
+    Returns:
+        [cells, cells, cells] float32, axes x, y, z; or None where nothing, or all, is inside.
+    """
+    from scipy.ndimage import distance_transform_edt
+
+    cell = 2.0 / cells
+    axis = (np.arange(cells) + 0.5) * cell - 1
+    grid = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
+    inside = (_inside_silhouettes(cameras, masks, grid) & (np.linalg.norm(grid, axis=1) < 1)).reshape([cells] * 3)
+    if not inside.any() or inside.all():
+        return None
+    # The transforms count to the nearest centre on the other side; the surface is half a cell before it.
+    outside_by = np.maximum(distance_transform_edt(~inside) - 0.5, 0)
+    inside_by = np.maximum(distance_transform_edt(inside) - 0.5, 0)
+    return (cell * (outside_by - inside_by)).astype(np.float32)
