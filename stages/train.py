@@ -7,6 +7,7 @@ import logging
 import os
 import shutil
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import IO, Any
 
@@ -98,13 +99,14 @@ def _use_threads(context: StageContext) -> None:
     numba.set_num_threads(min(context.workers, numba.config.NUMBA_NUM_THREADS))
 
 
-def _load_images(folder: Path, names: tuple[str, ...]) -> tuple[list[np.ndarray], list[np.ndarray] | None]:
-    """RGB images [H, W, 3] uint8 and masks [H, W] uint8, or None unless every photo has a mask."""
-    images = [artifacts.load_image(folder, name) for name in names]
-    masks = [mask for name in names if (mask := artifacts.load_mask(folder, name)) is not None]
-    if 0 < len(masks) < len(images):
-        log.warning("only %d of %d photos have a mask: training goes without masks", len(masks), len(images))
-    return images, masks if len(masks) == len(images) else None
+def _load_images(folder: Path, names: tuple[str, ...]) -> tuple[Iterator[np.ndarray], Iterator[np.ndarray] | None]:
+    """RGB images [H, W, 3] uint8 and masks [H, W] uint8, each read when taken; no masks unless every photo has one."""
+    masked = sum(artifacts.mask_path(folder, name).exists() for name in names)
+    if 0 < masked < len(names):
+        log.warning("only %d of %d photos have a mask: training goes without masks", masked, len(names))
+    images = (artifacts.load_image(folder, name) for name in names)
+    masks = (mask for name in names if (mask := artifacts.load_mask(folder, name)) is not None)
+    return images, masks if masked == len(names) else None
 
 
 def _start_from_hull(

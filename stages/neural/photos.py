@@ -5,6 +5,7 @@ Shapes: I photos, T pixels of all photos together, R rays.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -50,23 +51,19 @@ class Photos:
     def __init__(
         self,
         cameras: PinholeCameras,
-        images: list[np.ndarray],
-        masks: list[np.ndarray] | None,
+        images: Iterable[np.ndarray],
+        masks: Iterable[np.ndarray] | None,
         device: torch.device | str,
         training: torch.Tensor | None = None,
     ) -> None:
         """images: I arrays [H, W, 3] uint8; masks: I arrays [H, W] uint8 or None; training: None for all photos.
 
-        Raises ValueError on sizes.
+        Images and masks are taken one at a time, so that they need not all be held twice. Raises ValueError on sizes.
         """
-        for i, image in enumerate(images):
-            width, height = cameras.sizes[i]
-            if image.shape != (height, width, 3):
-                raise ValueError(f"{cameras.names[i]}: got shape {image.shape}, expected {(height, width, 3)}")
         self.device = torch.device(device)
-        self.pixels = torch.from_numpy(np.concatenate([i.reshape(-1, 3) for i in images])).to(device)
-        self.masks = torch.from_numpy(np.concatenate([m.ravel() for m in masks])).to(device) if masks else None
-        self.training = torch.ones(len(images), dtype=torch.bool) if training is None else training
+        self.pixels = _flat(cameras, images, (3,), self.device)
+        self.masks = None if masks is None else _flat(cameras, masks, (), self.device)
+        self.training = torch.ones(len(cameras), dtype=torch.bool) if training is None else training
         self.training = self.training.to(device)
         self._drawn = torch.nonzero(self.training).squeeze(1)
         counts = cameras.sizes.prod(1)
@@ -127,6 +124,24 @@ class Photos:
             self.pixels[rows].float() / 255,
             None if self.masks is None else self.masks[rows].float() / 255,
         )
+
+
+def _flat(
+    cameras: PinholeCameras, images: Iterable[np.ndarray], channels: tuple[int, ...], device: torch.device
+) -> torch.Tensor:
+    """All images [H, W, *channels] uint8 as one tensor of pixels [T, *channels].
+
+    Raises ValueError where one has not its camera's size.
+    """
+    pixels = torch.empty((int(cameras.sizes.prod(1).sum()), *channels), dtype=torch.uint8, device=device)
+    first = 0
+    for name, (width, height), image in zip(cameras.names, cameras.sizes, images, strict=True):
+        if image.shape != (height, width, *channels):
+            raise ValueError(f"{name}: got shape {image.shape}, expected {(int(height), int(width), *channels)}")
+        count = height * width
+        pixels[first : first + count] = torch.from_numpy(np.ascontiguousarray(image).reshape(count, *channels))
+        first += count
+    return pixels
 
 
 def _sphere_boxes(cameras: PinholeCameras) -> np.ndarray:
