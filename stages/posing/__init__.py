@@ -1,0 +1,1 @@
+"""Where the camera poses come from."""

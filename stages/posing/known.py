@@ -1,0 +1,180 @@
+"""Camera poses that are known already: what every reader gives, and which photo belongs to which camera.
+
+Cameras are COLMAP's: OpenCV axes (x right, y down, z forward), pixel centres at .5, a camera model by name.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+
+from stages.errors import InputError
+
+# An image's suffix; "frame.0001" has none.
+SUFFIX = re.compile(r"\.[A-Za-z]{3,5}$")
+# Width and height may be scaled by factors that differ by this much: both were rounded.
+MAX_STRETCH = 0.01
+# A rotation written with a few digits only is taken for the nearest true one, within this.
+ROTATION_TOLERANCE = 1e-2
+
+
+@dataclass(frozen=True)
+class KnownCamera:
+    """One image's camera.
+
+    Attributes:
+        name: the image as the poses' file names it, a posix path; its suffix may be missing.
+        size: width and height in pixels of the image that the parameters are for.
+        model: COLMAP's name of the camera model.
+        params: of that model, pixels.
+        cam_from_world: [3, 4] rotation and translation.
+    """
+
+    name: str
+    size: tuple[int, int]
+    model: str
+    params: tuple[float, ...]
+    cam_from_world: np.ndarray
+
+
+@dataclass(frozen=True)
+class StatedRegion:
+    """The sphere that holds the object as the poses' file says, in its world frame.
+
+    Attributes:
+        center: [3]. radius: world units. source: where it is said, in words.
+    """
+
+    center: np.ndarray
+    radius: float
+    source: str
+
+
+@dataclass(frozen=True)
+class KnownPoses:
+    """What a file of poses says.
+
+    Attributes:
+        origin: the file or folder.
+        cameras: in the file's order; names are unique.
+        region: where the object is, if the file says so.
+        masks: camera's name -> file of its mask, of formats that come with masks.
+    """
+
+    origin: Path
+    cameras: tuple[KnownCamera, ...]
+    region: StatedRegion | None = None
+    masks: Mapping[str, Path] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        seen: set[str] = set()
+        for camera in self.cameras:
+            if camera.name in seen:
+                raise InputError(f"{self.origin} has two poses for {camera.name}.", "Remove one of them.")
+            seen.add(camera.name)
+        if not self.cameras:
+            raise InputError(f"{self.origin} has no poses.", "Name another file with `--poses`.")
+
+
+# ---------------------------------------------------------------- photos and cameras
+def match_photos(poses: KnownPoses, photos: Iterable[str]) -> dict[str, KnownCamera]:
+    """The camera of each photo that has one.
+
+    Names agree when their last part does, suffix aside; where several do, the one with more of the path in common
+    is meant, then the one with the same suffix.
+
+    Args:
+        photos: relative posix paths.
+
+    Raises:
+        InputError: no photo has a camera, or two photos fit one camera equally well.
+    """
+    photos = list(photos)
+    by_stem: dict[str, list[str]] = {}
+    for photo in photos:
+        by_stem.setdefault(_parts(photo)[-1], []).append(photo)
+    cameras_of: dict[str, list[tuple[tuple[int, bool], KnownCamera]]] = {}
+    for camera in poses.cameras:
+        scored = [(_likeness(camera.name, photo), photo) for photo in by_stem.get(_parts(camera.name)[-1], [])]
+        if not scored:
+            continue
+        best = max(score for score, _ in scored)
+        fitting = [photo for score, photo in scored if score == best]
+        if len(fitting) > 1:
+            raise InputError(
+                f"The pose of {camera.name} in {poses.origin} fits {len(fitting)} photos: {fitting[0]}, {fitting[1]}.",
+                "Name the folder that only holds the photos.",
+            )
+        cameras_of.setdefault(fitting[0], []).append((best, camera))
+    matched = {}
+    for photo in photos:
+        if photo in cameras_of:
+            matched[photo] = max(cameras_of[photo], key=lambda scored: scored[0])[1]
+    if not matched:
+        example = f", photos are called e.g. {photos[0]}" if photos else ""
+        raise InputError(
+            f"None of the {len(photos)} photos has a pose in {poses.origin}: it names {len(poses.cameras)} images, "
+            f"e.g. {poses.cameras[0].name}{example}.",
+            "Name the folder of the photos these poses belong to: `hineus run PHOTOS --poses FILE`.",
+        )
+    return matched
+
+
+def _parts(name: str) -> tuple[str, ...]:
+    return PurePosixPath(SUFFIX.sub("", name)).parts
+
+
+def _likeness(first: str, second: str) -> tuple[int, bool]:
+    """How many parts of two paths agree, from the end; whether the suffixes do."""
+    common = 0
+    for one, other in zip(reversed(_parts(first)), reversed(_parts(second)), strict=False):
+        if one != other:
+            break
+        common += 1
+    return common, PurePosixPath(first).suffix.lower() == PurePosixPath(second).suffix.lower()
+
+
+# ---------------------------------------------------------------- what readers share
+def nearest_rotation(matrix: np.ndarray, name: str, origin: Path) -> np.ndarray:
+    """The rotation [3, 3] that a nearly orthonormal `matrix` [3, 3] stands for.
+
+    Raises:
+        InputError: it is none: mirrored, scaled or skewed.
+    """
+    left, _, right = np.linalg.svd(matrix)
+    rotation = left @ right
+    if not np.allclose(rotation, matrix, atol=ROTATION_TOLERANCE) or np.linalg.det(rotation) < 0:
+        raise InputError(
+            f"The pose of {name} in {origin} has no rotation: its 3 x 3 part is off by "
+            f"{np.abs(rotation - matrix).max():.3g} (determinant {np.linalg.det(matrix):.3g}, need 1).",
+            "Poses must be rigid: no scale, no mirroring.",
+        )
+    return rotation
+
+
+def image_size(file: Path, origin: Path) -> tuple[int, int]:
+    """Width and height in pixels of an image that the poses name.
+
+    Raises:
+        InputError: it cannot be read.
+    """
+    from PIL import Image
+
+    try:
+        with Image.open(file) as image:
+            return image.size
+    except OSError as error:
+        raise InputError(
+            f"{origin} does not say how large its images are, and {file} cannot be read.",
+            "Keep the file of poses beside its images.",
+        ) from error
+
+
+def first_of(names: Sequence[str], count: int = 3) -> str:
+    """The first names, and how many more there are."""
+    more = len(names) - count
+    return ", ".join(names[:count]) + (f" and {more} more" if more > 0 else "")

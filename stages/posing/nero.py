@@ -1,0 +1,101 @@
+"""Poses in the layout of NeRO's GlossySynthetic: per image `7.png`, `7-camera.pkl` and `7-depth.png`.
+
+A camera is a pickled pair: cam_from_world [3, 4] with OpenCV axes, and intrinsics [3, 3] of Blender (the corner of the
+image is (0, 0), as in COLMAP). The object lies in the unit sphere.
+"""
+
+from __future__ import annotations
+
+import pickle
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from stages.errors import InputError
+from stages.posing.known import KnownCamera, KnownPoses, StatedRegion, image_size, nearest_rotation
+
+CAMERA, DEPTH = "-camera.pkl", "-depth.png"
+# Depth is stored in 16 bits from 0 to 15; what is nearer than 14.5 is the object.
+DEPTH_RANGE, DEPTH_OBJECT = 15.0, 14.5
+# All that a pickled array needs.
+ALLOWED = {
+    ("numpy", "ndarray"),
+    ("numpy", "dtype"),
+    ("numpy._core.multiarray", "_reconstruct"),
+    ("numpy._core.multiarray", "scalar"),
+    ("numpy._core.numeric", "_frombuffer"),
+    ("_codecs", "encode"),
+}
+
+
+class _ArraysOnly(pickle.Unpickler):
+    """A pickle may name any function to call; this one takes arrays and plain values, and refuses the rest."""
+
+    def find_class(self, module: str, name: str) -> Any:
+        module = module.replace("numpy.core.", "numpy._core.")  # as NumPy 1 writes it
+        if (module, name) not in ALLOWED:
+            raise pickle.UnpicklingError(f"it holds {module}.{name}; only arrays are taken")
+        return super().find_class(module, name)
+
+
+def has_cameras(folder: Path) -> bool:
+    return next(folder.glob(f"*{CAMERA}"), None) is not None
+
+
+def read_nero(folder: Path) -> KnownPoses:
+    """Cameras of all images in `folder` that have one.
+
+    Raises:
+        InputError: a camera cannot be read.
+    """
+    cameras, masks = [], {}
+    for file in sorted(folder.glob(f"*{CAMERA}"), key=lambda path: (len(path.name), path.name)):
+        stem = file.name.removesuffix(CAMERA)
+        pose, intrinsics = _load(file)
+        rotation = nearest_rotation(pose[:, :3], stem, file)
+        name = f"{stem}.png"
+        cameras.append(
+            KnownCamera(
+                name=name,
+                size=image_size(folder / name, file),
+                model="PINHOLE",
+                params=tuple(float(intrinsics[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2))),
+                cam_from_world=np.concatenate([rotation, pose[:, 3:]], 1),
+            )
+        )
+        if (folder / f"{stem}{DEPTH}").is_file():
+            masks[name] = folder / f"{stem}{DEPTH}"
+    region = StatedRegion(np.zeros(3), 1.0, "the unit sphere of GlossySynthetic")
+    return KnownPoses(folder, tuple(cameras), region, masks)
+
+
+def read_depth_mask(file: Path) -> np.ndarray:
+    """[H, W] bool, true on the object, of a 16-bit depth image.
+
+    Raises:
+        InputError: it is none.
+    """
+    import cv2
+
+    depth = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+    if depth is None or depth.dtype != np.uint16:
+        found = "it cannot be read" if depth is None else f"it has {8 * depth.itemsize} bits"
+        raise InputError(f"{file} is no 16-bit depth image: {found}.", "Leave depth out with `--no-masks`.")
+    return (depth if depth.ndim == 2 else depth[..., 0]) / 65535 * DEPTH_RANGE < DEPTH_OBJECT
+
+
+def _load(file: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Pose [3, 4] and intrinsics [3, 3]."""
+    try:
+        with file.open("rb") as stream:
+            pose, intrinsics = _ArraysOnly(stream).load()[:2]
+        pose, intrinsics = np.asarray(pose, dtype=np.float64), np.asarray(intrinsics, dtype=np.float64)
+    except Exception as error:  # a damaged pickle raises nearly anything
+        raise InputError(f"The camera {file} cannot be read ({error}).", "It needs a pose and intrinsics.") from error
+    if pose.shape[-1:] != (4,) or pose.shape[:-1] not in ((3,), (4,)) or intrinsics.shape != (3, 3):
+        raise InputError(
+            f"The camera {file} holds arrays {pose.shape} and {intrinsics.shape}, expected (3, 4) and (3, 3).",
+            "It needs a pose and intrinsics.",
+        )
+    return pose[:3], intrinsics

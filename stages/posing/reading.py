@@ -1,0 +1,67 @@
+"""Which format a file or folder of poses has, and its reader."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from stages.errors import InputError
+from stages.posing import colmap_model, nero, neus, transforms
+from stages.posing.known import KnownPoses
+
+FORMATS = (
+    "a COLMAP model, transforms.json (nerfstudio, instant-ngp, Blender), cameras_sphere.npz (NeuS, IDR), "
+    "or a folder of *-camera.pkl (NeRO)"
+)
+
+
+def locate_poses(path: Path) -> Path:
+    """The file (or the folder, of COLMAP and NeRO) that holds the poses in `path`, a file or a data set's folder.
+
+    Raises:
+        InputError: there are none.
+    """
+    if not path.exists():
+        raise InputError(f"There are no poses at {path}.", "Check the path with `ls`.")
+    if path.is_file():
+        if path.suffix in (".json", ".npz"):
+            return path
+        if path.suffix in (".bin", ".txt") and colmap_model.find_model(path.parent) == path.parent:
+            return path.parent
+        if path.name.endswith(nero.CAMERA):
+            return path.parent
+        raise InputError(f"{path} is no file of poses.", f"`--poses` takes {FORMATS}.")
+    if colmap_model.find_model(path) == path:
+        return path
+    for name in (*neus.FILES, *transforms.FILES):
+        if (path / name).is_file():
+            return path / name
+    if nero.has_cameras(path):
+        return path
+    model = colmap_model.find_model(path)
+    if model is None:
+        raise InputError(f"No poses were found in {path}.", f"`--poses` takes {FORMATS}.")
+    return model
+
+
+def masks_beside(poses: Path) -> Path | None:
+    """The folder of the masks that the format of `poses` (as located) comes with, if it is there."""
+    if poses.suffix == ".npz":
+        folder = poses.parent / neus.MASKS
+        return folder if folder.is_dir() else None
+    if poses.is_dir() and nero.has_cameras(poses) and next(poses.glob(f"*{nero.DEPTH}"), None) is not None:
+        return poses
+    return None
+
+
+def read_poses(path: Path) -> KnownPoses:
+    """Cameras of `path`, a file or folder in any of the formats.
+
+    Raises:
+        InputError: it cannot be read, or it is none of them.
+    """
+    found = locate_poses(path)
+    if found.suffix == ".json":
+        return transforms.read_transforms(found)
+    if found.suffix == ".npz":
+        return neus.read_neus(found)
+    return colmap_model.read_colmap(found) if colmap_model.find_model(found) == found else nero.read_nero(found)

@@ -1,0 +1,165 @@
+"""A COLMAP model of known cameras: features and matches are found, points triangulated, the poses held fixed."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from stages.artifacts import ImageRecord
+from stages.errors import InputError
+from stages.posing.known import MAX_STRETCH, KnownCamera
+
+log = logging.getLogger(__name__)
+
+# Parts of the progress bar.
+PART_FEATURES, PART_MATCHES = 0.3, 0.9
+# Photos are matched with this many nearest ones where there are too many for all pairs.
+NEIGHBOURS = 40
+
+
+def fitted_camera(known: KnownCamera, record: ImageRecord) -> Any:
+    """The pycolmap camera of a photo that may have been reduced since its pose was found.
+
+    Raises:
+        InputError: photo and pose have different proportions, or the parameters are not valid.
+    """
+    import pycolmap
+
+    camera = pycolmap.Camera(model=known.model, width=known.size[0], height=known.size[1], params=list(known.params))
+    if not camera.verify_params():
+        raise InputError(f"The camera of {known.name} has {len(known.params)} parameters.", "Mend the poses.")
+    scale_x, scale_y = record.width / known.size[0], record.height / known.size[1]
+    if abs(scale_x / scale_y - 1) > MAX_STRETCH:
+        raise InputError(
+            f"{record.source} is {record.width} x {record.height} pixels upright, but its pose is for "
+            f"{known.size[0]} x {known.size[1]}.",
+            "Give the photos that the poses were found for, not cropped and not turned.",
+        )
+    if (record.width, record.height) != known.size:
+        camera.rescale(record.width, record.height)
+    camera.has_prior_focal_length = True
+    return camera
+
+
+def triangulate(
+    work: Path,
+    images_folder: Path,
+    cameras: Mapping[str, tuple[KnownCamera, ImageRecord]],
+    params: Any,
+    threads: int,
+    workers: int,
+    device: Any,
+    progress: Callable[[float, float, str], None],
+) -> tuple[Any, str]:
+    """The model, and how pairs were matched.
+
+    Args:
+        work: empty folder.
+        cameras: name under `images_folder` -> its camera and record.
+        params: `configs.params.SfmParams`.
+        threads: for what depends on their number (matching). workers: for the rest.
+
+    Raises:
+        InputError: see `fitted_camera`.
+    """
+    import pycolmap
+
+    database_path = work / "database.db"
+    model = _posed_model(database_path, images_folder, cameras)
+    progress(0.02, 1, "features")
+    extraction = pycolmap.FeatureExtractionOptions()
+    extraction.max_image_size, extraction.num_threads = params.max_image_size, workers
+    extraction.sift.max_num_features = params.max_features
+    extraction.use_gpu = device == pycolmap.Device.cuda
+    pycolmap.extract_features(database_path, images_folder, extraction_options=extraction, device=device)
+    progress(PART_FEATURES, 1, "matches")
+    matcher = _match(database_path, model, params, threads, device)
+    progress(PART_MATCHES, 1, "points")
+    options = pycolmap.IncrementalPipelineOptions()
+    options.num_threads = options.mapper.num_threads = threads
+    options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = params.seed
+    options.extract_colors = False
+    out = work / "points"
+    out.mkdir()
+    return pycolmap.triangulate_points(model, database_path, images_folder, out, options=options), matcher
+
+
+def _posed_model(
+    database_path: Path, images_folder: Path, cameras: Mapping[str, tuple[KnownCamera, ImageRecord]]
+) -> Any:
+    """A database of the images and their cameras, and a model of the same ids with all poses and no points."""
+    import pycolmap
+
+    shared: dict[tuple[Any, ...], list[str]] = {}
+    for name, (known, record) in sorted(cameras.items()):
+        key = (known.model, known.params, known.size, record.width, record.height)
+        shared.setdefault(key, []).append(name)
+    pycolmap.Database.open(database_path).close()  # creates it
+    for names in shared.values():
+        camera = fitted_camera(*cameras[names[0]])
+        options = pycolmap.ImageReaderOptions()
+        options.camera_model = camera.model_name
+        options.camera_params = ",".join(f"{value:.17g}" for value in camera.params)
+        pycolmap.import_images(
+            database_path,
+            images_folder,
+            camera_mode=pycolmap.CameraMode.SINGLE,
+            image_names=names,
+            options=options,
+        )
+    model = pycolmap.Reconstruction()
+    with pycolmap.Database.open(database_path) as database:
+        for camera in database.read_all_cameras():
+            model.add_camera_with_trivial_rig(camera)
+        for image in database.read_all_images():
+            pose = cameras[image.name][0].cam_from_world
+            model.add_image_with_trivial_frame(
+                pycolmap.Image(image.name, pycolmap.Point2DList(), image.camera_id, image.image_id),
+                pycolmap.Rigid3d(pycolmap.Rotation3d(pose[:, :3]), pose[:, 3]),
+            )
+    return model
+
+
+def _match(database_path: Path, model: Any, params: Any, threads: int, device: Any) -> str:
+    """All pairs of small sets, else neighbours in space: the poses say which these are."""
+    import pycolmap
+
+    matching = pycolmap.FeatureMatchingOptions()
+    matching.num_threads, matching.use_gpu = threads, device == pycolmap.Device.cuda
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = params.seed
+    common = {"matching_options": matching, "verification_options": verification, "device": device}
+    matcher = params.matcher
+    if matcher == "auto":
+        matcher = "exhaustive" if model.num_reg_images() <= params.exhaustive_max else "spatial"
+    if matcher == "exhaustive":
+        pycolmap.match_exhaustive(database_path, **common)
+    elif matcher == "sequential":
+        pycolmap.match_sequential(database_path, **common)
+    else:
+        _write_positions(database_path, model)
+        pairing = pycolmap.SpatialPairingOptions()
+        pairing.max_num_neighbors = NEIGHBOURS
+        pairing.max_distance, pairing.ignore_z = 1e12, False  # the unit of the poses is not known
+        pycolmap.match_spatial(database_path, pairing_options=pairing, **common)
+    return matcher
+
+
+def _write_positions(database_path: Path, model: Any) -> None:
+    """The cameras' own positions in place of those in EXIF."""
+    import pycolmap
+
+    with pycolmap.Database.open(database_path) as database:
+        database.clear_pose_priors()
+        for image in model.images.values():
+            database.write_pose_prior(
+                pycolmap.PosePrior(
+                    corr_data_id=image.data_id,
+                    position=np.asarray(image.projection_center()).reshape(3, 1),
+                    coordinate_system=pycolmap.PosePriorCoordinateSystem.CARTESIAN,
+                )
+            )
