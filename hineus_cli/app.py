@@ -37,6 +37,14 @@ WorkspaceOption = Annotated[
 Masks = Annotated[
     Path | None, typer.Option(help="Folder of masks, named like the photos, white on the object.", show_default=False)
 ]
+Poses = Annotated[
+    Path | None,
+    typer.Option(
+        help="Known poses: a COLMAP model, transforms.json, cameras_sphere.npz, or a folder of *-camera.pkl.",
+        show_default=False,
+    ),
+]
+NoPoses = Annotated[bool, typer.Option("--no-poses", help="Forget the poses of the last run and find them.")]
 NoMasks = Annotated[bool, typer.Option("--no-masks", help="Forget the masks of the last run.")]
 Preset = Annotated[
     str | None,
@@ -126,6 +134,8 @@ def run(
     workspace: WorkspaceOption = None,
     masks: Masks = None,
     no_masks: NoMasks = False,
+    poses: Poses = None,
+    no_poses: NoPoses = False,
     preset: Preset = None,
     config: ConfigFile = None,
     sets: Sets = None,
@@ -151,6 +161,8 @@ def run(
         workspace=workspace,
         masks=masks,
         no_masks=no_masks,
+        poses=poses,
+        no_poses=no_poses,
         preset=preset,
         config=config,
         sets=tuple(sets or ()),
@@ -174,6 +186,8 @@ def stage_command(stage: Stage) -> Callable[..., None]:
         workspace: WorkspaceOption = None,
         masks: Masks = None,
         no_masks: NoMasks = False,
+        poses: Poses = None,
+        no_poses: NoPoses = False,
         preset: Preset = None,
         config: ConfigFile = None,
         sets: Sets = None,
@@ -192,6 +206,8 @@ def stage_command(stage: Stage) -> Callable[..., None]:
             workspace=workspace,
             masks=masks,
             no_masks=no_masks,
+            poses=poses,
+            no_poses=no_poses,
             preset=preset,
             config=config,
             sets=tuple(sets or ()),

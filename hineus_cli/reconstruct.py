@@ -18,6 +18,7 @@ from stages.engine.runner import Listener, StageOutcome, run_pipeline
 from stages.engine.stage import Stage
 from stages.engine.workspace import Workspace
 from stages.errors import ConfigError, InputError, SystemRequirementError
+from stages.posing.reading import locate_poses, masks_beside
 
 log = logging.getLogger(__name__)
 
@@ -32,6 +33,7 @@ class Request:
         photos: folder of photos; a workspace that was run before knows its own.
         workspace: folder; default `<photos' name>_hineus` here.
         masks: folder of masks; kept from the last run while the photos are the same, unless `no_masks`.
+        poses: file or folder of known poses; kept like the masks, unless `no_poses`.
         preset, config, sets: layers of settings. With neither preset nor config, a workspace keeps its own.
         from_stage, until, force: see `run_pipeline`.
         device: "auto", "cpu" or "cuda".
@@ -44,6 +46,8 @@ class Request:
     workspace: Path | None = None
     masks: Path | None = None
     no_masks: bool = False
+    poses: Path | None = None
+    no_poses: bool = False
     preset: str | None = None
     config: Path | None = None
     sets: Sequence[str] = ()
@@ -86,17 +90,17 @@ def reconstruct(request: Request, pipeline: Sequence[Stage], listener: Listener 
         # Read when the heavy libraries load, which is inside the stages.
         os.environ["OMP_NUM_THREADS"] = str(request.workers)
     workspace = Workspace.open(choose_folder(request), create=True)
-    photos, masks = choose_sources(request, workspace)
+    sources = choose_sources(request, workspace)
     preset, config = choose_config(request, workspace)
     device = choose_device(request.device)
     workers = request.workers or available_cores()
     with workspace.lock(), log_to_file(workspace.log_path):
-        log.debug("preset %s, device %s, %d workers, photos %s", preset, device, workers, photos)
+        log.debug("preset %s, device %s, %d workers, %s", preset, device, workers, sources)
         outcomes = run_pipeline(
             pipeline,
             workspace,
             config,
-            {"photos": photos, "masks": masks},
+            sources,
             device=device,
             workers=workers,
             from_stage=request.from_stage,
@@ -126,8 +130,10 @@ def choose_folder(request: Request) -> Path:
     )
 
 
-def choose_sources(request: Request, workspace: Workspace) -> tuple[Path, Path | None]:
-    """Photos and masks: those given, else those the workspace was last run with.
+def choose_sources(request: Request, workspace: Workspace) -> dict[str, Path | None]:
+    """Photos, masks and poses: those given, else those the workspace was last run with.
+
+    Masks that the poses' format comes with are used, too.
 
     Raises:
         InputError: there are none, a given one is no folder, or the workspace lies inside the photos.
@@ -154,10 +160,17 @@ def choose_sources(request: Request, workspace: Workspace) -> tuple[Path, Path |
             "Choose a folder outside with `--workspace DIR`.",
         )
     masks = request.masks.resolve() if request.masks else None
-    remembered = known.get("masks")
-    if masks is None and remembered and not request.no_masks and str(photos) == recorded:
-        masks = Path(remembered)
-    return photos, masks
+    poses = locate_poses(request.poses).resolve() if request.poses else None
+    if str(photos) == recorded:
+        masks = masks or _remembered(known.get("masks"), request.no_masks)
+        poses = poses or _remembered(known.get("poses"), request.no_poses)
+    if masks is None and request.poses and poses is not None and not request.no_masks:
+        masks = masks_beside(poses)
+    return {"photos": photos, "masks": masks, "poses": poses}
+
+
+def _remembered(path: str | None, forget: bool) -> Path | None:
+    return Path(path) if path and not forget else None
 
 
 def choose_config(request: Request, workspace: Workspace) -> tuple[str | None, Config]:

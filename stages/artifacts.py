@@ -142,9 +142,10 @@ def load_image_set(folder: Path) -> ImageSet:
     )
 
 
-# ---------------------------------------------------------------- sfm: model/, registration.json
+# ---------------------------------------------------------------- sfm: model/, registration.json, known_poses.json
 MODEL = "model"
 REGISTRATION = "registration.json"
+KNOWN_POSES = "known_poses.json"
 
 
 def model_path(folder: Path) -> Path:
@@ -160,6 +161,17 @@ def save_registration(folder: Path, registration: dict[str, Any]) -> None:
 
 def load_registration(folder: Path) -> dict[str, Any]:
     return read_json(folder / REGISTRATION)
+
+
+def save_known_poses(folder: Path, origin: str, region: dict[str, Any] | None) -> None:
+    """Where poses that were given came from; the sphere {"center", "radius", "source"} they say the object is in."""
+    write_json(folder / KNOWN_POSES, {"origin": origin, "region": region})
+
+
+def load_known_poses(folder: Path) -> dict[str, Any] | None:
+    """What `save_known_poses` wrote; None where the poses were found and not given."""
+    path = folder / KNOWN_POSES
+    return read_json(path) if path.exists() else None
 
 
 # ---------------------------------------------------------------- undistort: images/, masks/, scene.json, points.npz,

@@ -22,6 +22,9 @@ from stages.artifacts import ImageRecord, ImageSet, SkippedImage
 from stages.engine.fingerprint import file_sha256
 from stages.engine.stage import Stage, StageContext
 from stages.errors import InputError
+from stages.posing.known import KnownPoses, match_photos
+from stages.posing.nero import DEPTH, read_depth_mask
+from stages.posing.reading import read_poses
 
 log = logging.getLogger(__name__)
 
@@ -60,6 +63,12 @@ def run(context: StageContext) -> dict[str, Any]:
     params, folder = context.params, context.sources["photos"]
     masks_folder = context.sources.get("masks")
     paths, skipped = _list_photos(folder, masks_folder)
+    poses = read_poses(context.sources["poses"]) if "poses" in context.sources else None
+    if poses is not None:
+        cameras = match_photos(poses, paths)
+        skipped += [SkippedImage(path, f"has no pose in {poses.origin.name}") for path in paths if path not in cameras]
+        paths = list(cameras)
+        _tell_unused(poses, {camera.name for camera in cameras.values()})
     heif = _register_heif()
 
     digests = _in_threads(lambda path: _sha256(folder / path), paths, context.workers)
@@ -72,7 +81,7 @@ def run(context: StageContext) -> dict[str, Any]:
             first_with[digest] = path
             unique.append((path, digest))
 
-    mask_files = _match_masks([path for path, _ in unique], masks_folder) if masks_folder else {}
+    mask_files = _find_masks([path for path, _ in unique], masks_folder, poses) if masks_folder else {}
     names = _Names(path for path, _ in unique)
     done = 0
 
@@ -103,8 +112,8 @@ def run(context: StageContext) -> dict[str, Any]:
             f"{len(missing)} of {len(images)} photos have no mask in {masks_folder}: {_first(missing)}.",
             f"Add {Path(missing[0]).stem}.png and the like, move those photos away, or run with `--no-masks`.",
         )
-    for item in skipped:
-        log.warning("left out %s: %s", item.source, item.reason)
+    for reason, sources in _by_reason(skipped).items():
+        log.warning("left out %s: %s", _first(sources), reason)
     masked = sum(record.has_mask for record in images)
     if 0 < masked < len(images):
         log.warning("only %d of %d photos have a mask (from their alpha channel)", masked, len(images))
@@ -160,6 +169,20 @@ def _too_few(folder: Path, found: int, needed: int, skipped: list[SkippedImage])
         reasons = "; ".join(f"{count} x {reason}, e.g. {example[reason]}" for reason, count in counts)
         message += f" {len(skipped)} file{'' if len(skipped) == 1 else 's'} left out: {reasons}."
     return InputError(message, hint)
+
+
+def _tell_unused(poses: KnownPoses, used: set[str]) -> None:
+    unused = [camera.name for camera in poses.cameras if camera.name not in used]
+    if unused:
+        total, file = len(poses.cameras), poses.origin.name
+        log.warning("%d of %d poses in %s have no photo: %s", len(unused), total, file, _first(unused))
+
+
+def _by_reason(skipped: list[SkippedImage]) -> dict[str, list[str]]:
+    sources: dict[str, list[str]] = {}
+    for item in skipped:
+        sources.setdefault(item.reason, []).append(item.source)
+    return sources
 
 
 def _first(names: list[str]) -> str:
@@ -239,7 +262,11 @@ def _take_photo(
         raise _UnusableError(f"only {width} x {height} pixels")
     mask = alpha
     if mask_file is not None:
-        mask = _read_mask(mask_file, source, (width, height), stored_size, orientation)
+        if mask_file.name.endswith(DEPTH):
+            mask = read_depth_mask(mask_file)
+            _check_size(mask_file, source, mask.shape[::-1], (width, height))
+        else:
+            mask = _read_mask(mask_file, source, (width, height), stored_size, orientation)
     if mask is not None and not mask.any():
         raise _UnusableError(f"its mask is empty ({mask_file.name if mask_file else 'alpha channel'})")
 
@@ -391,6 +418,19 @@ def _camera_key(exif: Any, size: tuple[int, int]) -> str:
 
 
 # ---------------------------------------------------------------- masks
+def _find_masks(photos: list[str], folder: Path, poses: KnownPoses | None) -> dict[str, Path]:
+    """Photo -> its mask file in `folder`; as the poses' format pairs them where it is that format's own folder."""
+    if (
+        poses is None
+        or not poses.masks
+        or {file.parent.resolve() for file in poses.masks.values()} != {folder.resolve()}
+    ):
+        return _match_masks(photos, folder)
+    cameras = match_photos(poses, photos)
+    named = {photo: poses.masks.get(camera.name) for photo, camera in cameras.items()}
+    return {photo: file for photo, file in named.items() if file is not None}
+
+
 def _match_masks(photos: list[str], folder: Path) -> dict[str, Path]:
     """Photo -> its mask file: same relative path or, where unambiguous, same file name; see `_mask_keys`."""
     by_path: dict[str, Path] = {}
@@ -436,17 +476,21 @@ def _read_mask(
             values = np.asarray(image.convert("L"))
     except Exception as error:  # Pillow's decoders raise nearly anything on a damaged file
         raise InputError(f"The mask {file} cannot be read ({error}).", "Write it again as an 8-bit PNG.") from error
-    if found != size:
-        raise InputError(
-            f"The mask {file.name} is {found[0]} x {found[1]} pixels, {photo} is {size[0]} x {size[1]}.",
-            "Masks need the size of their (upright) photo: make the masks again from these photos.",
-        )
+    _check_size(file, photo, found, size)
     if channel is not None:
         alpha = np.asarray(channel.getchannel("A"))
         if alpha.min() != alpha.max():
             values = alpha
     # half of the brightest value: masks of 0 and 1 are as common as masks of 0 and 255
     return values > values.max() / 2
+
+
+def _check_size(mask: Path, photo: str, found: tuple[int, ...], size: tuple[int, int]) -> None:
+    if found != size:
+        raise InputError(
+            f"The mask {mask.name} is {found[0]} x {found[1]} pixels, {photo} is {size[0]} x {size[1]}.",
+            "Masks need the size of their (upright) photo: make the masks again from these photos.",
+        )
 
 
 def _write_mask(mask: np.ndarray, target: Path, size: tuple[int, int]) -> None:
@@ -467,6 +511,6 @@ INGEST = Stage(
     needs=(),
     params="ingest",
     run=run,
-    sources=("photos", "masks"),
+    sources=("photos", "masks", "poses"),
     summary="read the photos and masks",
 )

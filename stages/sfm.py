@@ -1,4 +1,7 @@
-"""Sfm: upright images -> a COLMAP model (the largest component), with a reason for every photo left out."""
+"""Sfm: upright images -> a COLMAP model (the largest component), with a reason for every photo left out.
+
+With poses that are known already they are taken as they are, and only points are found.
+"""
 
 from __future__ import annotations
 
@@ -13,6 +16,9 @@ from stages import artifacts
 from stages.artifacts import ImageSet
 from stages.engine.stage import Stage, StageContext
 from stages.errors import InputError, ReconstructionError
+from stages.posing.known import match_photos
+from stages.posing.reading import read_poses
+from stages.posing.triangulation import triangulate
 
 log = logging.getLogger(__name__)
 
@@ -20,12 +26,16 @@ DEFAULT_FOCAL_FACTOR = 1.2  # COLMAP's guess where nothing is known: focal = 1.2
 MIN_VERIFIED = 15  # matches that fit one epipolar geometry before COLMAP believes a pair (its default)
 MIN_PNP = 30  # 3D points a photo must agree with to be placed (COLMAP's default)
 MIN_FEATURES = 50  # below this a photo shows too little texture to match anything
+FEW_POINTS = 10  # fewer points than this a photo are worth a warning where the poses are known
+DOUBTFUL_ERROR_PX = 2.0  # COLMAP's own models are below one
 # Parts of the progress bar, from timings of 47-photo sets.
 PART_FEATURES, PART_MATCHES = 0.3, 0.7
 
 
 def run(context: StageContext) -> dict[str, Any]:
     """Features, matches, mapping; write model/ and registration.json."""
+    if "poses" in context.sources:
+        return _from_known_poses(context)
     import pycolmap
 
     params, image_set = context.params, artifacts.load_image_set(context.inputs["ingest"])
@@ -92,6 +102,82 @@ def run(context: StageContext) -> dict[str, Any]:
         "models": len(models),
         "matcher": matcher,
         "focal_px": [round(camera.mean_focal_length(), 1) for camera in best.cameras.values()][:4],
+    }
+
+
+def _from_known_poses(context: StageContext) -> dict[str, Any]:
+    """The model of the given cameras; write the same files."""
+    import pycolmap
+
+    params, image_set = context.params, artifacts.load_image_set(context.inputs["ingest"])
+    poses = read_poses(context.sources["poses"])
+    by_source = {record.source: record for record in image_set.images}
+    matched = match_photos(poses, by_source)
+    cameras = {by_source[source].name: (camera, by_source[source]) for source, camera in matched.items()}
+    unregistered = [
+        {"name": record.name, "reason": f"has no pose in {poses.origin.name}"}
+        for record in image_set.images
+        if record.name not in cameras
+    ]
+    _check_enough(list(cameras), unregistered, [record.name for record in image_set.images], "exhaustive", params)
+    work = context.scratch / "colmap"
+    shutil.rmtree(work, ignore_errors=True)  # a killed run may have left half a database
+    work.mkdir(parents=True)
+    with _quiet_glog(work / "log"):
+        pycolmap.set_random_seed(params.seed)
+        model, matcher = triangulate(
+            work,
+            context.inputs["ingest"] / artifacts.IMAGES,
+            cameras,
+            params,
+            threads=1 if params.deterministic else max(1, context.workers),
+            workers=context.workers,
+            device=pycolmap.Device.cuda if pycolmap.has_cuda and context.device == "cuda" else pycolmap.Device.cpu,
+            progress=context.progress,
+        )
+    points = model.num_points3D()
+    error = model.compute_mean_reprojection_error() if points else 0.0
+    if points < FEW_POINTS * len(cameras):
+        log.warning(
+            "only %d points could be triangulated from the known poses of %d photos: training starts without their help",
+            points,
+            len(cameras),
+        )
+    if error > DOUBTFUL_ERROR_PX:
+        log.warning("the known poses fit the photos badly: a mean reprojection error of %.1f px", error)
+    folder = artifacts.model_path(context.out)
+    folder.mkdir(parents=True)
+    model.write(str(folder))
+    region = poses.region
+    artifacts.save_known_poses(
+        context.out,
+        poses.origin.name,
+        region and {"center": region.center.tolist(), "radius": region.radius, "source": region.source},
+    )
+    artifacts.save_registration(
+        context.out,
+        {
+            "registered": sorted(cameras),
+            "unregistered": unregistered,
+            "mean_reprojection_error_px": error,
+            "mean_track_length": model.compute_mean_track_length() if points else 0.0,
+            "num_points": points,
+            "num_models": 1,
+            "mapper": "known poses",
+            "matcher": matcher,
+        },
+    )
+    context.progress(1, 1, "done")
+    return {
+        "registered": len(cameras),
+        "images": len(image_set.images),
+        "points": points,
+        "mean_reprojection_error_px": round(error, 3),
+        "mean_track_length": round(model.compute_mean_track_length(), 2) if points else 0.0,
+        "models": 1,
+        "matcher": matcher,
+        "poses_from": poses.origin.name,
+        "focal_px": [round(camera.mean_focal_length(), 1) for camera in model.cameras.values()][:4],
     }
 
 
@@ -315,4 +401,12 @@ def _check_enough(
     )
 
 
-SFM = Stage(name="sfm", version=1, needs=("ingest",), params="sfm", run=run, summary="find the camera poses")
+SFM = Stage(
+    name="sfm",
+    version=1,
+    needs=("ingest",),
+    params="sfm",
+    run=run,
+    sources=("poses",),
+    summary="find the camera poses, or take known ones",
+)

@@ -100,10 +100,14 @@ def run(context: StageContext) -> dict[str, Any]:
         cam_from_scene=np.stack([photo.cam_from_world().matrix() for photo in photos]),
     )
     points, errors, observations = _sparse_points(model, photos)
-    positions = _gps_positions(ingest, [photo.name for photo in photos]) if params.gps else {}
+    known = artifacts.load_known_poses(context.inputs["sfm"])
+    # The world of poses that were given is theirs, whatever the photos' EXIF says.
+    use_gps = params.gps and known is None
+    positions = _gps_positions(ingest, [photo.name for photo in photos]) if use_gps else {}
     place, located = _find_place(cameras, positions, markers, params)
     cameras, points = into_scene(cameras, place.world_from_model.inverse()), place.world_from_model.apply(points)
-    region, ground, up = _find_region(cameras, points, masks, located, params)
+    stated = _stated_region(known, place) if known else None
+    region, ground, up = _find_region(cameras, points, masks, stated, located, params)
     world_from_scene = scene_frame(region.center, region.radius, up.direction)
     scene = PosedScene(
         cameras=into_scene(cameras, world_from_scene),
@@ -291,17 +295,27 @@ def _compare(factor: float, error: float, this: str, other: str) -> None:
 
 
 # ---------------------------------------------------------------- region, ground, up
+def _stated_region(known: dict[str, Any], place: Place) -> RegionOfInterest | None:
+    """The sphere that the given poses say the object is in, in the world frame."""
+    region, world_from_model = known["region"], place.world_from_model
+    if region is None:
+        return None
+    center = world_from_model.apply(np.array(region["center"]))
+    return RegionOfInterest(center, world_from_model.scale * region["radius"], "object", region["source"])
+
+
 def _find_region(
     cameras: PinholeCameras,
     points: np.ndarray,
     masks: Sequence[np.ndarray | None],
+    stated: RegionOfInterest | None,
     located: Located | None,
     params: Any,
 ) -> tuple[RegionOfInterest, Plane | None, Up]:
     """Region, ground and up in the world frame, that of the cameras and points [P, 3]."""
     held = estimate_up(cameras)
     try:
-        region = find_region(cameras, points, masks)
+        region = find_region(cameras, points, masks, stated)
     except ValueError as error:
         raise ReconstructionError(
             f"No region of interest found from {len(cameras)} cameras and {len(points)} points ({error}).",

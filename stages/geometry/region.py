@@ -154,7 +154,10 @@ def robust_sphere(
 
 
 def find_region(
-    cameras: PinholeCameras, points: np.ndarray, masks: Sequence[np.ndarray | None] | None = None
+    cameras: PinholeCameras,
+    points: np.ndarray,
+    masks: Sequence[np.ndarray | None] | None = None,
+    stated: RegionOfInterest | None = None,
 ) -> RegionOfInterest:
     """The sphere the capture is about; of an object without ground, see `grown_alone`.
 
@@ -162,6 +165,7 @@ def find_region(
         cameras: at least two, in the world frame.
         points: [P, 3] sparse points in the world frame.
         masks: one [H, W] silhouette per camera (or None for it), or None without masks.
+        stated: what the poses' file says; taken where there are no silhouettes.
 
     Raises:
         ValueError: fewer than two cameras, or no sphere of positive size can be found.
@@ -176,6 +180,9 @@ def find_region(
             hull = visual_hull_sphere(cameras, masks, center, 2.0 * SEEN_WHOLE_MARGIN * seen_whole)
             if hull is not None:
                 return RegionOfInterest(hull[0], hull[1] * HULL_MARGIN, "object", "the visual hull of the masks")
+    if stated is not None:
+        return stated
+    if found is not None:
         return RegionOfInterest(center, SEEN_WHOLE_MARGIN * seen_whole, "object", FROM_FRUSTA)
     if len(points) == 0:
         raise ValueError("got 0 sparse points and optical axes that do not meet, expected either")

@@ -1,0 +1,434 @@
+"""Known poses: every format written from one scene, read back, and held against the pixels that scene projects to."""
+
+from __future__ import annotations
+
+import json
+import os
+import pickle
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from configs.params import IngestParams
+from stages import artifacts
+from stages.engine.stage import StageContext
+from stages.errors import InputError
+from stages.ingest import INGEST
+from stages.posing.known import KnownCamera, KnownPoses, StatedRegion, match_photos
+from stages.posing.reading import locate_poses, masks_beside, read_poses
+
+WIDTH, HEIGHT, FOCAL = 320, 240, 300.0
+NUM = 4
+CENTER = np.array([1.0, -2.0, 0.5])
+POINTS = CENTER + np.random.default_rng(0).uniform(-0.5, 0.5, (30, 3))
+NAMES = [f"{i:03d}" for i in range(NUM)]
+OPENCV = (FOCAL, 1.02 * FOCAL, 163.0, 117.0, -0.1, 0.02, 0.002, -0.001)
+FISHEYE = (FOCAL, FOCAL, 160.0, 120.0, 0.05, -0.01, 0.002, -0.001)
+
+
+def cam_from_world(index: int) -> np.ndarray:
+    """[3, 4] of a camera on a circle about the scene, rolled a little so that no axis is special."""
+    angle, roll = 2 * np.pi * index / NUM + 0.3, 0.2 * index
+    offset = np.array([2.5 * np.cos(angle), 2.5 * np.sin(angle), 1.2])
+    z = -offset / np.linalg.norm(offset)
+    x = np.cross(z, [0, 0, 1])
+    x /= np.linalg.norm(x)
+    level = np.stack([x, np.cross(z, x), z])
+    turn = np.array([[np.cos(roll), -np.sin(roll), 0], [np.sin(roll), np.cos(roll), 0], [0, 0, 1]])
+    rotation = turn @ level
+    return np.concatenate([rotation, -(rotation @ (CENTER + offset))[:, None]], 1)
+
+
+def world_from_gl(index: int) -> np.ndarray:
+    """[4, 4] camera to world with OpenGL axes."""
+    pose = np.eye(4)
+    pose[:3] = cam_from_world(index)
+    return np.linalg.inv(pose) @ np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+# ---------------------------------------------------------------- what the pixels are, in numpy
+def pinhole(uv: np.ndarray) -> np.ndarray:
+    return uv * FOCAL + [WIDTH / 2, HEIGHT / 2]
+
+
+def opencv(uv: np.ndarray) -> np.ndarray:
+    fx, fy, cx, cy, k1, k2, p1, p2 = OPENCV
+    x, y = uv.T
+    r2 = x**2 + y**2
+    radial = 1 + k1 * r2 + k2 * r2**2
+    return np.stack(
+        [
+            fx * (x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x**2)) + cx,
+            fy * (y * radial + p1 * (r2 + 2 * y**2) + 2 * p2 * x * y) + cy,
+        ],
+        1,
+    )
+
+
+def fisheye(uv: np.ndarray) -> np.ndarray:
+    fx, fy, cx, cy, *k = FISHEYE
+    r = np.linalg.norm(uv, axis=1, keepdims=True)
+    theta = np.arctan(r)
+    bent = theta * (1 + sum(c * theta ** (2 * i + 2) for i, c in enumerate(k)))
+    return uv * bent / r * [fx, fy] + [cx, cy]
+
+
+def seen(index: int, lens: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+    """[P, 2] pixels of the points, the image's corner at (0, 0)."""
+    pose = cam_from_world(index)
+    in_cam = POINTS @ pose[:, :3].T + pose[:, 3]
+    return lens(in_cam[:, :2] / in_cam[:, 2:])
+
+
+def reprojected(camera: KnownCamera) -> np.ndarray:
+    import pycolmap
+
+    lens = pycolmap.Camera(model=camera.model, width=WIDTH, height=HEIGHT, params=list(camera.params))
+    in_cam = POINTS @ camera.cam_from_world[:, :3].T + camera.cam_from_world[:, 3]
+    return np.asarray(lens.img_from_cam(in_cam))
+
+
+def assert_reprojects(poses: KnownPoses, lens: Callable[[np.ndarray], np.ndarray], names: list[str]) -> None:
+    assert [camera.name for camera in poses.cameras] == names
+    for i, camera in enumerate(poses.cameras):
+        assert camera.size == (WIDTH, HEIGHT)
+        assert np.abs(reprojected(camera) - seen(i, lens)).max() < 1e-3
+
+
+def write_images(folder: Path, names: list[str], alpha: bool = False) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    for i, name in enumerate(names):
+        pixels = np.random.default_rng(i).integers(0, 255, (HEIGHT, WIDTH, 4 if alpha else 3), dtype=np.uint8)
+        if alpha:
+            pixels[..., 3] = np.where(np.arange(WIDTH) > 100, 255, 0)
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(folder / name), pixels)
+
+
+# ---------------------------------------------------------------- COLMAP
+@pytest.mark.parametrize("text", [False, True])
+def test_colmap_model(tmp_path: Path, text: bool):
+    import pycolmap
+
+    folder = tmp_path / "sparse" / "0"
+    folder.mkdir(parents=True)
+    model = pycolmap.Reconstruction()
+    camera = pycolmap.Camera(model="OPENCV", width=WIDTH, height=HEIGHT, params=list(OPENCV), camera_id=1)
+    model.add_camera_with_trivial_rig(camera)
+    for i, name in enumerate(NAMES):
+        pose = cam_from_world(i)
+        image = pycolmap.Image(f"{name}.jpg", pycolmap.Point2DList(), 1, i + 1)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pycolmap.Rotation3d(pose[:, :3]), pose[:, 3]))
+    (model.write_text if text else model.write_binary)(str(folder))
+    for place in (folder, tmp_path, folder / ("cameras.txt" if text else "cameras.bin")):
+        assert locate_poses(place) == folder
+    assert_reprojects(read_poses(tmp_path), opencv, [f"{name}.jpg" for name in NAMES])
+
+
+def test_a_damaged_model_is_named(tmp_path: Path):
+    (tmp_path / "cameras.bin").write_bytes(b"\x01")
+    with pytest.raises(InputError, match="cannot be read"):
+        read_poses(tmp_path)
+
+
+# ---------------------------------------------------------------- transforms.json
+def write_transforms(folder: Path, shared: dict, names: list[str], file: str = "transforms.json", **each) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    frames = [
+        {"file_path": name, "transform_matrix": world_from_gl(i).tolist(), **{k: v[i] for k, v in each.items()}}
+        for i, name in enumerate(names)
+    ]
+    (folder / file).write_text(json.dumps({**shared, "frames": frames}))
+    return folder / file
+
+
+OPENCV_KEYS = dict(zip(("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2"), OPENCV, strict=True))
+IMAGES = [f"images/{name}.png" for name in NAMES]
+SIZE = {"w": WIDTH, "h": HEIGHT}
+
+
+def test_nerfstudio_with_shared_intrinsics(tmp_path: Path):
+    file = write_transforms(tmp_path, {"camera_model": "OPENCV", **SIZE, **OPENCV_KEYS}, IMAGES)
+    assert locate_poses(tmp_path) == file
+    poses = read_poses(tmp_path)
+    assert_reprojects(poses, opencv, IMAGES)
+    assert poses.region is None
+
+
+def test_intrinsics_of_frames_and_frames_in_any_order(tmp_path: Path):
+    each = {key: [value] * NUM for key, value in {**OPENCV_KEYS, **SIZE}.items()}
+    file = write_transforms(tmp_path, {"fl_x": 1.0}, IMAGES, **each)
+    data = json.loads(file.read_text())
+    data["frames"].reverse()
+    file.write_text(json.dumps(data))
+    assert_reprojects(read_poses(file), opencv, IMAGES)
+
+
+def test_fisheye(tmp_path: Path):
+    keys = dict(zip(("fl_x", "fl_y", "cx", "cy", "k1", "k2", "k3", "k4"), FISHEYE, strict=True))
+    file = write_transforms(tmp_path, {"camera_model": "OPENCV_FISHEYE", **SIZE, **keys}, IMAGES)
+    assert_reprojects(read_poses(file), fisheye, IMAGES)
+
+
+def test_third_radial_coefficient(tmp_path: Path):
+    file = write_transforms(tmp_path, {"fl_x": FOCAL, **SIZE, "k1": -0.1, "k3": 0.05}, IMAGES)
+    expected = lambda uv: pinhole(uv * (1 - 0.1 * (uv**2).sum(1) + 0.05 * (uv**2).sum(1) ** 3)[:, None])  # noqa: E731
+    assert_reprojects(read_poses(file), expected, IMAGES)
+
+
+@pytest.mark.parametrize("applied_scale", [None, 0.25])
+def test_applied_transform_is_undone(tmp_path: Path, applied_scale: float | None):
+    """nerfstudio turns the world (z for y); poses come back in the original one."""
+    applied = np.array([[1.0, 0, 0, 0.3], [0, 0, 1, -0.2], [0, -1, 0, 5]])
+    file = write_transforms(tmp_path, {"fl_x": FOCAL, **SIZE, "applied_transform": applied.tolist()}, IMAGES)
+    data = json.loads(file.read_text())
+    for i, frame in enumerate(data["frames"]):
+        moved = applied @ world_from_gl(i)
+        moved[:, 3] *= applied_scale or 1.0
+        frame["transform_matrix"] = [*moved.tolist(), [0, 0, 0, 1]]
+    if applied_scale:
+        data["applied_scale"] = applied_scale
+    file.write_text(json.dumps(data))
+    assert_reprojects(read_poses(file), pinhole, IMAGES)
+
+
+def test_nerf_synthetic(tmp_path: Path):
+    """Only an angle, paths without suffix, images with alpha; the size comes from the images."""
+    names = [f"./train/r_{i}" for i in range(NUM)]
+    write_images(tmp_path, [f"{name}.png" for name in names], alpha=True)
+    write_images(tmp_path, ["test/r_0.png", "test/r_0_depth_0001.png"])
+    angle = 2 * np.arctan(0.5 * WIDTH / FOCAL)
+    write_transforms(tmp_path, {"camera_angle_x": angle}, names, "transforms_train.json")
+    poses = read_poses(tmp_path)
+    assert_reprojects(poses, pinhole, [f"train/r_{i}" for i in range(NUM)])
+    assert poses.region is not None
+    assert poses.region.radius == 1.5
+    image_set = ingested(tmp_path, tmp_path / "out", poses=tmp_path / "transforms_train.json")
+    assert [record.name for record in image_set.images] == [f"train/r_{i}.png" for i in range(NUM)]
+    assert all(record.has_mask for record in image_set.images)
+    assert {item.source: item.reason for item in image_set.skipped}["test/r_0.png"] == (
+        "has no pose in transforms_train.json"
+    )
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"fl_x": None}, "gives images/000.png no focal length"),
+        ({"fl_x": "wide"}, "`fl_x` of images/000.png in .* is 'wide', expected a number"),
+        ({"camera_model": "EQUIRECTANGULAR"}, "camera model EQUIRECTANGULAR of images/000.png"),
+        ({"k4": 0.1}, "camera model OPENCV of images/000.png .* with k4"),
+        ({"frames": []}, "has no `frames`"),
+        ({"frames": [{"transform_matrix": []}]}, "Frame 0 of .* has no `file_path`"),
+        ({"frames": [{"file_path": "a.png", "transform_matrix": [[1, 2]]}]}, r"is \(1, 2\), expected \(4, 4\)"),
+        ({"frames": [{"file_path": "a.png"}]}, "`transform_matrix of a.png` in .* is no matrix"),
+        ({"frames": [{"file_path": "a.png", "transform_matrix": (2 * np.eye(4)).tolist()}]}, "has no rotation"),
+        ({"applied_transform": np.diag([1.0, 1, -1, 1])[:3].tolist()}, "no rotation with a scale"),
+    ],
+)
+def test_what_a_transforms_file_may_lack(tmp_path: Path, changes: dict, sentence: str):
+    file = write_transforms(tmp_path, {"fl_x": FOCAL, **SIZE}, IMAGES)
+    data = {**json.loads(file.read_text()), **changes}
+    file.write_text(json.dumps({key: value for key, value in data.items() if value is not None}))
+    with pytest.raises(InputError, match=sentence):
+        read_poses(file)
+
+
+# ---------------------------------------------------------------- NeuS
+def write_neus(folder: Path, images: list[str]) -> Path:
+    write_images(folder / "image", images)
+    for name in images:
+        mask = np.zeros((HEIGHT, WIDTH), np.uint8)
+        mask[:, 100:200] = 255
+        (folder / "mask").mkdir(exist_ok=True)
+        cv2.imwrite(str(folder / "mask" / f"{int(name.split('.')[0]):04d}.png"), mask)
+    # the layout counts pixel centres at whole numbers
+    intrinsics = np.array([[FOCAL, 0, WIDTH / 2 - 0.5], [0, FOCAL, HEIGHT / 2 - 0.5], [0, 0, 1]])
+    world_from_unit = np.diag([0.8, 0.8, 0.8, 1.0])
+    world_from_unit[:3, 3] = CENTER
+    matrices = {}
+    for i in range(len(images)):
+        matrices[f"world_mat_{i}"] = np.vstack([-2.5 * intrinsics @ cam_from_world(i), [0, 0, 0, 1]])
+        matrices[f"scale_mat_{i}"] = world_from_unit
+        matrices[f"world_mat_inv_{i}"] = np.linalg.inv(matrices[f"world_mat_{i}"])
+    np.savez(folder / "cameras_sphere.npz", **matrices)
+    return folder / "cameras_sphere.npz"
+
+
+def test_neus(tmp_path: Path):
+    file = write_neus(tmp_path, [f"{name}.png" for name in NAMES])
+    assert locate_poses(tmp_path) == file
+    assert masks_beside(file) == tmp_path / "mask"
+    poses = read_poses(file)
+    assert_reprojects(poses, pinhole, [f"image/{name}.png" for name in NAMES])
+    assert poses.region is not None
+    np.testing.assert_allclose(poses.region.center, CENTER)
+    assert poses.region.radius == pytest.approx(0.8)
+
+
+@pytest.mark.parametrize("photos", [".", "image"])
+def test_photos_of_neus_are_its_images_whichever_folder_is_named(tmp_path: Path, photos: str):
+    data = tmp_path / "scan"
+    file = write_neus(data, [f"{name}.png" for name in NAMES])
+    image_set = ingested(data / photos, tmp_path / "out", masks=data / "mask", poses=file)
+    prefix = "image/" if photos == "." else ""
+    assert [record.name for record in image_set.images] == [f"{prefix}{name}.png" for name in NAMES]
+    # masks are paired by their order, not by their names
+    assert all(record.has_mask for record in image_set.images)
+    assert {item.source for item in image_set.skipped} <= {"cameras_sphere.npz"}
+
+
+def test_neus_with_another_number_of_images(tmp_path: Path):
+    file = write_neus(tmp_path, [f"{name}.png" for name in NAMES])
+    (tmp_path / "image" / "003.png").unlink()
+    with pytest.raises(InputError, match="has 4 cameras, but .*image has 3 images"):
+        read_poses(file)
+
+
+# ---------------------------------------------------------------- NeRO
+def write_nero(folder: Path) -> None:
+    write_images(folder, [f"{i}.png" for i in range(NUM)])
+    for i in range(NUM):
+        depth = np.full((HEIGHT, WIDTH), 65535, np.uint16)
+        depth[50:150, 60:160] = int(2.5 / 15 * 65535)
+        cv2.imwrite(str(folder / f"{i}-depth.png"), depth)
+        intrinsics = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]], np.float32)
+        (folder / f"{i}-camera.pkl").write_bytes(pickle.dumps([cam_from_world(i), intrinsics]))
+
+
+def test_nero(tmp_path: Path):
+    data = tmp_path / "bell"
+    write_nero(data)
+    assert locate_poses(data) == data
+    assert masks_beside(data) == data
+    poses = read_poses(data)
+    assert_reprojects(poses, pinhole, [f"{i}.png" for i in range(NUM)])
+    image_set = ingested(data, tmp_path / "out", masks=data, poses=data)
+    assert [record.name for record in image_set.images] == [f"{i}.png" for i in range(NUM)]
+    mask = artifacts.load_mask(tmp_path / "out", "2.png")
+    assert mask is not None
+    expected = np.zeros((HEIGHT, WIDTH), np.uint8)
+    expected[50:150, 60:160] = 255
+    np.testing.assert_array_equal(mask, expected)
+
+
+@pytest.mark.parametrize("protocol", range(pickle.HIGHEST_PROTOCOL + 1))
+def test_arrays_are_read_whatever_the_pickle_s_protocol(tmp_path: Path, protocol: int):
+    write_nero(tmp_path)
+    pose, intrinsics = cam_from_world(0), np.diag([FOCAL, FOCAL, 1.0])
+    (tmp_path / "0-camera.pkl").write_bytes(pickle.dumps((pose, intrinsics), protocol))
+    np.testing.assert_allclose(read_poses(tmp_path).cameras[0].cam_from_world, pose, atol=1e-12)
+
+
+def test_a_pickle_that_would_run_something_is_refused(tmp_path: Path):
+    write_nero(tmp_path)
+
+    class Evil:
+        def __reduce__(self):
+            return os.mkdir, (str(tmp_path / "hacked"),)
+
+    (tmp_path / "1-camera.pkl").write_bytes(pickle.dumps([cam_from_world(1), Evil()]))
+    with pytest.raises(
+        InputError, match=r"1-camera.pkl cannot be read \(it holds posix.mkdir; only arrays are taken\)"
+    ):
+        read_poses(tmp_path)
+    assert not (tmp_path / "hacked").exists()
+
+
+# ---------------------------------------------------------------- finding and matching
+def test_no_poses_there(tmp_path: Path):
+    with pytest.raises(InputError, match="There are no poses at"):
+        locate_poses(tmp_path / "nothing")
+    with pytest.raises(InputError, match="No poses were found in"):
+        locate_poses(tmp_path)
+    (tmp_path / "notes.txt").write_text("hello")
+    with pytest.raises(InputError, match="is no file of poses"):
+        locate_poses(tmp_path / "notes.txt")
+
+
+def known(*names: str) -> KnownPoses:
+    pose = cam_from_world(0)
+    return KnownPoses(
+        Path("poses.json"), tuple(KnownCamera(n, (WIDTH, HEIGHT), "PINHOLE", (1.0,), pose) for n in names)
+    )
+
+
+@pytest.mark.parametrize(
+    ("cameras", "photos", "expected"),
+    [
+        (["a.jpg", "b.jpg"], ["a.jpg", "b.jpg", "c.jpg"], {"a.jpg": "a.jpg", "b.jpg": "b.jpg"}),
+        (["a.jpg"], ["images/a.jpg"], {"images/a.jpg": "a.jpg"}),
+        (["images/a.jpg"], ["a.png"], {"a.png": "images/a.jpg"}),
+        (["image/0.png"], ["image/0.png", "mask/0.png"], {"image/0.png": "image/0.png"}),
+        (["train/r_0", "test/r_0"], ["train/r_0.png", "test/r_0.png"],
+         {"train/r_0.png": "train/r_0", "test/r_0.png": "test/r_0"}),
+        (["train/r_0", "test/r_0"], ["test/r_0.png"], {"test/r_0.png": "test/r_0"}),
+        (["a.jpg"], ["a.jpg", "a.png"], {"a.jpg": "a.jpg"}),
+        (["frame.0001", "frame.0002"], ["frame.0002.png"], {"frame.0002.png": "frame.0002"}),
+    ],
+)  # fmt: skip
+def test_names_that_agree(cameras: list[str], photos: list[str], expected: dict[str, str]):
+    assert {photo: camera.name for photo, camera in match_photos(known(*cameras), photos).items()} == expected
+
+
+def test_names_that_do_not_agree():
+    with pytest.raises(
+        InputError, match="None of the 2 photos has a pose in poses.json: it names 1 images, e.g. x.jpg"
+    ):
+        match_photos(known("x.jpg"), ["a.jpg", "b.jpg"])
+    with pytest.raises(InputError, match="fits 2 photos: left/a.jpg, right/a.jpg"):
+        match_photos(known("a.jpg"), ["left/a.jpg", "right/a.jpg"])
+    with pytest.raises(InputError, match="has two poses for a.jpg"):
+        known("a.jpg", "a.jpg")
+    with pytest.raises(InputError, match="has no poses"):
+        known()
+
+
+# ---------------------------------------------------------------- ingest
+def ingested(photos: Path, out: Path, **sources: Path) -> artifacts.ImageSet:
+    out.mkdir()
+    context = StageContext({}, {"photos": photos, **sources}, out, out, IngestParams(), workers=1)
+    INGEST.run(context)
+    return artifacts.load_image_set(out)
+
+
+def test_photos_without_pose_and_poses_without_photo_are_named_and_counted(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+):
+    write_images(tmp_path / "photos" / "images", [f"{name}.png" for name in NAMES])
+    (tmp_path / "photos" / "images" / "003.png").rename(tmp_path / "photos" / "images" / "extra.png")
+    file = write_transforms(tmp_path, {"fl_x": FOCAL, **SIZE}, IMAGES)
+    image_set = ingested(tmp_path / "photos", tmp_path / "out", poses=file)
+    assert [record.name for record in image_set.images] == IMAGES[:3]
+    assert "left out images/extra.png: has no pose in transforms.json" in caplog.text
+    assert "1 of 4 poses in transforms.json have no photo: images/003.png" in caplog.text
+
+
+def test_too_few_photos_with_a_pose(tmp_path: Path):
+    write_images(tmp_path / "photos", [f"images/{name}.png" for name in ("000", "001", "x", "y")])
+    file = write_transforms(tmp_path, {"fl_x": FOCAL, **SIZE}, IMAGES)
+    with pytest.raises(
+        InputError, match=r"Found 2 usable photos .* need at least 3.* 2 x has no pose in transforms.json"
+    ):
+        ingested(tmp_path / "photos", tmp_path / "out", poses=file)
+
+
+def test_the_region_is_that_of_the_file_where_there_are_no_masks():
+    from stages.geometry.cameras import PinholeCameras
+    from stages.geometry.region import RegionOfInterest, find_region
+
+    facing_one_way = PinholeCameras(
+        names=("a", "b"),
+        sizes=np.array([[WIDTH, HEIGHT]] * 2),
+        intrinsics=np.array([[[FOCAL, 0, 160], [0, FOCAL, 120], [0, 0, 1]]] * 2),
+        cam_from_scene=np.stack([np.c_[np.eye(3), [x, 0, 0]] for x in (0.0, 1.0)]),
+    )
+    nothing = np.zeros((0, 3))
+    with pytest.raises(ValueError, match="got 0 sparse points"):
+        find_region(facing_one_way, nothing)
+    stated = RegionOfInterest(CENTER, 2.0, "object", "the file")
+    assert find_region(facing_one_way, nothing, None, stated) is stated
+    assert StatedRegion(CENTER, 2.0, "the file").radius == stated.radius
