@@ -14,6 +14,7 @@ import numpy as np
 from stages import artifacts
 from stages.geometry.cameras import PinholeCameras, PosedScene
 from stages.geometry.similarity import Similarity
+from stages.posing.neus import decompose
 
 CAMERAS = "cameras_sphere.npz"
 # NeuS counts pixel centres at whole numbers, we at halves. The photos of DTU are halved and their cameras with them,
@@ -61,14 +62,3 @@ def write_posed_set(source: Path, folder: Path) -> None:
         up=up / np.linalg.norm(up),
     )
     artifacts.save_scene(folder, scene)
-
-
-def decompose(projection: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Intrinsics [3, 3] and pose [3, 4] (a rotation and a translation) of a projection [3, 4] of any scale."""
-    import cv2
-
-    # A negative scale would come out as negative focal lengths.
-    projection = projection * np.sign(np.linalg.det(projection[:, :3]))
-    intrinsics, rotation, center = cv2.decomposeProjectionMatrix(projection)[:3]
-    center = center[:3] / center[3]
-    return intrinsics / intrinsics[2, 2], np.concatenate([rotation, -rotation @ center], 1)

@@ -420,11 +420,7 @@ def _camera_key(exif: Any, size: tuple[int, int]) -> str:
 # ---------------------------------------------------------------- masks
 def _find_masks(photos: list[str], folder: Path, poses: KnownPoses | None) -> dict[str, Path]:
     """Photo -> its mask file in `folder`; as the poses' format pairs them where it is that format's own folder."""
-    if (
-        poses is None
-        or not poses.masks
-        or {file.parent.resolve() for file in poses.masks.values()} != {folder.resolve()}
-    ):
+    if poses is None or {file.parent.resolve() for file in poses.masks.values()} != {folder.resolve()}:
         return _match_masks(photos, folder)
     cameras = match_photos(poses, photos)
     named = {photo: poses.masks.get(camera.name) for photo, camera in cameras.items()}

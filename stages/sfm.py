@@ -139,7 +139,7 @@ def _from_known_poses(context: StageContext) -> dict[str, Any]:
     error = model.compute_mean_reprojection_error() if points else 0.0
     if points < FEW_POINTS * len(cameras):
         log.warning(
-            "only %d points could be triangulated from the known poses of %d photos: training starts without their help",
+            "only %d points could be triangulated from the known poses of %d photos: they help training little",
             points,
             len(cameras),
         )
@@ -152,7 +152,9 @@ def _from_known_poses(context: StageContext) -> dict[str, Any]:
     artifacts.save_known_poses(
         context.out,
         poses.origin.name,
-        region and {"center": region.center.tolist(), "radius": region.radius, "source": region.source},
+        None
+        if region is None
+        else {"center": region.center.tolist(), "radius": region.radius, "source": region.source},
     )
     artifacts.save_registration(
         context.out,

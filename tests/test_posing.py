@@ -284,7 +284,7 @@ def test_photos_of_neus_are_its_images_whichever_folder_is_named(tmp_path: Path,
 def test_neus_with_another_number_of_images(tmp_path: Path):
     file = write_neus(tmp_path, [f"{name}.png" for name in NAMES])
     (tmp_path / "image" / "003.png").unlink()
-    with pytest.raises(InputError, match="has 4 cameras, but .*image has 3 images"):
+    with pytest.raises(InputError, match=r"has 4 cameras, but .*image has 3 images"):
         read_poses(file)
 
 
@@ -376,12 +376,12 @@ def test_names_that_agree(cameras: list[str], photos: list[str], expected: dict[
 
 def test_names_that_do_not_agree():
     with pytest.raises(
-        InputError, match="None of the 2 photos has a pose in poses.json: it names 1 images, e.g. x.jpg"
+        InputError, match=r"None of the 2 photos has a pose in poses.json: it names 1 images, e.g. x.jpg"
     ):
         match_photos(known("x.jpg"), ["a.jpg", "b.jpg"])
-    with pytest.raises(InputError, match="fits 2 photos: left/a.jpg, right/a.jpg"):
+    with pytest.raises(InputError, match=r"fits 2 photos: left/a.jpg, right/a.jpg"):
         match_photos(known("a.jpg"), ["left/a.jpg", "right/a.jpg"])
-    with pytest.raises(InputError, match="has two poses for a.jpg"):
+    with pytest.raises(InputError, match=r"has two poses for a.jpg"):
         known("a.jpg", "a.jpg")
     with pytest.raises(InputError, match="has no poses"):
         known()

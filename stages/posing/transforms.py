@@ -119,7 +119,7 @@ def _intrinsics(
     if focal_x is None or focal_x <= 0:
         raise InputError(f"{file} gives {name} no focal length.", "It needs `fl_x` or `camera_angle_x`.")
     center_x, center_y = value("cx"), value("cy")
-    params = (
+    params: tuple[float, ...] = (
         focal_x,
         focal_x if focal_y is None else focal_y,
         size[0] / 2 if center_x is None else center_x,
