@@ -92,6 +92,32 @@ def test_workspace_remembers_photos_masks_and_settings(folder: Path) -> None:
     assert "parameter sfm.seed changed 5 -> 0" in named["stages"][1]["reason"]
 
 
+def test_workspace_remembers_poses_and_takes_the_masks_they_come_with(folder: Path) -> None:
+    posed = with_stage("sfm", sources=("poses",))
+    scan = folder / "scan"
+    (scan / "mask").mkdir(parents=True)
+    (scan / "mask" / "0.png").write_text("m")
+    (scan / "cameras_sphere.npz").write_text("poses")
+    outcome(hineus("run", "photos", "--poses", "scan", "-w", "ws", "--json", pipeline=posed))
+    kept = Workspace.open(folder / "ws").record.sources
+    assert kept["poses"] == str(scan / "cameras_sphere.npz")
+    assert kept["masks"] == str(scan / "mask")
+    assert set(actions(hineus("run", "-w", "ws", "--json", pipeline=posed)).values()) == {"skipped"}
+
+    (scan / "cameras_sphere.npz").write_text("other poses")
+    changed = outcome(hineus("run", "-w", "ws", "--json", pipeline=posed))["stages"][1]
+    assert changed["reason"] == "pose cameras_sphere.npz changed"
+    forgotten = outcome(hineus("run", "-w", "ws", "--no-poses", "--json", pipeline=posed))["stages"]
+    assert [stage["reason"] for stage in forgotten[:2]] == ["nothing changed", "poses are no longer given"]
+    assert Workspace.open(folder / "ws").record.sources["poses"] is None
+
+    refused = hineus("run", "photos", "--poses", "photos", "-w", "other")
+    assert refused.exit_code == 3
+    assert "No poses were found in photos" in refused.stderr
+    outcome(hineus("run", "photos", "--poses", "scan", "--no-masks", "-w", "bare", "--json", pipeline=posed))
+    assert Workspace.open(folder / "bare").record.sources["masks"] is None
+
+
 def test_kept_settings_can_be_fed_back(folder: Path) -> None:
     hineus("run", "photos", "-w", "one", "--set", "sfm.max_features=300")
     hineus("run", "photos", "-w", "two", "--config", "one/config.yaml")

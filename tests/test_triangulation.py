@@ -1,0 +1,93 @@
+"""The sfm stage with known poses: the poses stay, points are found, and what does not fit is said."""
+
+from __future__ import annotations
+
+import json
+import logging
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from test_sfm import FOCAL, HEIGHT, WIDTH, ingested, look_at, render
+
+from configs.params import SfmParams
+from stages import artifacts
+from stages.artifacts import ImageRecord
+from stages.engine.stage import StageContext
+from stages.errors import InputError
+from stages.posing.known import KnownCamera
+from stages.posing.triangulation import fitted_camera
+from stages.sfm import SFM
+
+ANGLES = np.radians(np.arange(0, 96, 16))
+CENTERS = [np.array([2.6 * np.cos(a), 2.6 * np.sin(a), 1.5 + 0.3 * (i % 2)]) for i, a in enumerate(ANGLES)]
+POSES = [look_at(center, np.array([0, 0, 0.35])) for center in CENTERS]
+
+
+def write_poses(folder: Path, names: list[str], focal: float = FOCAL, size: tuple[int, int] = (WIDTH, HEIGHT)) -> Path:
+    frames = []
+    for name, pose in zip(names, POSES, strict=True):
+        matrix = np.linalg.inv(np.vstack([pose, [0, 0, 0, 1]])) @ np.diag([1.0, -1.0, -1.0, 1.0])
+        frames.append({"file_path": name, "transform_matrix": matrix.tolist()})
+    file = folder / "transforms.json"
+    file.write_text(json.dumps({"fl_x": focal, "w": size[0], "h": size[1], "frames": frames}))
+    return file
+
+
+def run_sfm(ingest: Path, poses: Path, root: Path, **params: object) -> tuple[dict[str, object], Path]:
+    out, scratch = root / "sfm", root / "scratch"
+    out.mkdir()
+    scratch.mkdir()
+    settings = SfmParams(**params)  # type: ignore[arg-type]
+    return SFM.run(StageContext({"ingest": ingest}, {"poses": poses}, out, scratch, settings, workers=2)), out
+
+
+@pytest.mark.parametrize("exhaustive_max", [150, 2])
+def test_poses_stay_and_points_are_found(tmp_path: Path, exhaustive_max: int):
+    import pycolmap
+
+    ingest = ingested(tmp_path / "ingest", [render(pose, i) for i, pose in enumerate(POSES)])
+    poses = write_poses(tmp_path, [f"images/{i:03d}" for i in range(len(POSES))])
+    numbers, out = run_sfm(ingest, poses, tmp_path, exhaustive_max=exhaustive_max)
+    assert numbers["registered"] == len(POSES)
+    assert numbers["matcher"] == ("exhaustive" if exhaustive_max > len(POSES) else "spatial")
+    assert numbers["poses_from"] == "transforms.json"
+    assert numbers["mean_reprojection_error_px"] < 0.5
+    model = pycolmap.Reconstruction(str(artifacts.model_path(out)))
+    for image in model.images.values():
+        np.testing.assert_allclose(image.cam_from_world().matrix(), POSES[int(image.name[:3])], atol=1e-9)
+    points = np.array([point.xyz for point in model.points3D.values()])
+    assert len(points) > 300
+    # of the printed floor and box: nothing below the floor, nothing above the box
+    assert np.mean((points[:, 2] > -0.02) & (points[:, 2] < 0.92)) > 0.98
+    assert artifacts.load_registration(out)["registered"] == sorted(f"{i:03d}.png" for i in range(len(POSES)))
+    assert artifacts.load_known_poses(out) == {"origin": "transforms.json", "region": None}
+
+
+def test_plain_photos_are_a_warning_and_no_error(tmp_path: Path, caplog: pytest.LogCaptureFixture):
+    import pycolmap
+
+    photos = [np.full((HEIGHT, WIDTH), 100 + 10 * i, np.uint8) for i in range(len(POSES))]
+    poses = write_poses(tmp_path, [f"{i:03d}.png" for i in range(len(POSES))])
+    with caplog.at_level(logging.WARNING):
+        numbers, out = run_sfm(ingested(tmp_path / "ingest", photos), poses, tmp_path)
+    assert (numbers["registered"], numbers["points"]) == (len(POSES), 0)
+    assert "only 0 points could be triangulated" in caplog.text
+    assert pycolmap.Reconstruction(str(artifacts.model_path(out))).num_reg_images() == len(POSES)
+
+
+def test_a_reduced_photo_gets_a_reduced_camera():
+    params = (FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, -0.1, 0.0, 0.0, 0.0)
+    known = KnownCamera("a.png", (WIDTH, HEIGHT), "OPENCV", params, POSES[0])
+    record = ImageRecord("a.png", "a.jpg", WIDTH // 2, HEIGHT // 2, None, "", 1.0, False, "")
+    camera = fitted_camera(known, record)
+    assert (camera.width, camera.height) == (WIDTH // 2, HEIGHT // 2)
+    np.testing.assert_allclose(camera.params, [FOCAL / 2, FOCAL / 2, WIDTH / 4, HEIGHT / 4, -0.1, 0, 0, 0])
+
+
+def test_a_turned_photo_is_refused(tmp_path: Path):
+    ingest = ingested(tmp_path / "ingest", [cv2.rotate(render(pose, 0), cv2.ROTATE_90_CLOCKWISE) for pose in POSES])
+    poses = write_poses(tmp_path, [f"{i:03d}.png" for i in range(len(POSES))])
+    with pytest.raises(InputError, match=r"000.png is 240 x 320 pixels upright, but its pose is for 320 x 240"):
+        run_sfm(ingest, poses, tmp_path)
