@@ -116,7 +116,11 @@ def headline(scene: PosedScene, atlas: AtlasMesh, manifests: dict[str, dict[str,
         ("texture", f"{atlas.texture_size}²"),
         ("photos used", str(len(scene.cameras))),
     ]
-    sfm, train, baked = (manifests.get(name, {}).get("numbers") or {} for name in ("sfm", "train", "bake"))
+    sfm, train, baked, exported = (
+        manifests.get(name, {}).get("numbers") or {} for name in ("sfm", "train", "bake", "export")
+    )
+    if exported.get("units") == "metres":
+        numbers.insert(0, ("size", " x ".join(f"{side:.3g}" for side in exported["extent"]) + " m"))
     if "mean_reprojection_error_px" in sfm:
         numbers.append(("reprojection error", f"{sfm['mean_reprojection_error_px']:.2f} px"))
     if "psnr" in train:

@@ -194,6 +194,14 @@ def test_the_overview_shows_each_camera_from_both_sides(full):
     assert len(views[1].findall("{*}path")) == len(views[0].findall("{*}path")) + 1  # the ground
 
 
+def test_the_size_is_told_in_metres_where_they_are_known(full):
+    sized = full.inputs["export"] / "manifest.json"
+    sized.write_text(manifest("export", extent=[0.31234, 0.2, 12.0], units="metres"))
+    assert "0.312 x 0.2 x 12 m" in page(full)
+    sized.write_text(manifest("export", extent=[0.31234, 0.2, 12.0], units="arbitrary units"))
+    assert "0.312 x" not in page(full)
+
+
 def test_photos_left_out_come_first_and_the_number_is_capped(full):
     html = page(StageContext(full.inputs, {}, full.out, full.scratch, ReportParams(thumbnails=1)))
     shown = html[html.index('class="thumbs"') :]

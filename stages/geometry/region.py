@@ -26,7 +26,7 @@ MIN_IN_FRONT = 0.8
 # ... and the axes must pass it within this part of its distance (median): else they do not meet.
 MAX_MISS_RATIO = 0.5
 # There is something where they meet: of the points in the middle of the photos (half the width and height), this part
-# at least lies at that distance (give or take half of it). Too few points say nothing of it.
+# at least lies at that distance (give or take half of it). Fewer points than this say nothing of the whole.
 MIN_PRESENT, PRESENT_DEPTHS, MIN_JUDGED = 0.03, (0.5, 1.5), 100
 MAX_JUDGED = 4000
 # The sphere of an object capture comes from the median of the largest spheres each camera sees whole, but is
@@ -200,7 +200,7 @@ def grown_alone(region: RegionOfInterest, points: np.ndarray) -> RegionOfInteres
 
     Only for a capture where no ground was found: a table around the object lies as near as its far ends do.
     """
-    if region.source != FROM_FRUSTA or len(points) == 0:
+    if region.source != FROM_FRUSTA or len(points) < MIN_JUDGED:
         return region
     distances = np.linalg.norm(points - region.center, axis=1)
     near = points[distances < ALONE_RADII * region.radius / SEEN_WHOLE_MARGIN]
