@@ -42,8 +42,7 @@ def run(context: StageContext) -> dict[str, Any]:
     scene = artifacts.load_scene(folder)
     held_out = left_out(len(scene.cameras), params.holdout)
     _check_hold_out(len(held_out), int(held_out.sum()), params.holdout)
-    images, masks = _load_images(folder, scene.cameras.names)
-    photos = Photos(scene.cameras, images, masks, context.device, ~held_out)
+    photos = Photos(scene.cameras, *_load_images(folder, scene.cameras.names), context.device, ~held_out)
     sightings = Sightings.from_scene(scene, context.device, (~held_out).numpy())
     trainer = Trainer(photos, sightings, params, context.device)
 
@@ -51,7 +50,7 @@ def run(context: StageContext) -> dict[str, Any]:
     metrics = artifacts.metrics_path(context.scratch)
     spent = _resume(trainer, checkpoint, metrics)
     if params.init == "hull" and trainer.step_index == 0:
-        _start_from_hull(trainer, scene.cameras, masks, held_out.tolist())
+        _start_from_hull(trainer, scene.cameras, folder, held_out.tolist())
     started = saved = time.monotonic()
     previewed = _progress(trainer.step_index, spent, params)
     with metrics.open("a", encoding="utf-8") as lines:
@@ -109,9 +108,7 @@ def _load_images(folder: Path, names: tuple[str, ...]) -> tuple[Iterator[np.ndar
     return images, masks if masked == len(names) else None
 
 
-def _start_from_hull(
-    trainer: Any, cameras: PinholeCameras, masks: list[np.ndarray] | None, held_out: list[bool]
-) -> None:
+def _start_from_hull(trainer: Any, cameras: PinholeCameras, folder: Path, held_out: list[bool]) -> None:
     """The SDF starts as the visual hull of the masks of the photos that are trained on.
 
     Raises:
@@ -120,9 +117,12 @@ def _start_from_hull(
     from stages.geometry.hull import hull_distances
 
     advice = "Give a mask for each photo (`--masks FOLDER`), or start from a sphere: `--set train.init=sphere`."
-    if masks is None:
+    if trainer.photos.masks is None:
         raise InputError(f"`train.init` = hull needs masks for all {len(cameras)} photos, and some have none.", advice)
-    known = [None if left_out else mask for mask, left_out in zip(masks, held_out, strict=True)]
+    known = [
+        None if left_out else artifacts.load_mask(folder, name)
+        for name, left_out in zip(cameras.names, held_out, strict=True)
+    ]
     distances = hull_distances(cameras, known)
     if distances is None:
         raise InputError(f"The {len(cameras)} masks have no visual hull within the region of interest.", advice)

@@ -284,10 +284,11 @@ def test_the_hull_of_a_ball_is_a_little_more_than_the_ball():
     assert hull_distances(cameras, [np.zeros((40, 48), np.uint8)] * 16, cells=20) is None
 
 
-def test_training_can_start_from_the_hull(caplog):
+def test_training_can_start_from_the_hull(tmp_path):
+    write_undistorted(tmp_path, ring_of_cameras(), masks=True)
     trainer = make_trainer(TINY.model_copy(update={"sphere_radius": 0.8}), masks=True)
     cameras = ring_of_cameras()
-    train._start_from_hull(trainer, cameras, [render(cameras, i)[1] for i in range(len(cameras))], [False] * 8)
+    train._start_from_hull(trainer, cameras, tmp_path, [False] * len(cameras))
     levels = trainer.moment(0.0).levels
     points = torch.nn.functional.normalize(torch.randn(300, 3, generator=torch.Generator().manual_seed(0)), dim=1)
     with torch.no_grad():
