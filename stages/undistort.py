@@ -20,7 +20,7 @@ import numpy as np
 from configs.texts import read_distance, read_region
 from stages import artifacts
 from stages.engine.stage import Stage, StageContext
-from stages.errors import InputError, ReconstructionError
+from stages.errors import ConfigError, InputError, ReconstructionError
 from stages.geometry.cameras import PinholeCameras, PosedScene
 from stages.geometry.markers import detect_markers, measure_markers
 from stages.geometry.normalisation import into_scene, scene_frame
@@ -33,6 +33,7 @@ from stages.geometry.up import Up, choose_up, estimate_up
 
 log = logging.getLogger(__name__)
 
+MIN_SEEING = 2  # cameras that see a region which the user gave
 PNG_COMPRESSION = 2  # of 9; twice as fast as the default for a few percent of size
 
 
@@ -328,6 +329,7 @@ def _find_region(
     form, numbers = read_region(params.region)
     if form != "auto":
         region = given_region(form, numbers, region.kind)
+        _check_seen(region, cameras, params.region)
     else:
         region = replace(region, radius=region.radius * params.roi_scale)
     if params.up != "auto":
@@ -337,6 +339,22 @@ def _find_region(
     if located is None:
         return region, ground, choose_up(held, normal, None, 0.0)
     return region, ground, choose_up(held, normal, np.array([0.0, 0.0, 1.0]), located.tilt_error_deg)
+
+
+def _check_seen(region: RegionOfInterest, cameras: PinholeCameras, text: str) -> None:
+    """Raises ConfigError where fewer than two cameras see the given region."""
+    places = region.center + region.radius * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
+    seen = 0
+    for i, size in enumerate(cameras.sizes):
+        pixels, depth = cameras.project(i, places)
+        seen += bool(((depth > 0) & (pixels >= 0).all(1) & (pixels < size).all(1)).any())
+    if seen < MIN_SEEING:
+        middle = " ".join(f"{value:.4g}" for value in np.median(cameras.centers, axis=0))
+        raise ConfigError(
+            f"`undistort.region` = {text} is seen by {seen} of {len(cameras)} cameras (need {MIN_SEEING}).",
+            f"It is in the coordinates of the exported PLY, where the cameras stand about {middle}; "
+            "`--set undistort.region=auto` finds it by itself.",
+        )
 
 
 UNDISTORT = Stage(

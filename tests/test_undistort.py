@@ -13,7 +13,7 @@ from configs.params import UndistortParams
 from stages import artifacts
 from stages.artifacts import ImageRecord, ImageSet
 from stages.engine.stage import StageContext
-from stages.errors import InputError
+from stages.errors import ConfigError, InputError
 from stages.geometry.cameras import PinholeCameras, PosedScene
 from stages.geometry.place import Place
 from stages.geometry.plane import Plane
@@ -228,6 +228,13 @@ def test_a_given_sphere_is_the_unit_sphere(tmp_path: Path):
     assert scene.box is None
     assert numbers["region_from"] == "the given sphere"
     assert artifacts.overview_path(out).read_text().startswith("<svg")
+
+
+def test_a_region_that_no_camera_sees_is_refused(tmp_path: Path):
+    inputs = write_capture(tmp_path, *MODELS[0], masks=False)
+    with pytest.raises(ConfigError, match=r"sphere 2 50 0.5 1 is seen by 0 of 8 cameras \(need 2\)") as caught:
+        undistort(inputs, tmp_path, region="sphere 2 50 0.5 1")
+    assert "where the cameras stand about" in caught.value.hint
 
 
 def test_a_given_box_is_kept_for_the_crop(tmp_path: Path):
