@@ -397,6 +397,36 @@ def demo(
         typer.echo(json.dumps({"ok": True, **result}, default=str))
 
 
+# ---------------------------------------------------------------- poses for other programs
+OutFolder = Annotated[Path, typer.Argument(help="New or empty folder to write.", show_default=False)]
+OfWorkspace = Annotated[Path, typer.Argument(help="The workspace's folder.", show_default=False)]
+
+
+def export_colmap(context: typer.Context, workspace: OfWorkspace, out: OutFolder, as_json: Json = False) -> None:
+    """Write the undistorted photos with a COLMAP model of them, for COLMAP, OpenMVS and the like."""
+    from stages.posing.exporting import write_colmap
+
+    _export_poses(context.obj, workspace, out, write_colmap, as_json)
+
+
+def export_transforms(context: typer.Context, workspace: OfWorkspace, out: OutFolder, as_json: Json = False) -> None:
+    """Write the undistorted photos with nerfstudio's transforms.json and a PLY of the sparse points."""
+    from stages.posing.exporting import write_transforms
+
+    _export_poses(context.obj, workspace, out, write_transforms, as_json)
+
+
+def _export_poses(session: Session, workspace: Path, out: Path, write: Any, as_json: bool) -> None:
+    from hineus_cli.console import people
+    from hineus_cli.pose_export import export_poses
+
+    session.json = as_json
+    numbers = export_poses(workspace, out, write)
+    people().print(f"{numbers['images']} images, {numbers['points']} points: {out}", markup=False, soft_wrap=True)
+    if as_json:
+        typer.echo(json.dumps({"ok": True, "folder": str(out.absolute()), **numbers}))
+
+
 # ---------------------------------------------------------------- the table of commands
 def _version(wanted: bool) -> None:
     if wanted:
@@ -432,6 +462,8 @@ def build_app(pipeline: Sequence[Stage] = PIPELINE) -> typer.Typer:
     for command in (run, status, doctor, presets, demo):
         app.command()(command)
     app.command("config")(show_config)
+    app.command("export-colmap")(export_colmap)
+    app.command("export-transforms")(export_transforms)
     for stage in pipeline:
         app.command(stage.name, rich_help_panel="One stage (and what it needs)")(stage_command(stage))
     return app

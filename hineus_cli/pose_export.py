@@ -1,0 +1,33 @@
+"""From a workspace to a folder that other programs read: which stages it needs, and where it may be written."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from stages.engine.workspace import Workspace, storage_errors
+from stages.errors import InputError, WorkspaceError
+
+Writer = Callable[[Path, Path, Path], dict[str, Any]]
+
+
+def export_poses(workspace: Path, out: Path, write: Writer) -> dict[str, Any]:
+    """Write with `write`, one of `stages.posing.exporting`, into the empty or absent folder `out`.
+
+    Raises:
+        WorkspaceError: there is no workspace, it has no undistorted photos, or they are of other poses.
+        InputError: `out` holds something.
+    """
+    opened = Workspace.open(workspace)
+    sfm, undistort = opened.published("sfm"), opened.published("undistort")
+    if sfm is None or undistort is None or undistort.identity.inputs["sfm"] != sfm.outputs_digest:
+        raise WorkspaceError(
+            f"The workspace {opened.root} has no undistorted photos of its present poses.",
+            f"Make them: `hineus undistort --workspace {opened.root}`.",
+        )
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise InputError(f"{out} is there already.", "Name a new or empty folder.")
+    with storage_errors(out, "writing the poses"):
+        out.mkdir(parents=True, exist_ok=True)
+        return write(opened.stage_folder("undistort"), opened.stage_folder("sfm"), out)

@@ -1,0 +1,137 @@
+"""Poses for other programs: the undistorted photos with a COLMAP model, or with nerfstudio's transforms.json.
+
+Everything is in the world frame, that of the exported PLY and OBJ.
+"""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from stages import artifacts
+from stages.geometry.cameras import PosedScene
+from stages.geometry.normalisation import into_scene
+
+SPARSE, TRANSFORMS, POINTS = "sparse", "transforms.json", "sparse_pc.ply"
+
+
+def write_colmap(undistort: Path, sfm: Path, out: Path) -> dict[str, Any]:
+    """Write images/, masks/ (where there are any) and sparse/ (.bin and .txt), as COLMAP's own undistorter does.
+
+    Args:
+        undistort, sfm: folders of these stages. out: exists.
+
+    Returns:
+        Numbers of images, points and observations.
+    """
+    scene = artifacts.load_scene(undistort)
+    _copy_images(scene, undistort, out)
+    model = undistorted_model(scene, sfm, out / artifacts.IMAGES)
+    folder = out / SPARSE
+    folder.mkdir()
+    model.write_binary(str(folder))
+    model.write_text(str(folder))
+    return _numbers(model)
+
+
+def write_transforms(undistort: Path, sfm: Path, out: Path) -> dict[str, Any]:
+    """Write images/, masks/ (where there are any), transforms.json and a PLY of the sparse points.
+
+    Args:
+        undistort, sfm: folders of these stages. out: exists.
+
+    Returns:
+        Numbers of images, points and observations.
+    """
+    scene = artifacts.load_scene(undistort)
+    _copy_images(scene, undistort, out)
+    model = undistorted_model(scene, sfm, out / artifacts.IMAGES)
+    model.export_PLY(str(out / POINTS))
+    cameras = into_scene(scene.cameras, scene.world_from_scene.inverse())
+    frames = []
+    for i, name in enumerate(cameras.names):
+        cam_from_world = np.vstack([cameras.cam_from_scene[i], [0, 0, 0, 1]])
+        K, (width, height) = cameras.intrinsics[i], cameras.sizes[i].tolist()
+        frame = {
+            "file_path": f"{artifacts.IMAGES}/{name}",
+            "w": width,
+            "h": height,
+            "fl_x": K[0, 0],
+            "fl_y": K[1, 1],
+            "cx": K[0, 2],
+            "cy": K[1, 2],
+            # OpenGL axes: y up, z backward
+            "transform_matrix": (np.linalg.inv(cam_from_world) @ np.diag([1.0, -1.0, -1.0, 1.0])).tolist(),
+        }
+        mask = artifacts.mask_path(out, name)
+        if mask.exists():
+            frame["mask_path"] = mask.relative_to(out).as_posix()
+        frames.append(frame)
+    units = "arbitrary units" if scene.place is None else scene.place.units
+    artifacts.write_json(
+        out / TRANSFORMS, {"camera_model": "OPENCV", "units": units, "ply_file_path": POINTS, "frames": frames}
+    )
+    return _numbers(model)
+
+
+def undistorted_model(scene: PosedScene, sfm: Path, images_folder: Path) -> Any:
+    """The pycolmap model of the pinhole images, with the points' colours and tracks.
+
+    Where the features were seen comes from the model of `sfm`, whose photos and points are in the scene's order.
+    """
+    import pycolmap
+
+    source = pycolmap.Reconstruction(str(artifacts.model_path(sfm)))
+    photos = sorted((source.images[i] for i in source.reg_image_ids()), key=lambda image: image.name)
+    cameras = into_scene(scene.cameras, scene.world_from_scene.inverse())
+    model = pycolmap.Reconstruction()
+    camera_ids: dict[tuple[Any, ...], int] = {}
+    for i, (photo, name) in enumerate(zip(photos, cameras.names, strict=True)):
+        K, (width, height) = cameras.intrinsics[i], cameras.sizes[i].tolist()
+        params = K[[0, 1, 0, 1], [0, 1, 2, 2]]
+        key = (width, height, *params)
+        if key not in camera_ids:
+            camera_ids[key] = len(camera_ids) + 1
+            model.add_camera_with_trivial_rig(
+                pycolmap.Camera(
+                    model="PINHOLE", width=width, height=height, params=list(params), camera_id=camera_ids[key]
+                )
+            )
+        seen = np.array([point.xy for point in photo.points2D]).reshape(-1, 2)
+        rays = np.asarray(source.cameras[photo.camera_id].cam_from_img(seen)).reshape(-1, 2)
+        pixels = np.nan_to_num(rays * params[:2] + params[2:], nan=-1.0)  # a lens may not reach the photo's corners
+        pose = cameras.cam_from_scene[i]
+        model.add_image_with_trivial_frame(
+            pycolmap.Image(name, pycolmap.Point2DList([pycolmap.Point2D(xy) for xy in pixels]), camera_ids[key], i + 1),
+            pycolmap.Rigid3d(pycolmap.Rotation3d(pose[:, :3]), pose[:, 3]),
+        )
+    index_of = {photo.image_id: i + 1 for i, photo in enumerate(photos)}
+    points = scene.world_from_scene.apply(scene.points.astype(np.float64))
+    for point_id, xyz in zip(sorted(source.points3D), points, strict=True):
+        track = pycolmap.Track()
+        for element in source.points3D[point_id].track.elements:
+            if element.image_id in index_of:
+                track.add_element(index_of[element.image_id], element.point2D_idx)
+        model.add_point3D(xyz, track, np.zeros(3, np.uint8))
+    model.extract_colors_for_all_images(str(images_folder))
+    model.update_point_3d_errors()
+    return model
+
+
+def _copy_images(scene: PosedScene, undistort: Path, out: Path) -> None:
+    for name in scene.cameras.names:
+        for place in (artifacts.image_path, artifacts.mask_path):
+            if place(undistort, name).exists():
+                place(out, name).parent.mkdir(parents=True, exist_ok=True)
+                shutil.copyfile(place(undistort, name), place(out, name))
+
+
+def _numbers(model: Any) -> dict[str, Any]:
+    return {
+        "images": model.num_reg_images(),
+        "points": model.num_points3D(),
+        "observations": model.compute_num_observations(),
+    }
