@@ -24,6 +24,9 @@ class IngestParams(Section):
 
     max_side: int = Field(3200, ge=64, description="photos larger than this are reduced to it, longest side in pixels")
     min_images: int = Field(3, ge=2, description="fewer usable photos than this is an error")
+    video_frames: int = Field(
+        80, ge=2, description="at most this many frames of a video become photos: spread by motion, the sharpest ones"
+    )
 
 
 class SfmParams(Section):

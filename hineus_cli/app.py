@@ -28,7 +28,9 @@ INTERRUPTED = 130
 
 Photos = Annotated[
     Path | None,
-    typer.Argument(help="Folder of photos; may be left out for a workspace that knows its own.", show_default=False),
+    typer.Argument(
+        help="Folder of photos, or a video; may be left out for a workspace that knows its own.", show_default=False
+    ),
 ]
 WorkspaceOption = Annotated[
     Path | None,

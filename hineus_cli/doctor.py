@@ -27,6 +27,7 @@ REQUIRED = {
     "numpy": "numpy",
     "scipy": "scipy",
     "PIL": "pillow",
+    "pillow_heif": "pillow-heif",
     "cv2": "opencv-python-headless",
     "torch": "torch",
     "numba": "numba",
@@ -38,7 +39,7 @@ REQUIRED = {
     "fast_simplification": "fast-simplification",
     "jinja2": "jinja2",
 }
-OPTIONAL = {"pillow_heif": ("pillow-heif", "HEIC photos are left out")}
+OPTIONAL = {"rawpy": ("rawpy", "camera raw files are left out")}
 
 # PyMeshLab imports even where the libraries of its plug-ins are missing; then its filters are not there.
 _PROBES = {

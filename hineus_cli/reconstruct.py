@@ -14,6 +14,7 @@ from configs.load import load_config
 from configs.params import Config
 from hineus_cli.console import log_to_file
 from stages import artifacts
+from stages.capture.listing import is_video
 from stages.engine.runner import Listener, StageOutcome, run_pipeline
 from stages.engine.stage import Stage
 from stages.engine.workspace import Workspace
@@ -30,7 +31,7 @@ class Request:
     """What the user asked for; None is "not said".
 
     Attributes:
-        photos: folder of photos; a workspace that was run before knows its own.
+        photos: folder of photos, or a video; a workspace that was run before knows its own.
         workspace: folder; default `<photos' name>_hineus` here.
         masks: folder of masks; kept from the last run while the photos are the same, unless `no_masks`.
         poses: file or folder of known poses; kept like the masks, unless `no_poses`.
@@ -121,7 +122,8 @@ def choose_folder(request: Request) -> Path:
     if request.workspace is not None:
         return request.workspace
     if request.photos is not None:
-        return Path.cwd() / f"{request.photos.resolve().name}_hineus"
+        photos = request.photos.resolve()
+        return Path.cwd() / f"{photos.stem if is_video(photos) else photos.name}_hineus"
     if (Path.cwd() / "workspace.json").exists():
         return Path.cwd()
     raise ConfigError(
@@ -142,9 +144,9 @@ def choose_sources(request: Request, workspace: Workspace) -> dict[str, Path | N
     for name, given in (("photos", request.photos), ("masks", request.masks)):
         if given is not None and not given.exists():
             raise InputError(f"There is no {name} folder {given}.", "Check the path with `ls`.")
-        if given is not None and not given.is_dir():
+        if given is not None and not given.is_dir() and not (name == "photos" and is_video(given)):
             raise InputError(
-                f"{given} is a file; a folder of {name} is needed.",
+                f"{given} is a file; a folder of {name}{' or a video' if name == 'photos' else ''} is needed.",
                 f"Name the folder it is in: {given.absolute().parent}",
             )
     recorded = known.get("photos")

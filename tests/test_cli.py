@@ -179,7 +179,7 @@ def test_wrong_times_are_refused(text: str) -> None:
     [
         (["run"], 2, ["Neither a folder of photos nor a workspace is given.", "Try `hineus run PHOTOS`"]),
         (["run", "nowhere"], 3, ["There is no photos folder nowhere."]),
-        (["run", "photos/0.jpg"], 3, ["0.jpg is a file; a folder of photos is needed."]),
+        (["run", "photos/0.jpg"], 3, ["0.jpg is a file; a folder of photos or a video is needed."]),
         (["run", "photos", "--masks", "nowhere"], 3, ["There is no masks folder nowhere."]),
         (["run", "-w", "new"], 3, ["does not know its photos yet", "hineus run PHOTOS --workspace"]),
         (["run", "photos", "-w", "photos/ws"], 3, ["lies inside the photo folder"]),

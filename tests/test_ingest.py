@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import shutil
+import struct
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +14,11 @@ from PIL import Image
 from configs.params import IngestParams
 from stages import artifacts
 from stages.artifacts import ImageSet
+from stages.capture.exif import DIAGONAL_35MM
+from stages.capture.photos import register_formats
 from stages.engine.stage import StageContext
 from stages.errors import InputError
-from stages.ingest import DIAGONAL_35MM, INGEST
+from stages.ingest import INGEST
 
 SIZE = (96, 72)
 
@@ -146,6 +150,95 @@ def test_formats_colmap_cannot_read_are_encoded_anew(photos: Path):
         assert np.asarray(written).max() == 96 * 72 * 9 // 257  # scaled to 8 bits, not clipped
 
 
+@pytest.mark.parametrize(("suffix", "orientation"), [(".avif", 6), (".heic", 1)])
+def test_formats_of_phones_are_read_upright_with_their_exif(photos: Path, suffix: str, orientation: int):
+    register_formats()
+    write_photos(photos, 2)
+    upright = picture(7)
+    exif = exif_of(orientation, focal_mm=4.0, focal_35mm=28, model="A")
+    stored = upright.transpose(Image.Transpose.ROTATE_90) if orientation == 6 else upright
+    stored.save(photos / f"z{suffix}", quality=95, exif=exif)
+    image_set, out, numbers = ingest(photos)
+    assert not image_set.skipped
+    record = image_set.images[-1]
+    assert (record.name, record.width, record.height) == ("z.jpg", *SIZE)
+    assert record.focal_px == pytest.approx(28 / DIAGONAL_35MM * 120)
+    assert numbers["with_focal"] == 1
+    with Image.open(artifacts.image_path(out, record.name)) as written:
+        difference = np.abs(np.asarray(written, dtype=int) - np.asarray(upright, dtype=int))
+    assert difference.mean() < 6
+
+
+def test_sixteen_bits_a_channel_become_eight(photos: Path):
+    import cv2
+
+    write_photos(photos, 2)
+    colours = np.asarray(picture(7))
+    for name in ("deep.png", "deep.tif"):
+        shade = colours[:, ::-1] if name == "deep.tif" else colours
+        cv2.imwrite(str(photos / name), shade[:, :, ::-1].astype(np.uint16) * 257)
+    image_set, out, _ = ingest(photos)
+    assert not image_set.skipped
+    for name in ("deep.png", "deep.tif"):
+        source = next(record for record in image_set.images if record.source == name)
+        with Image.open(artifacts.image_path(out, source.name)) as written:
+            assert written.mode == "RGB"
+            shade = colours[:, ::-1] if name == "deep.tif" else colours
+            assert np.abs(np.asarray(written, dtype=int) - shade).max() <= 1
+
+
+def write_dng(path: Path, level: int, size: tuple[int, int] = (128, 96), orientation: int = 1) -> None:
+    """A raw file of a grey wall: 16-bit RGGB samples of `level` of 65535, neutral white balance."""
+    width, height = size
+    pixels = np.full((height, width), level, dtype="<u2").tobytes()
+    model, head = b"Test Camera\0", 8
+    matrix = struct.pack("<18i", *(part for k in range(9) for part in (int(k % 4 == 0), 1)))
+    neutral = struct.pack("<6I", 1, 1, 1, 1, 1, 1)
+    extra = {271: model, 272: model, 50708: model, 50721: matrix, 50728: neutral}
+    offsets, place = {}, head + len(pixels)
+    for tag, data in extra.items():
+        offsets[tag], place = place, place + len(data)
+    text = lambda tag: (tag, 2, len(model), offsets[tag])  # noqa: E731
+    entries = [
+        (254, 4, 1, 0), (256, 4, 1, width), (257, 4, 1, height), (258, 3, 1, 16), (259, 3, 1, 1), (262, 3, 1, 32803),
+        text(271), text(272), (273, 4, 1, head), (274, 3, 1, orientation), (277, 3, 1, 1), (278, 4, 1, height),
+        (279, 4, 1, len(pixels)), (33421, 3, 2, 2 | 2 << 16), (33422, 1, 4, 0 | 1 << 8 | 1 << 16 | 2 << 24),
+        (50706, 1, 4, 1 | 4 << 8), text(50708), (50714, 4, 1, 0), (50717, 4, 1, 65535),
+        (50721, 10, 9, offsets[50721]), (50728, 5, 3, offsets[50728]),
+    ]  # fmt: skip
+    table = struct.pack("<H", len(entries)) + b"".join(struct.pack("<HHII", *entry) for entry in entries) + b"\0" * 4
+    path.write_bytes(struct.pack("<2sHI", b"II", 42, place) + pixels + b"".join(extra.values()) + table)
+
+
+def test_raw_files_are_developed_alike_and_upright(photos: Path):
+    pytest.importorskip("rawpy")
+    write_photos(photos, 2)
+    write_dng(photos / "bright.dng", 16000)
+    write_dng(photos / "dark.dng", 8000, orientation=6)
+    picture(9).save(photos / "both.jpg")
+    write_dng(photos / "both.dng", 9000)
+    image_set, out, _ = ingest(photos)
+    assert reasons(image_set) == {"both.dng": "the raw file of both.jpg"}
+    records = {record.source: record for record in image_set.images}
+    assert (records["dark.dng"].width, records["dark.dng"].height) == (96, 128)
+    assert records["bright.dng"].camera.startswith("Test Camera")
+    means = [np.asarray(Image.open(artifacts.image_path(out, f"{name}.png"))).mean() for name in ("bright", "dark")]
+    assert means[0] / means[1] == pytest.approx(2 ** (1 / 2.222), rel=0.1)  # one stop apart: no automatic brightness
+
+
+def test_raw_files_without_rawpy_are_left_out_with_the_package_to_install(photos: Path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "rawpy", None)
+    write_photos(photos, 3)
+    write_dng(photos / "z.dng", 9000)
+    assert "pip install 'hineus[raw]'" in reasons(ingest(photos)[0])["z.dng"]
+
+
+def test_the_clip_of_a_live_photo_is_no_video(photos: Path):
+    write_photos(photos, 3)
+    (photos / "001.MOV").write_bytes(b"0")
+    assert reasons(ingest(photos)[0]) == {"001.MOV": "the clip of the live photo 001.jpg"}
+
+
 def test_names_stay_unique_when_suffixes_change(photos: Path):
     write_photos(photos, 2)
     picture(5).save(photos / "a.jpg")
@@ -204,6 +297,27 @@ def test_cameras_are_told_apart_by_model_focal_length_and_size(photos: Path):
     assert len(set(cameras)) == numbers["cameras"] == 4
 
 
+def test_without_exif_each_folder_and_size_is_a_camera(photos: Path):
+    for folder in ("left", "right"):
+        (photos / folder).mkdir()
+        for i in range(2):
+            picture(i + 10 * len(folder)).save(photos / folder / f"{i}.jpg")
+            picture(i + 10 * len(folder) + 5).save(photos / folder / f"a{i}.jpg", exif=exif_of(model="A", focal_mm=4))
+    picture(99, (120, 90)).save(photos / "left" / "z.jpg")
+    image_set, _, numbers = ingest(photos)
+    cameras = {record.name: record.camera for record in image_set.images}
+    assert cameras["left/0.jpg"] == cameras["left/1.jpg"] != cameras["right/0.jpg"] == cameras["right/1.jpg"]
+    assert cameras["left/a0.jpg"] == cameras["right/a0.jpg"]  # one body and zoom, whatever the folder
+    assert numbers["cameras"] == 4
+
+
+def test_digital_zoom_is_another_camera(photos: Path):
+    write_photos(photos, 2)
+    for equivalent in (26, 52):
+        picture(equivalent).save(photos / f"{equivalent}.jpg", exif=exif_of(None, 6.8, equivalent, model="Phone"))
+    assert ingest(photos)[2]["cameras"] == 3
+
+
 def test_blur_is_lower_for_the_blurred(photos: Path):
     write_photos(photos, 2)
     noise = Image.fromarray(np.random.default_rng(0).integers(0, 256, (72, 96, 3), dtype=np.uint8))
@@ -246,7 +360,7 @@ def test_missing_folder(tmp_path: Path):
 def test_a_file_instead_of_a_folder(photos: Path):
     name = write_photos(photos, 1)[0]
     shutil.move(photos / name, photos.parent / name)
-    with pytest.raises(InputError, match="is a file; a folder of photos is needed"):
+    with pytest.raises(InputError, match="is a file; a folder of photos or a video is needed"):
         ingest(photos.parent / name)
 
 

@@ -1,0 +1,151 @@
+"""A video as photos: frames spread evenly over the camera's motion, of each stretch the sharpest.
+
+Frames are counted and never sought, since seeking in a compressed video lands on different frames with different
+decoders. The decoder undoes the rotation that phones note in the file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from stages.capture.photos import UnusableError
+
+LOOKS_PER_S = 10.0  # frames looked at; hand-held blur comes and goes within some tenths of a second
+TRACK_SIDE = 320  # longest side of the thumbnails that motion is followed on, pixels
+SHARP_SIDE = 960  # longest side of those that sharpness is measured on: blur of two pixels still shows
+CORNERS = 200
+# Where only the object moves (a turntable), most corners may stand on the background: the faster quarter tells.
+MOVING = 0.75
+# Photos nearer than this part of the frame's diagonal see the same thing: a full turn around an object that fills half
+# of the frame moves its front by about 1.6 diagonals, which allows some 150 of them.
+MIN_STRETCH = 0.01
+STILL = 0.0005  # motion below this part of the diagonal is what tracking gets wrong
+LOST = 0.25  # nothing could be followed: the view changed by a good part of the frame
+JPEG_QUALITY = 97
+
+
+@dataclass(frozen=True)
+class Look:
+    """What was seen of one frame.
+
+    Attributes:
+        frame: its number, from 0.
+        sharpness: variance of the Laplacian of its thumbnail; compares between neighbours only.
+        moved: motion since the last look, as part of the frame's diagonal.
+    """
+
+    frame: int
+    sharpness: float
+    moved: float
+
+
+def extract_frames(
+    video: Path, folder: Path, count: int, progress: Callable[[float], None] = lambda part: None
+) -> list[Path]:
+    """Write up to `count` frames of `video` as JPEG files named by frame number into `folder`; fewer where it stands.
+
+    `progress` is told the part done, 0 to 1.
+
+    Raises:
+        UnusableError: it cannot be read as a video.
+    """
+    looks = list(_look(video, lambda part: progress(0.7 * part)))
+    if not looks:
+        raise UnusableError("no frame of this video can be read")
+    return _write(video, folder, choose_frames(looks, count), lambda part: progress(0.7 + 0.3 * part))
+
+
+def choose_frames(looks: list[Look], count: int) -> list[int]:
+    """Up to `count` frame numbers, ascending: the way is cut into equal stretches, of each the sharpest is taken."""
+    way = np.cumsum([0.0] + [look.moved if look.moved > STILL else 0.0 for look in looks[1:]])
+    stretches = int(np.clip(np.ceil(way[-1] / MIN_STRETCH), 1, count))
+    of_stretch = np.minimum((way / max(way[-1], STILL) * stretches).astype(int), stretches - 1)
+    best: dict[int, Look] = {}
+    for look, stretch in zip(looks, of_stretch.tolist(), strict=True):
+        if stretch not in best or look.sharpness > best[stretch].sharpness:
+            best[stretch] = look
+    return sorted(look.frame for look in best.values())
+
+
+def _look(video: Path, progress: Callable[[float], None]) -> Iterator[Look]:
+    import cv2
+
+    before = None
+    for frame, pixels in _frames(video, None, progress):
+        grey = cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY)
+        small = _reduced(grey, TRACK_SIDE)
+        sharpness = float(cv2.Laplacian(_reduced(grey, SHARP_SIDE), cv2.CV_32F).var())
+        moved = 0.0 if before is None else motion(before, small)
+        before = small
+        yield Look(frame, sharpness, moved)
+
+
+def motion(before: np.ndarray, after: np.ndarray) -> float:
+    """How far corners moved between two grey pictures [H, W] uint8, as part of the diagonal; see `MOVING`, `LOST`."""
+    import cv2
+
+    corners = cv2.goodFeaturesToTrack(before, CORNERS, 0.01, 7)
+    if corners is None:
+        return 0.0  # nothing to see
+    arrived, found, _ = cv2.calcOpticalFlowPyrLK(before, after, corners, np.empty_like(corners))
+    ok = found.ravel() == 1
+    if ok.mean() < 0.25:
+        return LOST
+    distances = np.linalg.norm((arrived - corners).reshape(-1, 2)[ok], axis=1)
+    return float(min(np.quantile(distances, MOVING) / np.hypot(*before.shape), LOST))
+
+
+def _reduced(grey: np.ndarray, side: int) -> np.ndarray:
+    import cv2
+
+    scale = side / max(grey.shape)
+    return cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else grey
+
+
+def _write(video: Path, folder: Path, chosen: list[int], progress: Callable[[float], None]) -> list[Path]:
+    from PIL import Image
+
+    folder.mkdir(parents=True, exist_ok=True)
+    written = []
+    for frame, pixels in _frames(video, set(chosen), progress):
+        path = folder / f"{frame:06d}.jpg"
+        Image.fromarray(pixels[:, :, ::-1]).save(path, quality=JPEG_QUALITY, subsampling=0)
+        written.append(path)
+    return written
+
+
+def _frames(
+    video: Path, wanted: set[int] | None, progress: Callable[[float], None]
+) -> Iterator[tuple[int, np.ndarray]]:
+    """Number and BGR pixels [H, W, 3] of the `wanted` frames; of None, `LOOKS_PER_S` a second."""
+    capture = _open(video)
+    import cv2
+
+    total = max(1.0, capture.get(cv2.CAP_PROP_FRAME_COUNT))
+    every = max(1, round(capture.get(cv2.CAP_PROP_FPS) / LOOKS_PER_S))
+    last = max(wanted, default=-1) if wanted is not None else None
+    frame = 0
+    try:
+        while (last is None or frame <= last) and capture.grab():
+            if frame in wanted if wanted is not None else frame % every == 0:
+                done, pixels = capture.retrieve()
+                if done:
+                    yield frame, pixels
+            frame += 1
+            progress(min(1.0, frame / total))
+    finally:
+        capture.release()
+
+
+def _open(video: Path) -> Any:
+    import cv2
+
+    capture = cv2.VideoCapture(str(video), cv2.CAP_FFMPEG)
+    if not capture.isOpened():
+        raise UnusableError("cannot be read as a video (damaged, or a codec that FFmpeg does not have)")
+    return capture
