@@ -50,7 +50,7 @@ def run(context: StageContext) -> dict[str, Any]:
     metrics = artifacts.metrics_path(context.scratch)
     spent = _resume(trainer, checkpoint, metrics)
     if params.init == "hull" and trainer.step_index == 0:
-        _start_from_hull(trainer, scene.cameras, folder, held_out.tolist())
+        _start_from_hull(trainer, scene.cameras)
     started = saved = time.monotonic()
     previewed = _progress(trainer.step_index, spent, params)
     with metrics.open("a", encoding="utf-8") as lines:
@@ -91,10 +91,13 @@ def run(context: StageContext) -> dict[str, Any]:
 
 def _use_threads(context: StageContext) -> None:
     """Torch and numba take as many threads as the run was given."""
-    import numba
     import torch
 
     torch.set_num_threads(context.workers)
+    try:
+        import numba
+    except ImportError:  # training goes without its kernels
+        return
     numba.set_num_threads(min(context.workers, numba.config.NUMBA_NUM_THREADS))
 
 
@@ -108,7 +111,7 @@ def _load_images(folder: Path, names: tuple[str, ...]) -> tuple[Iterator[np.ndar
     return images, masks if masked == len(names) else None
 
 
-def _start_from_hull(trainer: Any, cameras: PinholeCameras, folder: Path, held_out: list[bool]) -> None:
+def _start_from_hull(trainer: Any, cameras: PinholeCameras) -> None:
     """The SDF starts as the visual hull of the masks of the photos that are trained on.
 
     Raises:
@@ -117,15 +120,15 @@ def _start_from_hull(trainer: Any, cameras: PinholeCameras, folder: Path, held_o
     from stages.geometry.hull import hull_distances
 
     advice = "Give a mask for each photo (`--masks FOLDER`), or start from a sphere: `--set train.init=sphere`."
-    if trainer.photos.masks is None:
+    photos = trainer.photos
+    if photos.masks is None:
         raise InputError(f"`train.init` = hull needs masks for all {len(cameras)} photos, and some have none.", advice)
-    known = [
-        None if left_out else artifacts.load_mask(folder, name)
-        for name, left_out in zip(cameras.names, held_out, strict=True)
-    ]
-    distances = hull_distances(cameras, known)
+    masks = [photos.mask(i) if training else None for i, training in enumerate(photos.training.tolist())]
+    distances = hull_distances(cameras, masks)
     if distances is None:
-        raise InputError(f"The {len(cameras)} masks have no visual hull within the region of interest.", advice)
+        raise InputError(
+            f"The masks of {len(cameras)} photos have no visual hull within the region of interest.", advice
+        )
     log.info("the SDF starts from the masks' visual hull, met to %.4f on average", trainer.start_from(distances))
 
 

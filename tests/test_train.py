@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ from stages import artifacts, train
 from stages.engine.stage import StageContext
 from stages.errors import InputError
 from stages.geometry.hull import hull_distances
-from stages.neural import encodings
+from stages.neural import acceleration, encodings
 from stages.neural import fields as fields_module
 from stages.neural.field import load_field
 from stages.neural.fields import contract
@@ -222,6 +223,20 @@ def test_a_budget_in_minutes_ends_on_time_whatever_the_steps(tmp_path):
     assert numbers["train_seconds"] < 60  # the first step may have to compile the kernels
 
 
+def test_without_numba_a_step_is_the_same_and_it_is_said_once(monkeypatch, caplog):
+    with_kernels = make_trainer().step(0.5)
+    monkeypatch.setitem(sys.modules, "numba", None)
+    acceleration._has_numba.cache_clear()
+    try:
+        trainer = make_trainer()
+        plain = trainer.step(0.5)
+        trainer.step(0.5)
+    finally:
+        acceleration._has_numba.cache_clear()
+    assert sum("no CPU kernels" in record.message for record in caplog.records) == 1
+    assert float(plain["loss"]) == pytest.approx(float(with_kernels["loss"]), rel=1e-3)
+
+
 def test_wrong_image_size_is_named():
     cameras = ring_of_cameras()
     with pytest.raises(ValueError, match=r"view_00\.png: got shape \(3, 3, 3\)"):
@@ -284,11 +299,10 @@ def test_the_hull_of_a_ball_is_a_little_more_than_the_ball():
     assert hull_distances(cameras, [np.zeros((40, 48), np.uint8)] * 16, cells=20) is None
 
 
-def test_training_can_start_from_the_hull(tmp_path):
-    write_undistorted(tmp_path, ring_of_cameras(), masks=True)
+def test_training_can_start_from_the_hull(caplog):
     trainer = make_trainer(TINY.model_copy(update={"sphere_radius": 0.8}), masks=True)
     cameras = ring_of_cameras()
-    train._start_from_hull(trainer, cameras, tmp_path, [False] * len(cameras))
+    train._start_from_hull(trainer, cameras)
     levels = trainer.moment(0.0).levels
     points = torch.nn.functional.normalize(torch.randn(300, 3, generator=torch.Generator().manual_seed(0)), dim=1)
     with torch.no_grad():

@@ -23,6 +23,8 @@ from functools import cached_property
 import numpy as np
 import torch
 
+from stages.neural.acceleration import takes_kernel
+
 # Müller et al. 2022, eq. 4: the spatial hash's factors for y and z (x has factor 1).
 PRIME_Y, PRIME_Z = 2654435761, 805459861
 # A table starts as small noise: features begin near zero, so the geometric initialisation is what is rendered.
@@ -140,7 +142,7 @@ def encode_features(
 
 
 def _has_kernel(points: torch.Tensor, grid: HashGrid) -> bool:
-    return points.device.type == "cpu" and points.dtype == torch.float32 and grid.features == 4
+    return grid.features == 4 and takes_kernel(points)
 
 
 def encode_reference(

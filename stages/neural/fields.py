@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import torch
 from torch import nn
 
+from stages.neural.acceleration import takes_kernel
 from stages.neural.appearance import FeatureMlp
 from stages.neural.encodings import Encoding, Frequencies, HashGrid, encode, encode_features
 from stages.neural.mlp import kaiming_uniform, mlp, spherical_harmonics
@@ -26,7 +27,7 @@ def smooth_relu(z: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
 
     The second derivative exists almost everywhere, so normals get gradients; no exponential is needed.
     """
-    if z.device.type == "cpu" and z.dtype == torch.float32:
+    if takes_kernel(z):
         return _KernelSmoothRelu.apply(z)
     return smooth_relu_reference(z)
 

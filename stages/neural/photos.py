@@ -79,6 +79,13 @@ class Photos:
     def __len__(self) -> int:
         return len(self.first)
 
+    def mask(self, index: int) -> np.ndarray:
+        """The mask [H, W] uint8 of a photo, where there are masks."""
+        assert self.masks is not None
+        width, height = self.sizes[index].tolist()
+        first = int(self.first[index])
+        return self.masks[first : first + width * height].view(height, width).cpu().numpy()
+
     def draw(self, num_rays: int, generator: torch.Generator) -> RayBatch:
         """At most num_rays random rays through the unit sphere, photos for training equally likely."""
         count = int(num_rays * _OVERDRAW)

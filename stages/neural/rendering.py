@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import torch
 
+from stages.neural.acceleration import takes_kernel
 from stages.neural.density import FLAT, logistic_section_optical_depth, section_optical_depth
 
 
@@ -18,7 +19,7 @@ def rendering_weights(
     `weights_from_optical_depth` of `sample_optical_depths`; on the CPU in one pass each way where the scale is a number
     and the density that of "laplace".
     """
-    if density == "laplace" and isinstance(scale, float) and sdf.device.type == "cpu" and sdf.dtype == torch.float32:
+    if density == "laplace" and isinstance(scale, float) and takes_kernel(sdf):
         return _KernelWeights.apply(sdf, distances, scale)
     return weights_from_optical_depth(sample_optical_depths(sdf, distances, scale, density))
 

@@ -9,6 +9,7 @@ from collections.abc import Callable
 
 import torch
 
+from stages.neural.acceleration import takes_kernel
 from stages.neural.density import FLAT, section_optical_depth
 from stages.neural.rendering import weights_from_optical_depth
 
@@ -90,15 +91,13 @@ class SdfCache:
 
     def lookup(self, points: torch.Tensor) -> torch.Tensor:
         """Trilinear f [...] at points [..., 3], without gradient; positions outside the cube read its border."""
-        if not points.is_cuda:
-            from stages.neural import kernels
+        if not takes_kernel(points):
+            return self.lookup_reference(points)
+        from stages.neural import kernels
 
-            found = torch.empty(points.shape[:-1])
-            kernels.lookup(
-                self.values[0, 0].numpy(), points.detach().float().reshape(-1, 3).numpy(), found.view(-1).numpy()
-            )
-            return found
-        return self.lookup_reference(points)
+        found = torch.empty(points.shape[:-1])
+        kernels.lookup(self.values[0, 0].numpy(), points.detach().reshape(-1, 3).numpy(), found.view(-1).numpy())
+        return found
 
     def lookup_reference(self, points: torch.Tensor) -> torch.Tensor:
         """`lookup` in plain torch: the reference of the kernel, and the path on CUDA."""
@@ -127,7 +126,7 @@ def importance_distances(
     """
     places = stratified(len(origins), num_samples, generator, origins.device)
     scale = max(scale, 0.5 * cache.cell)
-    if origins.device.type != "cpu":
+    if not takes_kernel(origins):
         return importance_distances_reference(cache, origins, directions, entry, leave, places, scale, num_bins)
     from stages.neural import kernels
 

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 
 from stages.errors import ReconstructionError, SystemRequirementError
+from stages.neural.acceleration import takes_kernel
 from stages.neural.photos import Photos
 from stages.neural.sampling import SdfCache, free_outside
 
@@ -93,7 +94,7 @@ def smallest_sdf_on_paths(
     On the CPU a kernel walks the paths by sphere tracing and stops at -10 / sharpness, where V is 1e-3 and the rest of
     the path cannot matter; elsewhere they are sampled evenly.
     """
-    if not points.is_cuda:
+    if takes_kernel(points):
         from stages.neural import kernels
 
         smallest = torch.empty(len(points))
