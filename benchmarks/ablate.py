@@ -80,7 +80,6 @@ VARIANTS: dict[str, dict[str, str]] = {
     "reflection": {"train.reflection": "stable"},
     "planar": {"train.planar": "stable"},
     "eikonal": {"train.eikonal": "stable"},
-    "outlier": {"train.ambiguity": "outlier"},
     "all": TERMS,
     "all-ambiguity": _all_but("ambiguity"),
     "all-reflection": _all_but("reflection"),

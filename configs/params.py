@@ -233,10 +233,8 @@ class TrainParams(Section):
     weight_mask: float = Field(0.1, ge=0, description="weight of the mask term, where masks exist")
     weight_exposure: float = Field(0.1, ge=0, description="weight that holds the photos' gains at 1")
 
-    ambiguity: Literal["off", "paper", "stable", "outlier"] = Field(
-        "off",
-        description="trust photos less where the others that see a place disagree with them (`paper`, `stable`), or "
-        "where the others agree and they do not (`outlier`)",
+    ambiguity: Literal["off", "paper", "stable"] = Field(
+        "off", description="trust photos less where the others that see a place disagree with them"
     )
     ambiguity_from: float = Field(0.2, ge=0, le=1, description="progress at which all but the paper's form begins")
     visibility: Literal["network", "paper", "stable", "mesh"] = Field(

@@ -270,21 +270,3 @@ def test_without_another_view_nothing_is_doubted():
     for doubt in nothing:
         assert doubt.tolist() == [0, 0]
         assert vis.trust(doubt).tolist() == vis.trust_literal(doubt).tolist() == [1, 1]
-
-
-def test_an_outlier_is_doubted_and_a_quarrel_is_not():
-    """A photo that differs from others that agree is doubted; where all differ, or too few see the place, none is."""
-    visibility = torch.ones(4, 6)
-    visibility[3, 2:] = 0.5
-    agreeing = 0.5 + 0.001 * torch.arange(6.0)[None, :, None].expand(1, 6, 3)
-    quarrel = torch.rand(1, 6, 3, generator=torch.Generator().manual_seed(0)) * 4 - 2
-    views = torch.cat([agreeing, agreeing, quarrel, agreeing])
-    own = torch.tensor([[0.5, 0.5, 0.5], [1.5, 0.5, 0.5], [0.0, 0, 0], [1.5, 0.5, 0.5]])
-    doubt = vis.outlier_ambiguity(visibility, own, views)
-    middle = views[1].median(0).values
-    spread = (views[1] - middle).norm(dim=1).median()
-    expected = (own[1] - middle).norm() / (spread + 0.05) - 1
-    assert doubt[1].item() == pytest.approx(expected.item(), rel=1e-4)
-    assert doubt[1] > 10
-    assert doubt[2] < 1
-    assert (doubt[0], doubt[3]) == (0, 0)

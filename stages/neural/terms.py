@@ -53,7 +53,7 @@ class Terms:
         compares the rendered colours `exposed` [R, 3] with the photos, from the first step.
         """
         params, batch = self.params, rendered.batch
-        off = params.ambiguity == "off" or (params.ambiguity != "paper" and moment.progress < params.ambiguity_from)
+        off = params.ambiguity == "off" or (params.ambiguity == "stable" and moment.progress < params.ambiguity_from)
         if off:
             return torch.ones(len(batch.leave), device=self.device)
         weights = torch.ones(len(batch.leave), device=self.device)  # no doubt where no surface was met
@@ -65,14 +65,8 @@ class Terms:
             return weights.index_copy(0, hit, visibility.trust_literal(visibility.ambiguity(seen, distance)))
         gains = torch.exp(self.fields.log_gains.detach())
         own = batch.colors[hit] / gains[batch.images[hit]]
-        if params.ambiguity == "outlier":
-            whiten = torch.linalg.cholesky(self.color_precision)
-            doubt = visibility.outlier_ambiguity(seen, own @ whiten, (colors / gains) @ whiten)
-        else:
-            doubt = visibility.ambiguity(
-                seen, visibility.mahalanobis(own[:, None], colors / gains, self.color_precision)
-            )
-        return weights.index_copy(0, hit, visibility.trust(doubt))
+        distance = visibility.mahalanobis(own[:, None], colors / gains, self.color_precision)
+        return weights.index_copy(0, hit, visibility.trust(visibility.ambiguity(seen, distance)))
 
     @torch.no_grad()
     def _views(self, hit: torch.Tensor, rendered: Rendered, moment: Moment) -> tuple[torch.Tensor, torch.Tensor]:

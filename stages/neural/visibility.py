@@ -26,8 +26,6 @@ VISIBLE = 0.9
 _COLOR_VARIANCE_FLOOR = (1 / 255) ** 2
 # A covariance whose smallest eigenvalue is this small a part of the largest has no inverse worth the name.
 _SINGULAR = 1e-9
-# Least disagreement that photos of one place are taken to have, in standard deviations of the photos' colours.
-_SPREAD_FLOOR = 0.05
 # Smallest squared Mahalanobis distance: keeps the root's gradient finite where two colours agree.
 _SQUARED_DISTANCE_FLOOR = 1e-12
 
@@ -207,23 +205,6 @@ def ambiguity(visibility: torch.Tensor, distance: torch.Tensor) -> torch.Tensor:
     """
     seen = (visibility > VISIBLE).to(visibility.dtype)
     return (seen * visibility * distance).sum(1) / seen.sum(1).clamp(min=1)
-
-
-def outlier_ambiguity(visibility: torch.Tensor, own: torch.Tensor, views: torch.Tensor) -> torch.Tensor:
-    """lambda [R]: how far a photo is out of line with the others, in units of their own disagreement, less one.
-
-    max(0, d / s - 1) with d the distance of the photo's colour `own` [R, 3] from the median colour of the visible views
-    [R, I, 3], s the views' median distance from it, colours whitened by Sigma^-1/2. In place of the paper's mean
-    distance: that is as large where f is wrong and no two photos look at the same place, which is where the photos are
-    needed most. Zero there, and where fewer than three views are visible.
-    """
-    seen = visibility > VISIBLE
-    colors = views.masked_fill(~seen[..., None], torch.nan)
-    middle = colors.nanmedian(1).values
-    spread = torch.linalg.vector_norm(colors - middle[:, None], dim=2).nanmedian(1).values
-    distance = torch.linalg.vector_norm(own - middle, dim=1)
-    doubt = torch.relu(distance / (spread + _SPREAD_FLOOR) - 1)
-    return torch.where(seen.sum(1) >= 3, doubt, torch.zeros_like(doubt))
 
 
 def trust_literal(lambda_ambiguity: torch.Tensor) -> torch.Tensor:
