@@ -35,6 +35,7 @@ docs: venv
 	$(BIN)/python docs/make_reference.py
 	$(BIN)/python -m benchmarks.run_sets --table-only
 	$(BIN)/python -m benchmarks.ablate --table-only
+	$(BIN)/python -m benchmarks.hard_variants --table-only
 
 clean:
 	rm -rf .venv demo build dist *.egg-info

@@ -37,6 +37,18 @@ class SfmParams(Section):
     )
     exhaustive_max: int = Field(150, ge=2, description="auto matches all pairs up to this many photos")
     mapper: Literal["incremental", "global"] = Field("incremental", description="how poses are solved")
+    wanted: float = Field(
+        0.95,
+        ge=0,
+        le=1,
+        description="other ways are tried, one after another, until this part of the photos has a pose; 0: only the "
+        "first way",
+    )
+    masks: Literal["auto", "always", "never"] = Field(
+        "auto",
+        description="features on the object only, where masks exist; auto: where too few photos have a pose without. "
+        "always: for an object that was turned by hand",
+    )
     max_image_size: int = Field(1600, ge=100, description="features are found at this longest side, pixels")
     max_features: int = Field(8192, ge=100, description="SIFT features per image")
     camera_model: Literal["SIMPLE_RADIAL", "RADIAL", "OPENCV", "SIMPLE_PINHOLE", "PINHOLE"] = Field(

@@ -65,6 +65,10 @@ Time = Annotated[
     str | None, typer.Option(help="Training budget, like 5m or 90s: sets train.minutes.", show_default=False)
 ]
 NoGround = Annotated[bool, typer.Option("--no-ground", help="Cut off the ground or table: sets cleanup.remove_ground.")]
+Deterministic = Annotated[
+    bool,
+    typer.Option("--deterministic", help="The same poses every time, bit for bit, but slower: sfm.deterministic=true."),
+]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout.")]
 Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Say more.")]
 
@@ -152,6 +156,7 @@ def run(
     workers: Workers = None,
     time: Time = None,
     no_ground: NoGround = False,
+    deterministic: Deterministic = False,
     as_json: Json = False,
     verbose: Verbose = False,
 ) -> None:
@@ -167,7 +172,7 @@ def run(
         no_poses=no_poses,
         preset=preset,
         config=config,
-        sets=tuple(sets or ()),
+        sets=_settings(sets, deterministic),
         from_stage=from_stage,
         until=until,
         force=tuple(force or ()),
@@ -177,6 +182,11 @@ def run(
         no_ground=no_ground,
     )
     _run(context.obj, request, as_json, verbose)
+
+
+def _settings(sets: list[str] | None, deterministic: bool) -> tuple[str, ...]:
+    """Those of --set, and what a flag stands for."""
+    return (*(sets or ()), *(["sfm.deterministic=true"] if deterministic else []))
 
 
 def stage_command(stage: Stage) -> Callable[..., None]:
@@ -198,6 +208,7 @@ def stage_command(stage: Stage) -> Callable[..., None]:
         workers: Workers = None,
         time: Time = None,
         no_ground: NoGround = False,
+        deterministic: Deterministic = False,
         as_json: Json = False,
         verbose: Verbose = False,
     ) -> None:
@@ -212,7 +223,7 @@ def stage_command(stage: Stage) -> Callable[..., None]:
             no_poses=no_poses,
             preset=preset,
             config=config,
-            sets=tuple(sets or ()),
+            sets=_settings(sets, deterministic),
             until=stage.name,
             force=(stage.name,) if force else (),
             device=device,

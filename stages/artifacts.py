@@ -155,7 +155,8 @@ def model_path(folder: Path) -> Path:
 
 def save_registration(folder: Path, registration: dict[str, Any]) -> None:
     """{"registered": [names], "unregistered": [{"name", "reason"}], "mean_reprojection_error_px",
-    "num_points", "mapper", "matcher"}"""
+    "num_points", "mapper", "matcher", "kept": the attempt whose model this is, "ladder": [an attempt each, see
+    `stages.posing.ladder.Step`]}"""
     write_json(folder / REGISTRATION, registration)
 
 

@@ -13,7 +13,10 @@ from stages import artifacts
 from stages.artifacts import ImageRecord, ImageSet
 from stages.engine.stage import StageContext
 from stages.errors import InputError, ReconstructionError
-from stages.sfm import SFM, _camera_params, _Evidence
+from stages.posing.evidence import Evidence
+from stages.posing.ladder import Step
+from stages.posing.workbench import camera_params
+from stages.sfm import SFM
 
 WIDTH, HEIGHT, FOCAL = 320, 240, 350.0
 BOX = np.array([0.5, 0.35, 0.45])  # half sides; it stands on the floor z = 0
@@ -142,22 +145,22 @@ def test_photos_that_show_different_things(tmp_path: Path):
     assert "median 0 features" not in caught.value.message
 
 
-def test_too_few_registered_photos_are_an_error_with_numbers_and_a_command():
-    from stages.sfm import _check_enough
+def test_too_few_registered_photos_are_an_error_with_numbers_attempts_and_a_way_out():
+    from stages.sfm import _hint, _too_few, _tried
 
-    names = [f"{i}.jpg" for i in range(40)]
-    left_out = [{"name": name, "reason": "blurred"} for name in names[7:]]
-    with pytest.raises(ReconstructionError) as caught:
-        _check_enough(names[:7], left_out, names, "sequential", SfmParams(min_registered_ratio=0.5))
-    assert caught.value.message == (
-        "Only 7 of 40 photos were registered (need 20). E.g. 7.jpg: blurred; 8.jpg: blurred."
+    left_out = [{"name": f"{i}.jpg", "reason": "blurred"} for i in range(7, 40)]
+    steps = [Step("exhaustive matching", 7, 900, 0.5, 12.0, True), Step("global mapper", 0, 0, None, 3.0, False)]
+    error = _too_few(7, left_out, 20, _tried(steps), _hint(steps, SfmParams()))
+    assert error.message == (
+        "Only 7 of 40 photos were registered (need 20). E.g. 7.jpg: blurred; 8.jpg: blurred. Tried exhaustive "
+        "matching: 7 photos, 900 points, 0.50 px (12.0 s); global mapper: no model (3.0 s)."
     )
-    assert "--set sfm.matcher=exhaustive" in caught.value.hint
-    _check_enough(names[:20], left_out, names, "sequential", SfmParams(min_registered_ratio=0.5))
+    assert "Add photos between" in error.hint
+    assert "--set sfm.wanted=0.95" in _hint(steps[:1], SfmParams(wanted=0))
 
 
 def test_every_reason_for_a_photo_left_out():
-    evidence = _Evidence.__new__(_Evidence)
+    evidence = Evidence.__new__(Evidence)
     evidence.features = {"dark": 12, "lone": 900, "far": 900, "weak": 900, "pair": 900, "in": 900}
     evidence.pairs = {
         "dark": {}, "lone": {"in": 9}, "far": {"pair": 40}, "weak": {"in": 22}, "pair": {"far": 40}, "in": {"weak": 22},
@@ -176,6 +179,6 @@ def test_camera_parameters_are_what_colmap_expects(model: str):
     import pycolmap
 
     camera = pycolmap.Camera.create_from_model_name(1, model, 500.0, 320, 240)
-    assert camera.set_params_from_string(_camera_params(model, 444.0, 320, 240))
+    assert camera.set_params_from_string(camera_params(model, 444.0, 320, 240))
     assert camera.mean_focal_length() == pytest.approx(444.0)
     assert (camera.principal_point_x, camera.principal_point_y) == (160, 120)

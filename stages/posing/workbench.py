@@ -1,0 +1,522 @@
+"""The rungs of the ladder as COLMAP calls, on databases of features and matches that later rungs go on with.
+
+Every kind of features has a database of its own; pairs that were matched once are not matched again unless a rung
+matches them in another way.
+"""
+
+from __future__ import annotations
+
+import logging
+import shutil
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from stages.artifacts import ImageSet
+from stages.errors import InputError
+from stages.posing.evidence import MIN_PNP, MIN_VERIFIED
+from stages.posing.ladder import Rung, Solution
+
+log = logging.getLogger(__name__)
+
+DEFAULT_FOCAL_FACTOR = 1.2  # COLMAP's guess where nothing is known: focal = 1.2 x longest side (about 45 degrees)
+# A focal length that comes out this many times longer or shorter than the photos' EXIF says makes the EXIF doubtful:
+# rounding in EXIF costs a few percent, stabilised or cropped pictures up to a fifth.
+DOUBTFUL_FOCAL = 1.25
+# A match is stationary when it lies at the same place in both photos, within this many pixels (COLMAP's default).
+STATIONARY_PX = 4.0
+# A background that stands still while the object turns matches itself between most photos, also distant ones. Where
+# the camera moves, only photos that are nearly the same have such matches.
+STATIONARY_SHARE = 0.5
+# Affine features are also looked for where there is less contrast, this many times the usual threshold.
+AFFINE_PEAK = 0.5
+RELAXED = "relaxed thresholds"
+# Relaxed thresholds, with COLMAP's defaults: matches of a pair, 3D points that agree on a photo's position and their
+# share, matches and angle of the first pair.
+RELAXED_VERIFIED, RELAXED_PNP, RELAXED_PNP_SHARE = 10, 12, 0.1  # 15, 30, 0.25
+RELAXED_INIT_INLIERS, RELAXED_INIT_ANGLE_DEG = 40, 6.0  # 100, 16
+# Parts of an attempt's progress, from timings of 47-photo sets.
+PART_FEATURES, PART_MATCHES = 0.3, 0.7
+
+Progress = Callable[[float, float, str], None]
+
+
+@dataclass(frozen=True)
+class Base:
+    """What an attempt matches on: features, where they are looked for, and whether EXIF focal lengths are believed."""
+
+    affine: bool = False
+    masked: bool = False
+    focal_priors: bool = True
+
+    @property
+    def file(self) -> str:
+        parts = ["affine" if self.affine else "plain"]
+        parts += ["masked"] * self.masked + ["no-priors"] * (not self.focal_priors)
+        return "-".join(parts) + ".db"
+
+
+class Workbench:
+    """The photos of one capture, and one method for each rung.
+
+    Args:
+        work: empty folder.
+        images_folder, masks_folder: of the photos; masks are named as COLMAP wants them, PHOTO.png.
+        params: `configs.params.SfmParams`.
+        threads: for what depends on their number (matching, mapping). workers: for the rest.
+        cuda: whether to use a GPU.
+    """
+
+    def __init__(
+        self,
+        work: Path,
+        images_folder: Path,
+        masks_folder: Path,
+        image_set: ImageSet,
+        params: Any,
+        threads: int,
+        workers: int,
+        cuda: bool,
+        progress: Progress,
+    ) -> None:
+        import pycolmap
+
+        self.work, self.images_folder, self.masks_folder = work, images_folder, masks_folder
+        self.image_set, self.params = image_set, params
+        self.names = frozenset(record.name for record in image_set.images)
+        self.threads, self.workers = threads, workers
+        self.cuda = cuda and pycolmap.has_cuda
+        self._progress, self._rung = progress, ""
+        self._guided = self._relaxed = self._stationary = False
+        self._latest = Base(masked=params.masks == "always")
+        self._maps = 0
+        self._import(self._latest)
+        with pycolmap.Database.open(self.database(self._latest)) as database:
+            self.located = database.num_pose_priors()
+            cameras = [camera for camera in database.read_all_cameras() if camera.has_prior_focal_length]
+            self.priors = {camera.camera_id: camera.mean_focal_length() for camera in cameras}
+        self.matcher = choose_matcher(params, self.located, len(self.names))
+
+    def database(self, base: Base | None = None) -> Path:
+        """The file of one base; of the latest one without."""
+        return self.work / (base or self._latest).file
+
+    def rungs(self) -> list[Rung]:
+        """All attempts, the cheap and likely ones first."""
+        other = "global" if self.params.mapper == "incremental" else "incremental"
+        masked = self.params.masks == "auto" and all(record.has_mask for record in self.image_set.images)
+        return [
+            self._rung_of(f"{self.matcher} matching", self.first),
+            self._rung_of("all pairs", self.all_pairs, lambda best: self.matcher != "exhaustive"),
+            self._rung_of("no focal priors", self.no_focal_priors, self.priors_are_doubtful),
+            self._rung_of("features inside the masks", self.inside_masks, lambda best: masked),
+            self._rung_of("affine features", self.affine_features),
+            self._rung_of("guided matching", self.guided_matching),
+            self._rung_of(f"{other} mapper", self.other_mapper),
+            self._rung_of(RELAXED, self.relaxed_thresholds),
+        ]
+
+    def _rung_of(
+        self,
+        name: str,
+        attempt: Callable[[Solution | None], Solution | None],
+        applies: Callable[[Solution | None], bool] = lambda best: True,
+    ) -> Rung:
+        def named(best: Solution | None) -> Solution | None:
+            self._rung = name
+            return attempt(best)
+
+        return Rung(name, named, applies)
+
+    # ------------------------------------------------------------ rungs
+    def first(self, best: Solution | None) -> Solution | None:
+        """The chosen matcher and mapper."""
+        self._features_and_matches(self._latest, best)
+        return self._solve(self._latest, self.params.mapper)
+
+    def all_pairs(self, best: Solution | None) -> Solution | None:
+        """Photos left out against all others."""
+        base = self._base_of(best)
+        self._match_pairs(base, self._pairs_to_try(base, best))
+        return self._solve(base, self.params.mapper, best)
+
+    def no_focal_priors(self, best: Solution | None) -> Solution | None:
+        """The same matches, verified and mapped as if the photos carried no EXIF."""
+        source = self._base_of(best)
+        base = replace(source, focal_priors=False)
+        shutil.copyfile(self.database(source), self.database(base))
+        forget_focal_priors(self.database(base), self.params.camera_model)
+        self._verify_again(base)
+        return self._solve(base, self.params.mapper)
+
+    def inside_masks(self, best: Solution | None) -> Solution | None:
+        """Features on the object only: its surroundings may move."""
+        base = replace(self._base_of(best), masked=True)
+        self._features_and_matches(base, best)
+        return self._solve(base, self.params.mapper)
+
+    def affine_features(self, best: Solution | None) -> Solution | None:
+        """Features that follow tilted surfaces, and fainter ones.
+
+        On two views of carpet 50 degrees apart 57 matches became of 11, in 1.2 times the seconds. Pooling over sizes
+        makes it 111, but takes 2.5 times the seconds, and placed no photo that this did not.
+        """
+        base = replace(self._base_of(best), affine=True)
+        self._features_and_matches(base, best)
+        return self._solve(base, self.params.mapper)
+
+    def guided_matching(self, best: Solution | None) -> Solution | None:
+        """Photos left out against all others, with more matches along the epipolar lines that were found."""
+        self._guided = True
+        return self._match_anew(best)
+
+    def other_mapper(self, best: Solution | None) -> Solution | None:
+        """All poses at once instead of one after another, or the reverse."""
+        return self._solve(
+            self._base_of(best), "global" if self.params.mapper == "incremental" else "incremental"
+        )  # fmt: skip
+
+    def relaxed_thresholds(self, best: Solution | None) -> Solution | None:
+        """Photos left out are believed on fewer matches; the others stay where they are."""
+        self._relaxed = True
+        return self._match_anew(best)
+
+    def priors_are_doubtful(self, best: Solution | None) -> bool:
+        """There are EXIF focal lengths, and the poses do badly with them or contradict them."""
+        if not self.priors:
+            return False
+        return best is None or len(best.registered) < len(self.names) / 2 or bool(self.contradicted(best))
+
+    def contradicted(self, best: Solution) -> list[tuple[float, float]]:
+        """Focal lengths in pixels, as EXIF and as the poses have them, of the cameras where they differ much."""
+        pairs = [
+            (self.priors[i], camera.mean_focal_length())
+            for i, camera in best.model.cameras.items()
+            if i in self.priors
+        ]  # fmt: skip
+        return [(prior, found) for prior, found in pairs if max(found / prior, prior / found) > DOUBTFUL_FOCAL]
+
+    # ------------------------------------------------------------ what rungs share
+    def _base_of(self, best: Solution | None) -> Base:
+        """Rungs go on with what the best solution was found on; the latest where there is none."""
+        return self._latest if best is None else best.base
+
+    def _tell(self, part: float, note: str) -> None:
+        self._progress(part, 1, f"{self._rung}: {note}")
+
+    def _features_and_matches(self, base: Base, best: Solution | None) -> None:
+        self._latest = base
+        if not self.database(base).exists():
+            self._import(base)
+            if not base.focal_priors:
+                forget_focal_priors(self.database(base), self.params.camera_model)
+        self._tell(0.02, "features")
+        self._extract(base)
+        self._tell(PART_FEATURES, "matches")
+        self._match(base)
+        if not self._stationary and has_still_background(self.database(base)):
+            log.info("the background stands still while the object turns: its matches are left out")
+            self._stationary = True
+            self._verify_again(base)
+        if best is not None and self.matcher != "exhaustive":
+            self._match_pairs(base, self._pairs_to_try(base, best))
+        self._tell(PART_MATCHES, "poses")
+
+    def _match_anew(self, best: Solution | None) -> Solution | None:
+        """Match the pairs with photos left out as is set now, and map."""
+        import pycolmap
+
+        base = self._base_of(best)
+        pairs = self._pairs_to_try(base, best)
+        with pycolmap.Database.open(self.database(base)) as database:
+            for first, second in pairs:
+                if database.exists_two_view_geometry(first, second):
+                    database.delete_two_view_geometry(first, second)
+        self._match_pairs(base, pairs)
+        return self._solve(base, "incremental", best)
+
+    def _pairs_to_try(self, base: Base, best: Solution | None) -> list[tuple[int, int]]:
+        """Image ids of all pairs with a photo that has no pose; of all pairs where no photo has one."""
+        import pycolmap
+
+        registered = frozenset[str]() if best is None else best.registered
+        with pycolmap.Database.open(self.database(base)) as database:
+            images = sorted((image.image_id, image.name) for image in database.read_all_images())
+        return [
+            (first, second)
+            for (first, name), (second, other) in combinations(images, 2)
+            if name not in registered or other not in registered
+        ]
+
+    def _import(self, base: Base) -> None:
+        """One camera a group of photos that share intrinsics, with its focal prior."""
+        import pycolmap
+
+        path = self.database(base)
+        pycolmap.Database.open(path).close()  # creates it
+        groups: dict[str, list[Any]] = {}
+        for record in self.image_set.images:
+            groups.setdefault(record.camera, []).append(record)
+        for records in groups.values():
+            options = pycolmap.ImageReaderOptions()
+            options.camera_model = self.params.camera_model
+            priors = sorted(record.focal_px for record in records if record.focal_px is not None)
+            if priors:
+                # giving the parameters also marks the focal length as a prior that may be trusted
+                options.camera_params = camera_params(
+                    self.params.camera_model, priors[len(priors) // 2], records[0].width, records[0].height
+                )
+            options.default_focal_length_factor = DEFAULT_FOCAL_FACTOR
+            pycolmap.import_images(
+                path,
+                self.images_folder,
+                camera_mode=pycolmap.CameraMode.SINGLE,
+                image_names=[record.name for record in records],
+                options=options,
+            )
+
+    def _extract(self, base: Base) -> None:
+        """Features; finding them is deterministic with any number of threads."""
+        import pycolmap
+
+        options = pycolmap.FeatureExtractionOptions()
+        options.max_image_size = self.params.max_image_size
+        options.num_threads = self.workers
+        options.sift.max_num_features = self.params.max_features
+        if base.affine:  # the CPU's only
+            options.sift.estimate_affine_shape = True
+            options.sift.peak_threshold *= AFFINE_PEAK
+        options.use_gpu = self.cuda and not base.affine
+        reader = pycolmap.ImageReaderOptions()
+        if base.masked:
+            reader.mask_path = str(self.masks_folder)
+        pycolmap.extract_features(
+            self.database(base),
+            self.images_folder,
+            reader_options=reader,
+            extraction_options=options,
+            device=pycolmap.Device.cuda if options.use_gpu else pycolmap.Device.cpu,
+        )
+
+    def _matching_options(self) -> dict[str, Any]:
+        import pycolmap
+
+        matching = pycolmap.FeatureMatchingOptions()
+        matching.num_threads = self.threads
+        matching.use_gpu = self.cuda
+        matching.guided_matching = self._guided
+        device = pycolmap.Device.cuda if self.cuda else pycolmap.Device.cpu
+        return {"matching_options": matching, "verification_options": self._verification(), "device": device}
+
+    def _verification(self) -> Any:
+        import pycolmap
+
+        verification = pycolmap.TwoViewGeometryOptions()
+        verification.min_num_inliers = RELAXED_VERIFIED if self._relaxed else MIN_VERIFIED
+        verification.ransac.random_seed = self.params.seed
+        verification.filter_stationary_matches = self._stationary
+        verification.stationary_matches_max_error = STATIONARY_PX
+        return verification
+
+    def _match(self, base: Base) -> None:
+        import pycolmap
+
+        matchers: dict[str, Any] = {
+            "exhaustive": pycolmap.match_exhaustive,
+            "spatial": pycolmap.match_spatial,
+            "sequential": pycolmap.match_sequential,
+        }
+        matchers[self.matcher](self.database(base), **self._matching_options())
+
+    def _match_pairs(self, base: Base, pairs: Iterable[tuple[int, int]]) -> None:
+        """Match and verify pairs of image ids; those that are verified already are left as they are."""
+        import pycolmap
+
+        self._tell(PART_FEATURES, "matches")
+        path = self.database(base)
+        listed = path.with_suffix(".pairs.txt")
+        listed.write_text("".join(f"{first} {second}\n" for first, second in pairs), encoding="utf-8")
+        pairing = pycolmap.ImportedPairingOptions()
+        pairing.match_list_path = str(listed)
+        with _named_by_number(path):
+            pycolmap.match_image_pairs(path, pairing_options=pairing, **self._matching_options())
+        self._tell(PART_MATCHES, "poses")
+
+    def _verify_again(self, base: Base) -> None:
+        """Judge the matches there are by the verification options of now."""
+        import pycolmap
+
+        with pycolmap.Database.open(self.database(base)) as database:
+            database.clear_two_view_geometries()
+        options = pycolmap.GeometricVerifierOptions()
+        options.num_threads = self.threads
+        pycolmap.geometric_verification(
+            self.database(base), verifier_options=options, two_view_geometry_options=self._verification()
+        )
+
+    # ------------------------------------------------------------ poses
+    def _solve(self, base: Base, mapper: str, start: Solution | None = None) -> Solution | None:
+        """Map, and pick the largest model.
+
+        A start that was found on the same features and has most photos is gone on with; else all begins anew.
+        """
+        self._latest = base
+        out = self.work / f"models-{self._maps}"
+        self._maps += 1
+        out.mkdir()
+        if mapper == "global":
+            models = self._map_global(base, out)
+        else:
+            continued = start is not None and start.base == base and 2 * len(start.registered) > len(self.names)
+            models = self._map_incremental(base, out, start if continued else None)
+        if not models:
+            return None
+        largest = max(models, key=lambda model: (model.num_reg_images(), model.num_points3D()))
+        return Solution(
+            registered=_names(largest),
+            points=largest.num_points3D(),
+            error_px=float(largest.compute_mean_reprojection_error()),
+            others=tuple(_names(model) for model in models if model is not largest),
+            model=largest,
+            base=base,
+        )
+
+    def _map_global(self, base: Base, out: Path) -> list[Any]:
+        import pycolmap
+
+        path = self.database(base)
+        if not (base.focal_priors and self.priors):  # it needs focal lengths; the database of the others stays as it is
+            path = out / path.name
+            shutil.copyfile(self.database(base), path)
+            pycolmap.calibrate_view_graph(path)
+        options = pycolmap.GlobalPipelineOptions()
+        options.num_threads, options.random_seed = self.threads, self.params.seed
+        return list(pycolmap.global_mapping(path, self.images_folder, out, options).values())
+
+    def _map_incremental(self, base: Base, out: Path, start: Solution | None) -> list[Any]:
+        import pycolmap
+
+        options, seed = pycolmap.IncrementalPipelineOptions(), self.params.seed
+        options.num_threads, options.random_seed = self.threads, seed
+        options.mapper.num_threads, options.mapper.random_seed = self.threads, seed
+        options.triangulation.random_seed = seed
+        options.min_model_size = 3  # small captures are captures too
+        options.extract_colors = False
+        options.mapper.abs_pose_min_num_inliers = MIN_PNP
+        if self._relaxed:
+            options.min_num_matches = RELAXED_VERIFIED
+            options.mapper.abs_pose_min_num_inliers = RELAXED_PNP
+            options.mapper.abs_pose_min_inlier_ratio = RELAXED_PNP_SHARE
+            options.mapper.init_min_num_inliers = RELAXED_INIT_INLIERS
+            options.mapper.init_min_tri_angle = RELAXED_INIT_ANGLE_DEG
+        placed, total, input_path = 2, len(self.names), ""
+        if start is not None:
+            input_path = str(out / "start")
+            Path(input_path).mkdir()
+            start.model.write(input_path)
+            placed = len(start.registered)
+
+        def one_more() -> None:
+            nonlocal placed
+            placed += 1
+            part = min(1.0, placed / max(total, 1))
+            self._tell(PART_MATCHES + (1 - PART_MATCHES) * part, f"{min(placed, total)} of {total} photos placed")
+
+        models = pycolmap.incremental_mapping(
+            self.database(base),
+            self.images_folder,
+            out,
+            options,
+            input_path=input_path,
+            next_image_callback=one_more,
+        )
+        return list(models.values())
+
+
+# ---------------------------------------------------------------- on databases
+def choose_matcher(params: Any, located: int, num_images: int) -> str:
+    """auto: all pairs of small sets, neighbours in space where most photos carry GPS, else in name.
+
+    Raises:
+        InputError: spatial matching is asked for and no photo carries GPS.
+    """
+    if params.matcher == "spatial" and located == 0:
+        raise InputError(
+            f"None of the {num_images} photos carries a GPS position, which spatial matching needs.",
+            "Try `--set sfm.matcher=sequential`, or exhaustive.",
+        )
+    if params.matcher != "auto":
+        return params.matcher
+    if num_images <= params.exhaustive_max:
+        return "exhaustive"
+    return "spatial" if located > 0.9 * num_images else "sequential"
+
+
+def camera_params(model: str, focal: float, width: int, height: int) -> str:
+    """COLMAP's parameter list: focal length(s), principal point at the middle, no distortion."""
+    focals = 2 if model in ("PINHOLE", "OPENCV") else 1
+    distortions = {"SIMPLE_PINHOLE": 0, "PINHOLE": 0, "SIMPLE_RADIAL": 1, "RADIAL": 2, "OPENCV": 4}[model]
+    values = [focal] * focals + [width / 2, height / 2] + [0.0] * distortions
+    return ",".join(f"{value:.8g}" for value in values)
+
+
+def forget_focal_priors(path: Path, model: str) -> None:
+    """Set all cameras of a database to COLMAP's guess of the focal length, as one that is not known."""
+    import pycolmap
+
+    with pycolmap.Database.open(path) as database:
+        for camera in database.read_all_cameras():
+            focal = DEFAULT_FOCAL_FACTOR * max(camera.width, camera.height)
+            camera.set_params_from_string(camera_params(model, focal, camera.width, camera.height))
+            camera.has_prior_focal_length = False
+            database.update_camera(camera)
+
+
+def has_still_background(path: Path) -> bool:
+    """Whether most pairs of photos that match have many matches at one and the same place of the frame."""
+    import pycolmap
+
+    with pycolmap.Database.open(path) as database:
+        places = {
+            image.image_id: database.read_keypoints(image.image_id)[:, :2] for image in database.read_all_images()
+        }
+        pair_ids, matches = database.read_all_matches()
+    matched = still = 0
+    for pair_id, indices in zip(pair_ids, matches, strict=True):
+        if len(indices) < MIN_VERIFIED:
+            continue
+        first, second = pycolmap.pair_id_to_image_pair(pair_id)
+        moved = np.linalg.norm(places[first][indices[:, 0]] - places[second][indices[:, 1]], axis=1)
+        matched += 1
+        still += int((moved <= STATIONARY_PX).sum() >= MIN_VERIFIED)
+    return matched > 0 and still > STATIONARY_SHARE * matched
+
+
+@contextmanager
+def _named_by_number(path: Path) -> Iterator[None]:
+    """Images carry their ids as names for a while: COLMAP's lists of pairs take no names with spaces."""
+    import pycolmap
+
+    def rename(names: dict[int, str]) -> None:
+        with pycolmap.Database.open(path) as database:
+            for image_id, name in names.items():
+                image = database.read_image(image_id)
+                image.name = name
+                database.update_image(image)
+
+    with pycolmap.Database.open(path) as database:
+        names = {image.image_id: image.name for image in database.read_all_images()}
+    rename({image_id: str(image_id) for image_id in names})
+    try:
+        yield
+    finally:
+        rename(names)
+
+
+def _names(model: Any) -> frozenset[str]:
+    return frozenset(model.images[i].name for i in model.reg_image_ids())

@@ -1,0 +1,187 @@
+"""The ladder's decisions with stubbed attempts, and what its rungs do on databases and small captures."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from configs.params import SfmParams
+from stages.posing.ladder import Rung, Solution, Step, better, climb, describe, photos_wanted
+from stages.posing.workbench import Base, forget_focal_priors, has_still_background
+
+
+def solution(count: int, error: float = 0.5) -> Solution:
+    return Solution(frozenset(f"{i}.jpg" for i in range(count)), 100 * count, error)
+
+
+class Stub:
+    """Rungs that find models of the sizes given (None: no model), and remember what they were handed."""
+
+    def __init__(self, *found: int | Exception | None, applies=lambda best: True):
+        self.handed: list[int | None] = []
+        self.rungs = [Rung(f"rung {i}", self._attempt(each), applies) for i, each in enumerate(found)]
+
+    def _attempt(self, found):
+        def attempt(best):
+            self.handed.append(None if best is None else len(best.registered))
+            if isinstance(found, Exception):
+                raise found
+            return None if found is None else solution(found)
+
+        return attempt
+
+
+# ---------------------------------------------------------------- decisions
+def test_a_set_that_is_whole_at_the_first_rung_takes_no_other():
+    stub = Stub(20, 20, 20)
+    best, steps = climb(stub.rungs, 20, 6)
+    assert len(best.registered) == 20
+    assert [step.rung for step in steps] == ["rung 0"]
+
+
+def test_rungs_are_taken_until_enough_photos_are_placed_and_each_gets_the_best_so_far():
+    stub = Stub(None, 9, 4, 19, 20)
+    best, steps = climb(stub.rungs, 19, 6)
+    assert stub.handed == [None, None, 9, 9]
+    assert len(best.registered) == 19
+    assert [step.kept for step in steps] == [False, True, False, True]
+    assert [step.registered for step in steps] == [0, 9, 4, 19]
+    assert steps[0].error_px is None
+
+
+def test_two_fruitless_rungs_end_the_climb_where_enough_is_placed_and_only_there():
+    _, steps = climb(Stub(12, 12, 11, 20).rungs, 20, 10)
+    assert len(steps) == 3
+    best, steps = climb(Stub(8, 8, 7, 20).rungs, 20, 10)
+    assert len(steps) == 4
+    assert len(best.registered) == 20
+    # one that places a photo begins the count anew
+    _, steps = climb(Stub(12, 12, 13, 13, 13, 20).rungs, 20, 10)
+    assert len(steps) == 5
+
+
+def test_no_rung_finds_anything():
+    best, steps = climb(Stub(None, None).rungs, 5, 3)
+    assert best is None
+    assert len(steps) == 2
+
+
+def test_a_rung_that_does_not_apply_is_left_out_and_asked_with_the_best_so_far():
+    stub = Stub(5, 9)
+    asked = []
+    stub.rungs[1] = Rung("other", stub.rungs[1].attempt, lambda best: asked.append(best) or False)
+    best, steps = climb(stub.rungs, 9, 3)
+    assert len(best.registered) == 5
+    assert len(steps) == 1
+    assert asked == [best]
+
+
+def test_a_later_rung_that_breaks_is_noted_and_the_first_one_is_not_hidden():
+    best, steps = climb(Stub(5, RuntimeError("Check failed:\n x"), 9).rungs, 9, 3)
+    assert len(best.registered) == 9
+    assert steps[1].note == "Check failed: x"
+    assert describe(steps[1]).startswith("rung 1: Check failed: x (")
+    with pytest.raises(RuntimeError):
+        climb(Stub(RuntimeError("broken"), 9).rungs, 9, 3)
+
+
+def test_none_wanted_takes_the_first_rung_only():
+    _, steps = climb(Stub(None, 9).rungs, 0, 3)
+    assert len(steps) == 1
+
+
+def test_photos_come_before_error():
+    assert better(solution(5, 0.9), solution(4, 0.1))
+    assert better(solution(5, 0.4), solution(5, 0.5))
+    assert not better(solution(5, 0.5), solution(5, 0.5))
+    assert not better(None, solution(1))
+    assert better(solution(1), None)
+
+
+@pytest.mark.parametrize(("total", "wanted"), [(3, 3), (16, 16), (20, 19), (47, 45), (49, 47), (100, 95)])
+def test_photos_wanted(total: int, wanted: int):
+    assert photos_wanted(total, 0.95) == wanted
+    assert photos_wanted(total, 0) == 0
+
+
+def test_seconds_are_those_of_the_attempt():
+    ticks = iter([1.0, 4.5])
+    _, steps = climb(Stub(5).rungs, 5, 3, lambda: next(ticks))
+    assert steps == [Step("rung 0", 5, 500, 0.5, 3.5, True)]
+
+
+# ---------------------------------------------------------------- databases
+def database(path: Path, places: dict[str, np.ndarray], pairs: list[tuple[int, int]]) -> Path:
+    """Photos of one camera whose k-th features all match."""
+    import pycolmap
+
+    with pycolmap.Database.open(path) as opened:
+        camera = pycolmap.Camera.create_from_model_name(0, "SIMPLE_RADIAL", 900.0, 640, 480)
+        camera.has_prior_focal_length = True
+        camera_id = opened.write_camera(camera)
+        ids = []
+        for name, keypoints in places.items():
+            ids.append(opened.write_image(pycolmap.Image(name=name, camera_id=camera_id)))
+            opened.write_keypoints(ids[-1], keypoints.astype(np.float32))
+        matches = np.stack([np.arange(len(keypoints))] * 2, 1).astype(np.uint32)
+        for first, second in pairs:
+            opened.write_matches(ids[first], ids[second], matches)
+    return path
+
+
+def turntable(shift: float) -> dict[str, np.ndarray]:
+    """20 features that stand still, and 20 that move by `shift` pixels from photo to photo."""
+    still, moving = np.random.default_rng(0).uniform(0, 400, (2, 20, 2))
+    return {f"a photo {i}.jpg": np.concatenate([still, moving + np.array([shift * i, 0])]) for i in range(4)}
+
+
+def test_a_background_that_stands_still_is_seen_and_one_that_moves_along_is_not(tmp_path: Path):
+    neighbours, all_pairs = [(0, 1), (1, 2), (2, 3)], [(i, j) for j in range(4) for i in range(j)]
+    assert has_still_background(database(tmp_path / "a.db", turntable(30), all_pairs))
+    moved = {name: places + 30 * i for i, (name, places) in enumerate(turntable(30).items())}
+    assert not has_still_background(database(tmp_path / "b.db", moved, all_pairs))
+    # one pair of photos that are nearly the same is no turntable
+    moved["a photo 1.jpg"] = moved["a photo 0.jpg"] + 1
+    assert not has_still_background(database(tmp_path / "c.db", moved, neighbours))
+    assert not has_still_background(database(tmp_path / "d.db", turntable(30), []))
+
+
+def test_focal_priors_are_forgotten(tmp_path: Path):
+    import pycolmap
+
+    path = database(tmp_path / "a.db", turntable(30), [])
+    forget_focal_priors(path, "SIMPLE_RADIAL")
+    with pycolmap.Database.open(path) as opened:
+        (camera,) = opened.read_all_cameras()
+    assert not camera.has_prior_focal_length
+    assert camera.mean_focal_length() == pytest.approx(1.2 * 640)
+
+
+def test_names_with_spaces_survive_a_list_of_pairs(tmp_path: Path):
+    import pycolmap
+
+    from stages.posing.workbench import _named_by_number
+
+    path = database(tmp_path / "a.db", turntable(30), [])
+    with _named_by_number(path), pycolmap.Database.open(path) as opened:
+        assert sorted(image.name for image in opened.read_all_images()) == ["1", "2", "3", "4"]
+    with pycolmap.Database.open(path) as opened:
+        assert sorted(image.name for image in opened.read_all_images()) == sorted(turntable(30))
+
+
+def test_every_base_has_a_database_of_its_own():
+    bases = [Base(a, m, f) for a in (False, True) for m in (False, True) for f in (False, True)]
+    assert len({base.file for base in bases}) == 8
+
+
+def test_always_inside_the_masks_needs_masks(tmp_path: Path):
+    from stages.artifacts import ImageRecord, ImageSet
+    from stages.errors import InputError
+    from stages.sfm import _check_masks
+
+    images = ImageSet((ImageRecord("a.jpg", "a.jpg", 64, 64, None, "c", 1.0, False, "0"),))
+    with pytest.raises(InputError, match=r"1 of 1 photos have no mask, e\.g\. a\.jpg"):
+        _check_masks(images, SfmParams(masks="always"))
+    _check_masks(images, SfmParams())
