@@ -173,17 +173,17 @@ def find_region(
     if len(cameras) < 2:
         raise ValueError(f"got {len(cameras)} cameras, expected at least 2")
     found = _object_sphere(cameras)
-    if found is not None and (len(points) < MIN_JUDGED or present_share(cameras, points, found[0]) >= MIN_PRESENT):
-        center, seen_whole = found
-        if masks is not None and any(mask is not None for mask in masks):
-            # The silhouettes may be larger than what every view shows whole: look in a cube twice as wide.
-            hull = visual_hull_sphere(cameras, masks, center, 2.0 * SEEN_WHOLE_MARGIN * seen_whole)
-            if hull is not None:
-                return RegionOfInterest(hull[0], hull[1] * HULL_MARGIN, "object", "the visual hull of the masks")
+    if found is not None and len(points) >= MIN_JUDGED and present_share(cameras, points, found[0]) < MIN_PRESENT:
+        found = None
+    if found is not None and masks is not None and any(mask is not None for mask in masks):
+        # The silhouettes may be larger than what every view shows whole: look in a cube twice as wide.
+        hull = visual_hull_sphere(cameras, masks, found[0], 2.0 * SEEN_WHOLE_MARGIN * found[1])
+        if hull is not None:
+            return RegionOfInterest(hull[0], hull[1] * HULL_MARGIN, "object", "the visual hull of the masks")
     if stated is not None:
         return stated
     if found is not None:
-        return RegionOfInterest(center, SEEN_WHOLE_MARGIN * seen_whole, "object", FROM_FRUSTA)
+        return RegionOfInterest(found[0], SEEN_WHOLE_MARGIN * found[1], "object", FROM_FRUSTA)
     if len(points) == 0:
         raise ValueError("got 0 sparse points and optical axes that do not meet, expected either")
     from scipy.spatial import cKDTree
