@@ -27,6 +27,11 @@ class IngestParams(Section):
     video_frames: int = Field(
         80, ge=2, description="at most this many frames of a video become photos: spread by motion, the sharpest ones"
     )
+    auto_mask: Literal["off", "plain"] = Field(
+        "off",
+        description="plain: photos without a mask get one from their plain background (black cloth, white sweep, "
+        "chroma key); an error where it is not plain",
+    )
 
 
 class SfmParams(Section):

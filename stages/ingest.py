@@ -8,10 +8,12 @@ and counted, never fatal by themselves.
 from __future__ import annotations
 
 import logging
+import math
 import shutil
 from collections import Counter
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import Any, TypeVar
 
@@ -19,6 +21,7 @@ import numpy as np
 
 from stages import artifacts
 from stages.artifacts import ImageRecord, ImageSet, SkippedImage
+from stages.capture.background import find_background, object_mask
 from stages.capture.exif import ORIENTATION, camera_key, focal_px, gps_position
 from stages.capture.listing import list_captures
 from stages.capture.masks import check_size, match_masks, read_mask, write_mask
@@ -34,6 +37,7 @@ from stages.posing.reading import read_poses
 
 log = logging.getLogger(__name__)
 
+PLAIN_PHOTOS = 0.9  # this part of the photos must have a plain background before masks are made from it
 JPEG_QUALITY = 97  # re-encoded lossy photos; visually lossless, about a third of PNG's size
 NAMED_IN_ERRORS = 3  # this many file names are spelt out in an error message
 
@@ -88,6 +92,9 @@ def run(context: StageContext) -> dict[str, Any]:
     outcomes = _in_threads(take, unique, context.workers)
     images = sorted((o for o in outcomes if isinstance(o, ImageRecord)), key=lambda record: record.name)
     skipped += [o for o in outcomes if isinstance(o, SkippedImage)]
+    if params.auto_mask == "plain":
+        images, without = _mask_plain_backgrounds(images, context)
+        skipped += without
     skipped.sort(key=lambda item: item.source)
 
     if len(images) < params.min_images:
@@ -214,6 +221,38 @@ class _Names:
 def _in_threads(function: Callable[[Item], Result], items: Iterable[Item], workers: int) -> list[Result]:
     with ThreadPoolExecutor(max_workers=max(1, workers)) as pool:
         return list(pool.map(function, items))
+
+
+def _mask_plain_backgrounds(
+    images: list[ImageRecord], context: StageContext
+) -> tuple[list[ImageRecord], list[SkippedImage]]:
+    """Masks for the photos that have none; the few whose background is not plain are left out.
+
+    Raises:
+        InputError: those are not few.
+    """
+    bare = [record for record in images if not record.has_mask]
+
+    def masked(record: ImageRecord) -> bool:
+        rgb = artifacts.load_image(context.out, record.name)
+        background = find_background(rgb)
+        mask = object_mask(rgb, background) if background.is_plain else None
+        if mask is not None:
+            write_mask(mask, artifacts.mask_path(context.out, record.name), (record.width, record.height))
+        return mask is not None
+
+    found = dict(zip((record.name for record in bare), _in_threads(masked, bare, context.workers), strict=True))
+    left_out = [record for record in bare if not found[record.name]]
+    if len(left_out) > (1 - PLAIN_PHOTOS) * len(bare):
+        raise InputError(
+            f"The background is plain in {len(bare) - len(left_out)} of {len(bare)} photos (need "
+            f"{math.ceil(PLAIN_PHOTOS * len(bare))}), for example not in {left_out[0].source}.",
+            "Run with `--set ingest.auto_mask=off`, or give masks: `--masks FOLDER`.",
+        )
+    for record in left_out:
+        artifacts.image_path(context.out, record.name).unlink()
+    kept = [replace(record, has_mask=True) for record in images if record not in left_out]
+    return kept, [SkippedImage(record.source, "its background is not plain") for record in left_out]
 
 
 # ---------------------------------------------------------------- one photo
