@@ -316,6 +316,9 @@ def describe_photos(ingest: Path, sfm: Path, most: int) -> dict[str, Any]:
             {"name": name, "image": image, "registered": name not in reasons, "reason": reasons.get(name, "")}
         )
     summary = f"{len(names) - len(reasons)} of {len(names)} photos were placed."
+    attempts = [f"{step['rung']} {step['registered']}" for step in registration.get("ladder", [])]
+    if len(attempts) > 1:
+        summary += f" Attempts, with the photos each placed: {', '.join(attempts)}."
     if len(names) > most:
         summary += f" The first {most} are shown."
     return {

@@ -33,7 +33,7 @@ def texture(seed: int) -> np.ndarray:
     return np.clip((mixed - 0.5) * 3 + 0.5, 0, 1) * 255
 
 
-TEXTURES = [texture(seed) for seed in range(4)]  # floor, and the faces across x, y, z
+TEXTURES = {seed: texture(seed) for seed in range(4)}  # floor, and the faces across x, y, z
 
 
 def render(cam_from_world: np.ndarray, seed: int) -> np.ndarray:
@@ -101,9 +101,10 @@ def test_rendered_capture_gives_back_its_cameras(tmp_path: Path):
     photos = [render(pose, i) for i, pose in enumerate(poses)]
     # one photo of something else, which cannot be placed
     photos.append(cv2.resize(texture(99), (WIDTH, HEIGHT)).astype(np.uint8))
-    numbers, out = run_sfm(ingested(tmp_path / "ingest", photos, FOCAL), tmp_path, deterministic=True)
+    numbers, out = run_sfm(ingested(tmp_path / "ingest", photos, FOCAL), tmp_path, deterministic=True, wanted=0.9)
 
     assert numbers["registered"] == len(poses)
+    assert numbers["attempts"] == 1
     registration = artifacts.load_registration(out)
     assert registration["matcher"] == "exhaustive"
     assert [item["name"] for item in registration["unregistered"]] == [f"{len(poses):03d}.png"]
@@ -120,6 +121,44 @@ def test_rendered_capture_gives_back_its_cameras(tmp_path: Path):
     for name, pose in zip(names, poses, strict=True):
         difference = found[name][:, :3] @ true_from_found.rotation.matrix().T @ pose[:, :3].T
         assert np.degrees(np.arccos(np.clip((np.trace(difference) - 1) / 2, -1, 1))) < 1.0
+
+
+def orbit(count: int, step_deg: float) -> list[np.ndarray]:
+    angles = np.radians(step_deg * np.arange(count))
+    centers = [np.array([2.6 * np.cos(a), 2.6 * np.sin(a), 1.5 + 0.3 * (i % 2)]) for i, a in enumerate(angles)]
+    return [look_at(center, np.array([0, 0, 0.35])) for center in centers]
+
+
+def test_a_background_that_stands_still_behind_a_turntable_does_not_matter(tmp_path: Path, monkeypatch):
+    poses = orbit(8, 10)
+    background = cv2.resize(texture(7), (WIDTH, HEIGHT)).astype(np.uint8)
+    photos = []
+    for i, pose in enumerate(poses):
+        shown = []
+        for floor in (0.0, 255.0):
+            monkeypatch.setitem(TEXTURES, 0, np.full((256, 256), floor, np.float32))
+            shown.append(render(pose, i))
+        on_floor = np.abs(shown[0].astype(int) - shown[1]) > 128
+        photos.append(np.where(on_floor, background, shown[0]))
+    numbers, _ = run_sfm(ingested(tmp_path / "ingest", photos, FOCAL), tmp_path, wanted=0)
+    assert numbers["registered"] == len(poses)
+    assert abs(numbers["focal_px"][0] / FOCAL - 1) < 0.1
+
+
+@pytest.mark.slow
+def test_two_deterministic_runs_give_the_same_model_bit_for_bit(tmp_path: Path):
+    photos = [render(pose, i) for i, pose in enumerate(orbit(5, 12))]
+    photos.append(cv2.resize(texture(99), (WIDTH, HEIGHT)).astype(np.uint8))  # so that other rungs are taken
+    ingest = ingested(tmp_path / "ingest", photos, FOCAL)
+    models = []
+    for run in ("a", "b"):
+        (tmp_path / run).mkdir()
+        numbers, out = run_sfm(ingest, tmp_path / run, deterministic=True)
+        assert numbers["registered"] == 5
+        assert numbers["attempts"] > 1
+        models.append({path.name: path.read_bytes() for path in sorted(artifacts.model_path(out).iterdir())})
+    assert len(models[0]) >= 3
+    assert models[0] == models[1]
 
 
 def test_photos_of_plain_walls(tmp_path: Path):
