@@ -217,9 +217,10 @@ class TrainParams(Section):
         "analytic", description="SDF gradients by differentiation, or central differences one active voxel to each side"
     )
     sphere_radius: float = Field(0.5, gt=0, lt=1, description="the SDF is this sphere before training, scene units")
-    init: Literal["sphere", "hull"] = Field(
-        "sphere",
-        description="the SDF before training: a sphere, or the visual hull of the masks (every photo needs one)",
+    init: Literal["auto", "sphere", "room", "hull"] = Field(
+        "auto",
+        description="the SDF before training: that sphere, a room around the cameras, or the visual hull of masks (one "
+        "for each photo); auto: a room where most cameras stand in that sphere, else it",
     )
 
     density: Literal["laplace", "neus"] = Field(

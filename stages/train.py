@@ -49,8 +49,8 @@ def run(context: StageContext) -> dict[str, Any]:
     checkpoint = artifacts.checkpoint_path(context.scratch)
     metrics = artifacts.metrics_path(context.scratch)
     spent = _resume(trainer, checkpoint, metrics)
-    if params.init == "hull" and trainer.step_index == 0:
-        _start_from_hull(trainer, scene.cameras)
+    if trainer.step_index == 0:
+        _start_from_shape(trainer, scene.cameras)
     started = saved = time.monotonic()
     previewed = _progress(trainer.step_index, spent, params)
     with metrics.open("a", encoding="utf-8") as lines:
@@ -111,8 +111,22 @@ def _load_images(folder: Path, names: tuple[str, ...]) -> tuple[Iterator[np.ndar
     return images, masks if masked == len(names) else None
 
 
-def _start_from_hull(trainer: Any, cameras: PinholeCameras) -> None:
-    """The SDF starts as the visual hull of the masks of the photos that are trained on.
+def _start_from_shape(trainer: Any, cameras: PinholeCameras) -> None:
+    """Where training is not to start from a sphere: bring the SDF to a room, or to the visual hull of the masks."""
+    from stages.geometry.hull import room_distances
+
+    params = trainer.params
+    inside = np.linalg.norm(cameras.centers, axis=1) < params.sphere_radius
+    if params.init == "hull":
+        error = trainer.start_from(_hull(cameras, trainer.photos))
+        log.info("the SDF starts from the masks' visual hull, met to %.4f on average", error)
+    elif params.init == "room" or (params.init == "auto" and inside.mean() > 0.5):
+        error = trainer.start_from(room_distances())
+        log.info("the SDF starts from a room around the cameras, met to %.4f on average", error)
+
+
+def _hull(cameras: PinholeCameras, photos: Any) -> np.ndarray:
+    """Signed distances to the visual hull of the masks of the photos that are trained on.
 
     Raises:
         InputError: a photo has no mask, or the masks leave nothing.
@@ -120,16 +134,13 @@ def _start_from_hull(trainer: Any, cameras: PinholeCameras) -> None:
     from stages.geometry.hull import hull_distances
 
     advice = "Give a mask for each photo (`--masks FOLDER`), or start from a sphere: `--set train.init=sphere`."
-    photos = trainer.photos
     if photos.masks is None:
         raise InputError(f"`train.init` = hull needs masks for all {len(cameras)} photos, and some have none.", advice)
     masks = [photos.mask(i) if training else None for i, training in enumerate(photos.training.tolist())]
     distances = hull_distances(cameras, masks)
     if distances is None:
-        raise InputError(
-            f"The masks of {len(cameras)} photos have no visual hull within the region of interest.", advice
-        )
-    log.info("the SDF starts from the masks' visual hull, met to %.4f on average", trainer.start_from(distances))
+        raise InputError(f"The {len(cameras)} masks have no visual hull within the region of interest.", advice)
+    return distances
 
 
 def _check_hold_out(num_photos: int, num_held_out: int, every: int) -> None:

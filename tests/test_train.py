@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -299,10 +300,10 @@ def test_the_hull_of_a_ball_is_a_little_more_than_the_ball():
     assert hull_distances(cameras, [np.zeros((40, 48), np.uint8)] * 16, cells=20) is None
 
 
-def test_training_can_start_from_the_hull(caplog):
-    trainer = make_trainer(TINY.model_copy(update={"sphere_radius": 0.8}), masks=True)
+def test_training_can_start_from_the_hull():
+    trainer = make_trainer(TINY.model_copy(update={"sphere_radius": 0.8, "init": "hull"}), masks=True)
     cameras = ring_of_cameras()
-    train._start_from_hull(trainer, cameras)
+    train._start_from_shape(trainer, cameras)
     levels = trainer.moment(0.0).levels
     points = torch.nn.functional.normalize(torch.randn(300, 3, generator=torch.Generator().manual_seed(0)), dim=1)
     with torch.no_grad():
@@ -312,6 +313,21 @@ def test_training_can_start_from_the_hull(caplog):
     assert all(len(state) == 0 for state in trainer.optimizer.state.values())
     numbers = trainer.step(0.0)
     assert np.isfinite(float(numbers["loss"]))
+
+
+@pytest.mark.parametrize(("distance", "room"), [(0.3, True), (2.5, False)])
+def test_cameras_inside_the_sphere_start_in_a_free_room(distance, room):
+    cameras = ring_of_cameras()
+    pose = cameras.cam_from_scene.copy()
+    pose[:, :, 3] *= distance / np.linalg.norm(cameras.centers, axis=1)[:, None]
+    trainer = make_trainer()
+    train._start_from_shape(trainer, replace(cameras, cam_from_scene=pose))
+    middle = torch.nn.functional.normalize(torch.randn(100, 3, generator=torch.Generator().manual_seed(0)), dim=1)
+    with torch.no_grad():
+        levels = trainer.moment(0.0).levels
+        within = trainer.fields.sdf.sdf(0.3 * middle, levels)
+        assert within.min() > 0.3 if room else within.max() < 0
+        assert (trainer.fields.sdf.sdf(middle, levels).max() < 0) == room
 
 
 def test_a_hull_without_masks_is_refused(tmp_path):

@@ -1,4 +1,4 @@
-"""The visual hull: the largest shape that silhouettes allow."""
+"""Shapes to start from: the visual hull, which is the largest that silhouettes allow, and a room."""
 
 from __future__ import annotations
 
@@ -13,6 +13,8 @@ from stages.geometry.cameras import PinholeCameras
 HULL_AGREEMENT = 0.9
 HULL_CELLS = 48
 DISTANCE_CELLS = 64
+# A room's walls before training, in radii of the region: most of it is free, and the sphere lies behind them.
+ROOM_RADIUS = 0.9
 
 
 def visual_hull_sphere(
@@ -74,8 +76,7 @@ def hull_distances(
     from scipy.ndimage import distance_transform_edt
 
     cell = 2.0 / cells
-    axis = (np.arange(cells) + 0.5) * cell - 1
-    grid = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
+    grid = _cube(cells).reshape(-1, 3)
     inside = (_inside_silhouettes(cameras, masks, grid) & (np.linalg.norm(grid, axis=1) < 1)).reshape([cells] * 3)
     if not inside.any() or inside.all():
         return None
@@ -83,3 +84,14 @@ def hull_distances(
     outside_by = np.maximum(distance_transform_edt(~inside) - 0.5, 0)
     inside_by = np.maximum(distance_transform_edt(inside) - 0.5, 0)
     return (cell * (outside_by - inside_by)).astype(np.float32)
+
+
+def room_distances(cells: int = DISTANCE_CELLS) -> np.ndarray:
+    """Signed distance to a round room's wall, positive within, at the centres of a grid as of `hull_distances`."""
+    return (ROOM_RADIUS - np.linalg.norm(_cube(cells), axis=-1)).astype(np.float32)
+
+
+def _cube(cells: int) -> np.ndarray:
+    """[cells, cells, cells, 3] centres of a grid over the cube [-1, 1]^3."""
+    axis = (np.arange(cells) + 0.5) * 2.0 / cells - 1
+    return np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1)
