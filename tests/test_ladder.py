@@ -185,3 +185,89 @@ def test_always_inside_the_masks_needs_masks(tmp_path: Path):
     with pytest.raises(InputError, match=r"1 of 1 photos have no mask, e\.g\. a\.jpg"):
         _check_masks(images, SfmParams(masks="always"))
     _check_masks(images, SfmParams())
+
+
+# ---------------------------------------------------------------- the workbench
+def workbench(tmp_path: Path, focal: float | None = None, **params: object):
+    """Three photos of noise, the object in the left half of each."""
+    import cv2
+
+    from stages import artifacts
+    from stages.artifacts import ImageRecord, ImageSet
+    from stages.posing.workbench import Workbench
+
+    records, noise = [], np.random.default_rng(0)
+    mask = np.zeros((120, 160), np.uint8)
+    mask[:, :80] = 255
+    for name in ("a b.png", "c.png", "d.png"):
+        grey = noise.integers(0, 256, (30, 40), dtype=np.uint8)
+        artifacts.write_png(artifacts.image_path(tmp_path, name), cv2.resize(grey, (160, 120)))
+        artifacts.write_png(artifacts.mask_path(tmp_path, name), mask)
+        records.append(ImageRecord(name, name, 160, 120, focal, "camera", 1.0, True, name))
+    work = tmp_path / "work"
+    work.mkdir()
+    return Workbench(
+        work,
+        tmp_path / artifacts.IMAGES,
+        tmp_path / artifacts.MASKS,
+        ImageSet(tuple(records)),
+        SfmParams(**params),  # type: ignore[arg-type]
+        threads=1,
+        workers=1,
+        cuda=False,
+        progress=lambda done, total, note: None,
+    )
+
+
+def keypoints(path: Path) -> np.ndarray:
+    import pycolmap
+
+    with pycolmap.Database.open(path) as opened:
+        return np.concatenate([opened.read_keypoints(image.image_id)[:, :2] for image in opened.read_all_images()])
+
+
+def test_features_are_found_inside_the_masks_where_asked(tmp_path: Path):
+    bench = workbench(tmp_path, masks="always")
+    bench._extract(Base(masked=True))
+    inside = keypoints(bench.database(Base(masked=True)))
+    bench._import(Base())
+    bench._extract(Base())
+    everywhere = keypoints(bench.database(Base()))
+    assert len(inside) > 20
+    assert inside[:, 0].max() <= 81
+    assert everywhere[:, 0].max() > 120
+
+
+def test_the_rungs_are_those_that_the_capture_allows(tmp_path: Path):
+    bench = workbench(tmp_path)
+    names = [rung.name for rung in bench.rungs() if rung.applies(None)]
+    assert names == [
+        "exhaustive matching", "features inside the masks", "affine features", "guided matching", "global mapper",
+        "relaxed thresholds",
+    ]  # fmt: skip
+    (tmp_path / "other").mkdir()
+    bench = workbench(tmp_path / "other", focal=180.0, matcher="sequential", mapper="global", masks="never")
+    names = [rung.name for rung in bench.rungs() if rung.applies(None)]
+    assert names == [
+        "sequential matching", "all pairs", "no focal priors", "affine features", "guided matching",
+        "incremental mapper", "relaxed thresholds",
+    ]  # fmt: skip
+
+
+def test_a_focal_length_that_the_poses_contradict_is_noticed(tmp_path: Path):
+    import pycolmap
+
+    bench = workbench(tmp_path, focal=180.0)
+
+    def found(focal: float, count: int) -> Solution:
+        model = pycolmap.Reconstruction()
+        model.add_camera(pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", focal, 160, 120))
+        return Solution(frozenset(sorted(bench.names)[:count]), 10, 0.5, model=model)
+
+    assert bench.contradicted(found(200.0, 3)) == []
+    assert bench.contradicted(found(360.0, 3)) == [(pytest.approx(180.0), pytest.approx(360.0))]
+    assert bench.contradicted(found(90.0, 3))
+    assert bench.priors_are_doubtful(None)
+    assert bench.priors_are_doubtful(found(360.0, 3))
+    assert bench.priors_are_doubtful(found(180.0, 1))
+    assert not bench.priors_are_doubtful(found(180.0, 2))
