@@ -17,7 +17,7 @@ import typer
 from typer.core import TyperGroup
 
 from stages.engine.stage import Stage
-from stages.errors import HineusError, SystemRequirementError
+from stages.errors import HineusError, InputError, SystemRequirementError
 from stages.pipeline import PIPELINE
 
 if TYPE_CHECKING:
@@ -318,6 +318,59 @@ def status(
     typer.echo(json.dumps({"workspace": str(opened.root), "sources": dict(opened.record.sources), "stages": stages}))
 
 
+def check(
+    context: typer.Context,
+    photos: Annotated[Path, typer.Argument(help="Folder of photos, or a video.", show_default=False)],
+    workspace: WorkspaceOption = None,
+    masks: Masks = None,
+    preset: Preset = None,
+    config: ConfigFile = None,
+    sets: Sets = None,
+    device: Device = "auto",
+    workers: Workers = None,
+    time: Time = None,
+    as_json: Json = False,
+) -> None:
+    """A quick look before a run: are these photos good, and what will they take? Exits with 0 unless it is no-go."""
+    from rich.table import Table
+    from rich.text import Text
+
+    from hineus_cli.console import product
+    from hineus_cli.preflight import facts
+    from hineus_cli.reconstruct import Request, check_photos
+
+    session: Session = context.obj
+    session.json = as_json
+    request = Request(
+        photos=photos,
+        workspace=workspace,
+        masks=masks,
+        preset=preset,
+        config=config,
+        sets=tuple(sets or ()),
+        device=device,
+        workers=workers,
+        time=time,
+    )
+    done = check_photos(request)
+    exit_code = InputError.exit_code if done.refusals else SystemRequirementError.exit_code if done.shortages else 0
+    if as_json:
+        typer.echo(json.dumps({"ok": exit_code == 0, **done.as_dict()}))
+        raise typer.Exit(exit_code)
+    table = Table.grid(padding=(0, 2))
+    for what, found in facts(done):
+        table.add_row(Text(what, style="bold"), Text(found))
+    for what, style, lines in (
+        ("warning", "yellow", done.warnings),
+        ("no-go", "red", (*done.refusals, *done.shortages)),
+    ):
+        for line in lines:
+            table.add_row(Text(what, style=style), Text(line))
+    table.add_row(Text("verdict", style="bold"), Text(done.verdict))
+    product().print(table)
+    raise typer.Exit(exit_code)
+
+
 def doctor(
     context: typer.Context,
     folder: Annotated[Path, typer.Option(help="Where workspaces would lie; its free disk is shown.")] = Path("."),
@@ -472,7 +525,7 @@ def build_app(pipeline: Sequence[Stage] = PIPELINE) -> typer.Typer:
     ) -> None:
         """Photos in, textured 3D asset out. Start with `hineus doctor`, then `hineus run PHOTOS`."""
 
-    for command in (run, status, doctor, presets, demo):
+    for command in (run, check, status, doctor, presets, demo):
         app.command()(command)
     app.command("config")(show_config)
     app.command("export-colmap")(export_colmap)

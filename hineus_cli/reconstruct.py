@@ -13,6 +13,7 @@ from pathlib import Path
 from configs.load import load_config
 from configs.params import Config
 from hineus_cli.console import log_to_file
+from hineus_cli.preflight import Preflight, in_short, preflight
 from stages import artifacts
 from stages.capture.listing import is_video
 from stages.engine.runner import Listener, StageOutcome, run_pipeline
@@ -96,6 +97,9 @@ def reconstruct(request: Request, pipeline: Sequence[Stage], listener: Listener 
     device = choose_device(request.device)
     workers = request.workers or available_cores()
     with workspace.lock(), log_to_file(workspace.log_path):
+        photos = sources["photos"]
+        if photos is not None and not workspace.stage_folder("ingest").exists():
+            _tell_preflight(preflight(photos, sources["masks"], workspace.root, config, device, workers))
         log.debug("preset %s, device %s, %d workers, %s", preset, device, workers, sources)
         outcomes = run_pipeline(
             pipeline,
@@ -111,6 +115,27 @@ def reconstruct(request: Request, pipeline: Sequence[Stage], listener: Listener 
             preset=preset,
         )
     return Reconstruction(workspace, config, preset, device, workers, tuple(outcomes))
+
+
+def check_photos(request: Request) -> Preflight:
+    """Look at the photos of a run that is not started.
+
+    Raises:
+        HineusError: a child by what the user can do.
+    """
+    photos = request.photos
+    assert photos is not None, "the command line demands it"
+    sets = [*request.sets, *([f"train.minutes={minutes(request.time)}"] if request.time else [])]
+    config = load_config(request.preset or default_preset(), request.config, sets)
+    workers = request.workers or available_cores()
+    return preflight(photos, request.masks, choose_folder(request), config, choose_device(request.device), workers)
+
+
+def _tell_preflight(done: Preflight) -> None:
+    """In short. A no-go does not stop the run: estimates may be wrong, and the stages say what they need."""
+    log.info("%s", in_short(done))
+    for line in (*done.refusals, *done.shortages, *done.warnings):
+        log.warning("%s", line)
 
 
 def choose_folder(request: Request) -> Path:

@@ -60,6 +60,21 @@ def extract_frames(
     return _write(video, folder, choose_frames(looks, count), lambda part: progress(0.7 + 0.3 * part))
 
 
+def video_size(video: Path) -> tuple[int, int, int]:
+    """Number of frames as the file states it, upright width and height.
+
+    Raises:
+        UnusableError: it cannot be read as a video.
+    """
+    capture = _open(video)
+    import cv2
+
+    keys = (cv2.CAP_PROP_FRAME_COUNT, cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)
+    frames, width, height = (max(0, int(capture.get(key))) for key in keys)
+    capture.release()
+    return frames, width, height
+
+
 def choose_frames(looks: list[Look], count: int) -> list[int]:
     """Up to `count` frame numbers, ascending: the way is cut into equal stretches, of each the sharpest is taken."""
     way = np.cumsum([0.0] + [look.moved if look.moved > STILL else 0.0 for look in looks[1:]])

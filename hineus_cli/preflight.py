@@ -1,0 +1,204 @@
+"""Can these photos be reconstructed here? What is in them, what it will take, and go or no-go."""
+
+from __future__ import annotations
+
+import shutil
+from collections import Counter
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from configs.params import Config
+from stages.capture.preflight import Inspection, inspect
+
+Verdict = Literal["go", "go with warnings", "no-go"]
+
+FEW_PHOTOS = 20  # a full turn in steps of less than 20 degrees; sets below it lose photos
+EXPECTED = ("not an image", "the raw file of", "the clip of")  # reasons to leave a file out that are no news
+NAMED = 4  # this many photos are named in a warning
+
+# All measured with `benchmarks/run_sets.py` on two cores, see docs/benchmarks.md.
+GIB = 1 << 30
+MEMORY_BASE_GIB = 1.5  # baking, the peak of all sets: 1.45 to 1.66 GiB
+MEMORY_OF_PHOTOS = 2.0  # training holds the photos' bytes twice while it puts them in a row
+SFM_BASE_GIB, SFM_GIB_PER_THREAD_MP = 0.25, 0.25  # finding features: 0.32 GiB at 0.3 megapixels, 1.0 at 1.5
+MEMORY_MARGIN = 1.3  # an estimate this near to what is there gets a warning
+SFM_CPU_S_PER_MP = 2.8  # 2.3 to 3.3 CPU seconds a megapixel looked at
+SFM_CPU_S_PER_PAIR = 0.01  # too little in those sets to be told from nothing; larger ones are quadratic
+TRAIN_CPU_S_PER_RAY_SAMPLE = 8.6e-6  # 560 CPU seconds for 8000 steps of 512 rays of 16 samples
+OTHER_CPU_S = 75.0  # everything after training: 60 to 85
+MEASURED_CORES = 2  # more were not measured, so they are not counted on
+DISK_BASE_GB = 0.3  # checkpoint, meshes, textures, report: an allowance
+DISK_BYTES_PER_PIXEL = 2.0  # undistorted images are PNG: 1.4 to 2 bytes a pixel
+
+
+@dataclass(frozen=True)
+class Needs:
+    """What the reconstruction will take.
+
+    Attributes:
+        memory_gib: peak of main memory.
+        disk_gb: the finished workspace.
+        minutes: wall clock; None on a GPU, where nothing was measured.
+    """
+
+    memory_gib: float
+    disk_gb: float
+    minutes: float | None
+
+
+@dataclass(frozen=True)
+class Preflight:
+    """What was seen, what it needs, and what to make of it.
+
+    Attributes:
+        refusals: reasons for "no-go" that lie in the photos; `shortages`: those that lie in the machine.
+    """
+
+    inspection: Inspection
+    needs: Needs
+    warnings: tuple[str, ...]
+    refusals: tuple[str, ...]
+    shortages: tuple[str, ...]
+
+    @property
+    def verdict(self) -> Verdict:
+        if self.refusals or self.shortages:
+            return "no-go"
+        return "go with warnings" if self.warnings else "go"
+
+    def as_dict(self) -> dict[str, Any]:
+        """JSON-able."""
+        seen = self.inspection
+        return {
+            "verdict": self.verdict,
+            "photos": len(seen.photos),
+            "videos": [asdict(video) for video in seen.videos],
+            "left_out": [asdict(item) for item in seen.skipped],
+            "sizes": [[*size, count] for size, count in Counter(seen.sizes).most_common()],
+            "cameras": dict(Counter(photo.camera for photo in seen.photos)),
+            "with_focal": sum(photo.has_focal for photo in seen.photos),
+            "blurred": list(seen.blurred),
+            "badly_exposed": list(seen.badly_exposed),
+            "alike": [list(pair) for pair in seen.alike],
+            "plain_background": seen.plain,
+            "needs": asdict(self.needs),
+            "warnings": list(self.warnings),
+            "refusals": list(self.refusals),
+            "shortages": list(self.shortages),
+        }
+
+
+def preflight(source: Path, masks: Path | None, folder: Path, config: Config, device: str, workers: int) -> Preflight:
+    """Look at the photos, and at the memory and the disk of `folder`, where the workspace will lie.
+
+    Raises:
+        InputError: there is no such folder or video.
+    """
+    import psutil
+
+    seen = inspect(source, masks, config.ingest.video_frames, workers)
+    needs = estimate(seen, config, device, workers)
+    while not folder.exists():
+        folder = folder.parent
+    memory, disk = psutil.virtual_memory().available / GIB, shutil.disk_usage(folder).free / 1e9
+    refusals, shortages = [], []
+    if len(seen.sizes) < config.ingest.min_images:
+        refusals.append(f"{len(seen.sizes)} usable photos, {config.ingest.min_images} are needed.")
+    if needs.memory_gib > memory:
+        shortages.append(
+            f"It may take {needs.memory_gib:.1f} GiB of memory, {memory:.1f} are free: close other programs, or try "
+            "`--set undistort.max_side=800`, `--workers 1`."
+        )
+    if needs.disk_gb > disk:
+        shortages.append(f"It may take {needs.disk_gb:.1f} GB of disk, {disk:.1f} are free: try `--workspace DIR`.")
+    warnings = _warnings(seen, config)
+    if memory / MEMORY_MARGIN < needs.memory_gib <= memory:
+        warnings.append(f"It may take {needs.memory_gib:.1f} of the {memory:.1f} GiB of memory that are free.")
+    return Preflight(seen, needs, tuple(warnings), tuple(refusals), tuple(shortages))
+
+
+def estimate(seen: Inspection, config: Config, device: str, workers: int) -> Needs:
+    """From simple models of what was measured; see the constants."""
+
+    def pixels(most: int) -> list[float]:
+        return [width * height * min(1.0, most / max(width, height)) ** 2 for width, height in seen.sizes]
+
+    looked_at = pixels(min(config.ingest.max_side, config.sfm.max_image_size))
+    trained_on = sum(pixels(min(config.ingest.max_side, config.undistort.max_side)))
+    sfm_gib = SFM_BASE_GIB + workers * SFM_GIB_PER_THREAD_MP * max(looked_at, default=0) / 1e6
+    later_gib = MEMORY_BASE_GIB + MEMORY_OF_PHOTOS * 3 * trained_on / GIB
+    return Needs(
+        memory_gib=max(sfm_gib, later_gib),
+        disk_gb=DISK_BASE_GB + (seen.num_bytes + DISK_BYTES_PER_PIXEL * trained_on) / 1e9,
+        minutes=_minutes(looked_at, config, workers) if device == "cpu" else None,
+    )
+
+
+def _minutes(looked_at: list[float], config: Config, workers: int) -> float:
+    count, train = len(looked_at), config.train
+    pairs = count * (count - 1) / 2 if count <= config.sfm.exhaustive_max else 10 * count
+    cores = min(workers, MEASURED_CORES)
+    training_s = train.steps * train.rays * train.samples * TRAIN_CPU_S_PER_RAY_SAMPLE / cores
+    if train.minutes is not None:
+        training_s = 60 * train.minutes
+    other_s = SFM_CPU_S_PER_MP * sum(looked_at) / 1e6 + SFM_CPU_S_PER_PAIR * pairs + OTHER_CPU_S
+    return (training_s + other_s / cores) / 60
+
+
+def _warnings(seen: Inspection, config: Config) -> list[str]:
+    found = []
+    if config.ingest.min_images <= len(seen.sizes) < FEW_PHOTOS:
+        found.append(f"Only {len(seen.sizes)} photos; 30 to 100 that overlap by two thirds give a whole object.")
+    if seen.blurred:
+        found.append(f"Far less sharp than the others: {_named(seen.blurred)}. Take them again or move them away.")
+    if seen.badly_exposed:
+        found.append(f"Far darker or lighter than the others: {_named(seen.badly_exposed)}. Fix the exposure.")
+    if seen.alike:
+        pairs = tuple(f"{earlier} = {later}" for earlier, later in seen.alike)
+        found.append(f"Nearly the same picture: {_named(pairs)}. They take time and add nothing.")
+    unusable = tuple(item.source for item in seen.skipped if not item.reason.startswith(EXPECTED))
+    if unusable:
+        found.append(f"Left out: {_named(unusable)}; the first because: {_reason(seen, unusable[0])}.")
+    return found
+
+
+def _reason(seen: Inspection, source: str) -> str:
+    return next(item.reason for item in seen.skipped if item.source == source)
+
+
+def _named(names: tuple[str, ...]) -> str:
+    more = len(names) - NAMED
+    return ", ".join(names[:NAMED]) + (f" and {more} more" if more > 0 else "")
+
+
+def facts(done: Preflight) -> list[tuple[str, str]]:
+    """What was found, line by line: a word and a text."""
+    seen, needs = done.inspection, done.needs
+    lines = [("photos", str(len(seen.photos)))]
+    lines += [("video", f"{clip.source}: up to {clip.frames} frames") for clip in seen.videos]
+    sizes = Counter(seen.sizes).most_common()
+    lines.append(("sizes", "; ".join(f"{count} x {width} x {height}" for (width, height), count in sizes[:NAMED])))
+    cameras = Counter(photo.camera for photo in seen.photos).most_common()
+    lines += [("camera", f"{name} ({count} photos)") for name, count in cameras[:NAMED]]
+    if len(cameras) > NAMED:
+        lines.append(("camera", f"and {len(cameras) - NAMED} more"))
+    with_focal = sum(photo.has_focal for photo in seen.photos)
+    estimated = "" if with_focal == len(seen.photos) else "; else it is estimated"
+    lines.append(("focal length", f"in the EXIF of {with_focal} of {len(seen.photos)} photos{estimated}"))
+    if seen.plain:
+        lines.append(("background", "plain: `--set ingest.auto_mask=plain` would cut the object out"))
+    minutes = "not measured on a GPU" if needs.minutes is None else f"about {needs.minutes:.0f} min"
+    lines.append(("needs", f"{minutes}, {needs.memory_gib:.1f} GiB of memory, {needs.disk_gb:.1f} GB of disk"))
+    return lines
+
+
+def in_short(done: Preflight) -> str:
+    """One line for the start of a run."""
+    seen, needs = done.inspection, done.needs
+    cameras = len({photo.camera for photo in seen.photos}) + len(seen.videos)
+    time = "" if needs.minutes is None else f"about {needs.minutes:.0f} min, "
+    return (
+        f"{len(seen.sizes)} photos, {cameras} camera{'' if cameras == 1 else 's'}; "
+        f"{time}{needs.memory_gib:.1f} GiB of memory, {needs.disk_gb:.1f} GB of disk: {done.verdict}"
+    )

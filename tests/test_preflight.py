@@ -1,0 +1,185 @@
+"""The look before a run: what it notices of the photos, what it says of the machine, with which exit code."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import psutil
+import pytest
+from PIL import Image, ImageFilter
+from typer.testing import CliRunner, Result
+
+from configs.load import load_config
+from hineus_cli import preflight as module
+from hineus_cli import reconstruct
+from hineus_cli.app import app
+from hineus_cli.preflight import GIB, estimate, preflight
+from stages.capture.preflight import Inspection, Video, glance, inspect
+
+SIZE = (320, 240)
+
+
+def picture(seed: int, light: float = 1.0) -> Image.Image:
+    """Texture of all scales, different for each seed."""
+    generator = np.random.default_rng(seed)
+    pixels = np.zeros((SIZE[1], SIZE[0], 3))
+    for cells in (4, 16, 64):
+        noise = generator.normal(0, 40, (cells * 3 // 4, cells, 3))
+        pixels += cv2.resize(noise, SIZE, interpolation=cv2.INTER_CUBIC)
+    return Image.fromarray(((pixels + 128) * light).clip(0, 255).astype(np.uint8))
+
+
+@pytest.fixture
+def photos(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """24 good photos, on a machine without a GPU and with room."""
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    for i in range(24):
+        picture(i).save(folder / f"{i:02d}.jpg")
+    monkeypatch.setattr(reconstruct, "has_cuda", lambda: False)
+    room(monkeypatch, memory_gib=64, disk_gb=500)
+    return folder
+
+
+def room(monkeypatch: pytest.MonkeyPatch, memory_gib: float, disk_gb: float) -> None:
+    monkeypatch.setattr(psutil, "virtual_memory", lambda: SimpleNamespace(available=memory_gib * GIB))
+    monkeypatch.setattr(module.shutil, "disk_usage", lambda path: SimpleNamespace(free=disk_gb * 1e9))
+
+
+def check(*arguments: str) -> Result:
+    return CliRunner().invoke(app, ["check", *arguments])
+
+
+def look(folder: Path) -> Inspection:
+    return inspect(folder, None, video_frames=80, workers=2)
+
+
+# ---------------------------------------------------------------- what is noticed
+def test_good_photos_are_a_go(photos: Path):
+    result = check(str(photos))
+    assert result.exit_code == 0
+    assert "24 x 320 x 240" in result.stdout
+    assert result.stdout.split()[-1] == "go"
+
+
+def test_blurred_photos_are_named(photos: Path):
+    picture(30).filter(ImageFilter.GaussianBlur(2)).save(photos / "shaken.jpg")
+    assert look(photos).blurred == ("shaken.jpg",)
+
+
+def test_dark_and_light_photos_are_named(photos: Path):
+    picture(30, light=0.3).save(photos / "x_dark.jpg")
+    picture(31, light=1.1).save(photos / "y_usual.jpg")
+    assert look(photos).badly_exposed == ("x_dark.jpg",)
+
+
+def test_the_same_picture_twice_is_named_with_its_twin(photos: Path):
+    picture(3).save(photos / "again.jpg", quality=60)
+    assert look(photos).alike == (("03.jpg", "again.jpg"),)
+
+
+def test_exif_and_size_are_those_of_the_upright_photo(photos: Path):
+    exif = Image.Exif()
+    exif[0x0112], exif[0x0110] = 6, "Phone"
+    exif.get_ifd(0x8769)[0xA405] = 28
+    large = picture(40).resize((2400, 1800))  # large enough to be decoded smaller
+    large.save(photos / "z.jpg", exif=exif)
+    seen = glance(photos / "z.jpg", "z.jpg")
+    assert (seen.width, seen.height) == (1800, 2400)
+    assert seen.camera == "Phone | 28 mm equivalent | 1800 x 2400"
+    assert seen.has_focal
+    assert not glance(photos / "00.jpg", "00.jpg").has_focal
+
+
+def test_damaged_files_are_told_with_the_reason_and_other_files_are_no_warning(photos: Path):
+    (photos / "bad.jpg").write_text("not a picture")
+    (photos / "torn.mp4").write_bytes(b"0" * 100)
+    (photos / "notes.txt").write_text("hello")
+    result = check(str(photos), "--json")
+    data = json.loads(result.stdout)
+    assert data["verdict"] == "go with warnings"
+    assert {item["source"] for item in data["left_out"]} == {"bad.jpg", "torn.mp4", "notes.txt"}
+    assert len(data["warnings"]) == 1
+    assert "bad.jpg, torn.mp4" in data["warnings"][0]
+
+
+def test_a_plain_background_is_noticed(tmp_path: Path):
+    for i in range(3):
+        cloth = Image.new("RGB", SIZE, (12, 12, 14))
+        cloth.paste(picture(i).resize((120, 120)), (100, 60))
+        cloth.save(tmp_path / f"{i}.png")
+    assert look(tmp_path).plain
+
+
+# ---------------------------------------------------------------- verdicts
+def test_too_few_photos_are_a_no_go(photos: Path):
+    for file in sorted(photos.iterdir())[2:]:
+        file.unlink()
+    result = check(str(photos))
+    assert result.exit_code == 3
+    assert "2 usable photos, 3 are needed." in result.stdout
+
+
+def test_few_photos_are_a_warning(photos: Path):
+    for file in sorted(photos.iterdir())[8:]:
+        file.unlink()
+    result = check(str(photos), "--json")
+    assert result.exit_code == 0
+    assert json.loads(result.stdout)["verdict"] == "go with warnings"
+
+
+@pytest.mark.parametrize(("memory", "disk", "word"), [(0.5, 500, "memory"), (64, 0.1, "disk")])
+def test_lack_of_room_is_a_no_go(photos: Path, monkeypatch, memory: float, disk: float, word: str):
+    room(monkeypatch, memory, disk)
+    result = check(str(photos), "--json")
+    assert result.exit_code == 6
+    data = json.loads(result.stdout)
+    assert data["ok"] is False
+    assert data["verdict"] == "no-go"
+    assert word in data["shortages"][0]
+
+
+def test_missing_folder(photos: Path):
+    result = check(str(photos / "nowhere"))
+    assert result.exit_code == 3
+    assert "does not exist" in result.stderr
+
+
+# ---------------------------------------------------------------- what it needs
+def test_needs_grow_with_photos_as_measured():
+    def of(count: int, side: int, workers: int = 2, **sets: object):
+        seen = Inspection((), (Video("clip.mp4", count, side, side),), (), (), (), (), False, 0)
+        config = load_config("cpu", sets=[f"{key}={value}" for key, value in sets.items()])
+        return estimate(seen, config, "cpu", workers)
+
+    small = of(47, 554)  # 47 photos of 0.31 megapixels: docs/benchmarks.md has 5.7 to 6.2 minutes and 1.45 to 1.62 GiB
+    assert small.minutes == pytest.approx(6, abs=0.7)
+    assert small.memory_gib == pytest.approx(1.55, abs=0.1)
+    # past undistort.max_side a photo takes no more memory; 200 photos of 1600 x 1600 are 1.43 GiB
+    assert of(200, 4000).memory_gib == of(200, 1600).memory_gib == pytest.approx(1.5 + 2 * 1.43, abs=0.01)
+    assert of(47, 1600, workers=16).memory_gib > of(47, 1600).memory_gib  # each thread looks for features
+    assert of(47, 554, **{"train.minutes": 20}).minutes == pytest.approx(21.2, abs=0.5)
+
+
+def test_nothing_is_said_of_the_time_on_a_gpu(photos: Path):
+    done = preflight(photos, None, photos.parent, load_config("gpu"), "cuda", 2)
+    assert done.needs.minutes is None
+    assert "not measured" in dict(module.facts(done))["needs"]
+
+
+def test_a_run_begins_with_it_in_short(photos: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(photos.parent)
+    picture(30).filter(ImageFilter.GaussianBlur(2)).save(photos / "shaken.jpg")
+    result = CliRunner().invoke(app, ["run", "photos", "--until", "ingest"])
+    assert result.exit_code == 0
+    lines = result.stderr.splitlines()
+    assert "25 photos, 1 camera; about" in lines[0]
+    assert any("Far less sharp than the others: shaken.jpg" in line for line in lines)
+    again = CliRunner().invoke(app, ["run", "photos", "--until", "ingest"])
+    assert "25 photos, 1 camera" not in again.stderr
+    shutil.rmtree(photos.parent / "photos_hineus")
