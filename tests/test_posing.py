@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import pickle
@@ -432,3 +433,59 @@ def test_the_region_is_that_of_the_file_where_there_are_no_masks():
     stated = RegionOfInterest(CENTER, 2.0, "object", "the file")
     assert find_region(facing_one_way, nothing, None, stated) is stated
     assert StatedRegion(CENTER, 2.0, "the file").radius == stated.radius
+
+
+# ---------------------------------------------------------------- a real set
+@pytest.mark.data
+def test_silhouettes_of_a_real_set_agree_with_its_cameras(data_dir: Path):
+    """The hull that the masks carve through the cameras fills each mask again, and lies in the file's sphere."""
+    from stages.geometry.region import visual_hull_sphere
+
+    cameras, masks, region = real_set(data_dir / "dtu_scan24")
+    found = visual_hull_sphere(cameras, masks, region.center, 1.2 * region.radius)
+    assert found is not None
+    center, radius = found
+    assert np.linalg.norm(center - region.center) + radius < 1.3 * region.radius
+    turned = dataclasses.replace(cameras, cam_from_scene=np.roll(cameras.cam_from_scene, 7, axis=0))
+    wrong = visual_hull_sphere(turned, masks, region.center, 1.2 * region.radius)
+    assert wrong is None or wrong[1] < 0.8 * radius
+
+
+@pytest.mark.data
+@pytest.mark.slow
+def test_points_of_a_real_set_fit_its_cameras(data_dir: Path, tmp_path: Path):
+    """A mean reprojection error under a pixel, which cameras with other axes or another order could not give."""
+    import pycolmap
+
+    from configs.params import SfmParams
+    from stages.artifacts import ImageRecord
+    from stages.posing.triangulation import triangulate
+
+    root = data_dir / "dtu_scan24"
+    chosen = {
+        camera.name: (camera, ImageRecord(camera.name, camera.name, *camera.size, None, "", 1.0, False, ""))
+        for camera in read_poses(root).cameras[:5]
+    }
+    params = SfmParams(max_features=2000)
+    model, _ = triangulate(tmp_path, root, chosen, params, 1, 2, pycolmap.Device.cpu, lambda *progress: None)
+    assert model.num_points3D() > 400
+    assert model.compute_mean_reprojection_error() < 0.7
+
+
+def real_set(root: Path):
+    """Pinhole cameras, masks and the stated region of a set in the layout of NeuS."""
+    from stages.geometry.cameras import PinholeCameras
+
+    poses = read_poses(root)
+    masks = [cv2.imread(str(poses.masks[camera.name]), cv2.IMREAD_GRAYSCALE) > 127 for camera in poses.cameras]
+    intrinsics = [
+        [[camera.params[0], 0, camera.params[2]], [0, camera.params[1], camera.params[3]], [0, 0, 1]]
+        for camera in poses.cameras
+    ]
+    cameras = PinholeCameras(
+        names=tuple(camera.name for camera in poses.cameras),
+        sizes=np.array([camera.size for camera in poses.cameras]),
+        intrinsics=np.array(intrinsics),
+        cam_from_scene=np.stack([camera.cam_from_world for camera in poses.cameras]),
+    )
+    return cameras, masks, poses.region

@@ -17,7 +17,9 @@ from stages.posing.known import KnownCamera, KnownPoses, StatedRegion, image_siz
 FILES = ("cameras_sphere.npz", "cameras.npz")
 IMAGES, MASKS = "image", "mask"
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
-# These matrices count pixel centres at whole numbers, COLMAP at halves.
+# These matrices count pixel centres at whole numbers, COLMAP at halves. That is by definition, not by measurement: on
+# DTU's scan 24 at half size, where it would leave 0.25 px, triangulated points fit best with (-0.12, 0.13) +- 0.03, and
+# parts of the circle alone with up to 1 px; from 0 to 0.5 px the mean reprojection error goes from 0.485 to 0.493 px.
 PIXEL_SHIFT = 0.5
 # COLMAP's cameras have no skew; more than this many pixels across the image would show.
 MAX_SKEW_PX = 0.5
