@@ -165,7 +165,7 @@ def find_region(
         cameras: at least two, in the world frame.
         points: [P, 3] sparse points in the world frame.
         masks: one [H, W] silhouette per camera (or None for it), or None without masks.
-        stated: what the poses' file says; taken where there are no silhouettes.
+        stated: what the poses' file says; taken unless the silhouettes' hull is smaller, for both hold the object.
 
     Raises:
         ValueError: fewer than two cameras, or no sphere of positive size can be found.
@@ -178,7 +178,7 @@ def find_region(
     if found is not None and masks is not None and any(mask is not None for mask in masks):
         # The silhouettes may be larger than what every view shows whole: look in a cube twice as wide.
         hull = visual_hull_sphere(cameras, masks, found[0], 2.0 * SEEN_WHOLE_MARGIN * found[1])
-        if hull is not None:
+        if hull is not None and (stated is None or hull[1] * HULL_MARGIN < stated.radius):
             return RegionOfInterest(hull[0], hull[1] * HULL_MARGIN, "object", "the visual hull of the masks")
     if stated is not None:
         return stated
