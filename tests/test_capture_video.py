@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 
 import cv2
@@ -11,7 +12,7 @@ import pytest
 from configs.params import IngestParams
 from stages import artifacts
 from stages.capture.photos import UnusableError
-from stages.capture.video import LOST, Look, choose_frames, extract_frames, motion
+from stages.capture.video import LOST, Look, choose_frames, extract_frames, motion, video_size
 from stages.engine.stage import StageContext
 from stages.ingest import INGEST
 
@@ -113,3 +114,16 @@ def test_ingest_takes_videos_as_one_camera_each(tmp_path: Path, alone: bool):
     assert all(record.name.startswith(("clip.mp4/", "other.mp4/")) for record in image_set.images)
     assert all(artifacts.image_path(out, record.name).is_file() for record in image_set.images)
     assert [item.source for item in image_set.skipped] == ([] if alone else ["bad.mov"])
+
+
+def test_a_portrait_video_of_a_phone_is_read_upright(tmp_path: Path):
+    """Phones store the sensor's landscape and note the turn in the track's matrix."""
+    video = write_video(tmp_path / "clip.mp4", [5.0 * i for i in range(30)])
+    data = bytearray(video.read_bytes())
+    matrix = data.index(b"tkhd") + 4 + 40  # version 0: 40 bytes of times, ids and volume before it
+    quarter_turn = (0, 1 << 16, 0, -(1 << 16), 0, 0, SIZE[1] << 16, 0, 1 << 30)
+    data[matrix : matrix + 36] = struct.pack(">9i", *quarter_turn)
+    video.write_bytes(data)
+    assert video_size(video) == (30, SIZE[1], SIZE[0])
+    frame = cv2.imread(str(extract_frames(video, tmp_path / "frames", 1)[0]))
+    assert frame.shape == (SIZE[0], SIZE[1], 3)

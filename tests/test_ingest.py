@@ -169,6 +169,17 @@ def test_formats_of_phones_are_read_upright_with_their_exif(photos: Path, suffix
     assert difference.mean() < 6
 
 
+@pytest.mark.parametrize("kind", ["HEIF", "AVIF", "WEBP"])
+def test_another_format_under_the_name_of_a_jpeg_is_encoded_anew(photos: Path, kind: str):
+    register_formats()
+    write_photos(photos, 2)
+    picture(7).save(photos / "z.jpg", format=kind)
+    image_set, out, _ = ingest(photos)
+    assert image_set.images[-1].name == "z.jpg"
+    with Image.open(artifacts.image_path(out, "z.jpg")) as written:
+        assert written.format == "JPEG"
+
+
 def test_sixteen_bits_a_channel_become_eight(photos: Path):
     import cv2
 

@@ -13,6 +13,7 @@ from stages.capture.exif import ORIENTATION
 
 # What COLMAP's reader takes as it is; the rest is re-encoded.
 COLMAP_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"})
+COLMAP_FORMATS = frozenset({"JPEG", "MPO", "PNG", "TIFF", "BMP"})  # a name may lie: phones write HEIC as .jpg
 HEIF_SUFFIXES = frozenset({".heic", ".heif"})
 PHOTO_SUFFIXES = COLMAP_SUFFIXES | HEIF_SUFFIXES | {".webp", ".avif"}
 RAW_SUFFIXES = frozenset({".dng", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".rw2", ".raf", ".pef", ".srw"})
@@ -94,7 +95,7 @@ def _decode(file: Path) -> Photo:
             stored_size=stored.size,
             orientation=orientation,
             lossy=stored.format in LOSSY_FORMATS,
-            as_is=unchanged and file.suffix.lower() in COLMAP_SUFFIXES and stored.format != "WEBP",
+            as_is=unchanged and file.suffix.lower() in COLMAP_SUFFIXES and stored.format in COLMAP_FORMATS,
         )
 
 

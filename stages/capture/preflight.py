@@ -1,6 +1,6 @@
 """A quick look at photos before the work: decoded small, judged against each other.
 
-Figures in the comments: 49 photos of a figure on a turntable, 16 of fruit by hand (one of them shaken), and twice 47
+Figures in the comments: 49 photos of a figure on a turntable, 16 of fruit by hand (one of them blurred), and twice 47
 rendered with one exposure, all of them sets that can be reconstructed.
 """
 
@@ -27,7 +27,7 @@ TURNED = (5, 6, 7, 8)  # EXIF orientations that swap width and height
 LIKENESS_SIDE = 64
 
 # Variance of the Laplacian: half the contrast of edges is a quarter of it. The set's own median stands for its texture.
-# Lowest in the sets: 0.54 (figure), 0.68 (rendered), 0.46 (fruit) but for the shaken one at 0.26.
+# Lowest in the sets: 0.54 (figure), 0.68 (rendered), 0.46 (fruit) but for the blurred one at 0.26.
 BLURRED = 0.3
 # Stops from the set's median. Dark and light sides of a scene with one exposure reach 1.3.
 EXPOSED = 1.5
