@@ -487,12 +487,12 @@ def test_points_of_a_real_set_fit_its_cameras(data_dir: Path, tmp_path: Path):
     root = data_dir / "dtu_scan24"
     chosen = {
         camera.name: (camera, ImageRecord(camera.name, camera.name, *camera.size, None, "", 1.0, False, ""))
-        for camera in read_poses(root).cameras[:5]
+        for camera in read_poses(root).cameras[:4]
     }
-    params = SfmParams(max_features=2000)
+    params = SfmParams(max_features=2000, max_image_size=400)
     model, _ = triangulate(tmp_path, root, chosen, params, 1, 2, pycolmap.Device.cpu, lambda *progress: None)
-    assert model.num_points3D() > 400
-    assert model.compute_mean_reprojection_error() < 0.7
+    assert model.num_points3D() > 50
+    assert model.compute_mean_reprojection_error() < 0.8
 
 
 def real_set(root: Path):
