@@ -19,7 +19,6 @@ import json
 import shutil
 import subprocess
 import sys
-import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -27,6 +26,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.ablate import score_clean_mesh
 from benchmarks.posed_sets import CAMERAS, decompose, has_cameras
 from benchmarks.run_sets import (
     NOT_MEASURED,
@@ -336,7 +336,7 @@ def run_row(row: str, data: Path, mesh: bool, preset: str) -> Row:
     if mesh and failure is None and has_truth(data / name):
         answer = _ask([*arguments, "--until", CLEAN])
         if answer["ok"]:
-            score = _score(workspace, data / name)
+            score = score_clean_mesh(workspace, workspace, data / name)
         else:
             failure = _failure(answer)
     stages = {stage["name"]: stage for stage in answer.get("stages", ())}
@@ -389,21 +389,11 @@ def _count(workspace: Path, photos: Path) -> int:
         return sum(1 for _ in photos.iterdir())
 
 
-def _score(workspace: Path, truth: Path) -> dict[str, float]:
-    from hineus_cli.scoring import score_mesh
-    from stages import artifacts
-
-    vertices, faces = artifacts.load_mesh(workspace / CLEAN)
-    world_from_scene = artifacts.load_scene(workspace / POSES).world_from_scene
-    with tempfile.TemporaryDirectory() as world:
-        artifacts.save_mesh(Path(world), world_from_scene.apply(vertices), faces)
-        return score_mesh(Path(world) / artifacts.MESH, artifacts.model_path(workspace / "sfm"), truth)
-
-
 def code_hash() -> str:
     """Hash of the sources that decide where the poses come out."""
     stages = ROOT / "stages"
-    sources = [stages / "ingest.py", stages / "sfm.py", *sorted((stages / "posing").glob("*.py"))]
+    sources = [stages / "ingest.py", stages / "sfm.py"]
+    sources += [path for package in ("capture", "posing") for path in sorted((stages / package).glob("*.py"))]
     return hashlib.sha256(b"".join(source.read_bytes() for source in sources)).hexdigest()[:8]
 
 

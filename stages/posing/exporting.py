@@ -27,9 +27,7 @@ def write_colmap(undistort: Path, sfm: Path, out: Path) -> dict[str, Any]:
     Returns:
         Numbers of images, points and observations.
     """
-    scene = artifacts.load_scene(undistort)
-    _copy_images(scene, undistort, out)
-    model = undistorted_model(scene, sfm, out / artifacts.IMAGES)
+    _, model = _images_and_model(undistort, sfm, out)
     folder = out / SPARSE
     folder.mkdir()
     model.write_binary(str(folder))
@@ -46,9 +44,7 @@ def write_transforms(undistort: Path, sfm: Path, out: Path) -> dict[str, Any]:
     Returns:
         Numbers of images, points and observations.
     """
-    scene = artifacts.load_scene(undistort)
-    _copy_images(scene, undistort, out)
-    model = undistorted_model(scene, sfm, out / artifacts.IMAGES)
+    scene, model = _images_and_model(undistort, sfm, out)
     model.export_PLY(str(out / POINTS))
     cameras = into_scene(scene.cameras, scene.world_from_scene.inverse())
     frames = []
@@ -75,6 +71,13 @@ def write_transforms(undistort: Path, sfm: Path, out: Path) -> dict[str, Any]:
         out / TRANSFORMS, {"camera_model": "OPENCV", "units": units, "ply_file_path": POINTS, "frames": frames}
     )
     return _numbers(model)
+
+
+def _images_and_model(undistort: Path, sfm: Path, out: Path) -> tuple[PosedScene, Any]:
+    """Copy images and masks to `out`; the scene, and the pycolmap model of it."""
+    scene = artifacts.load_scene(undistort)
+    _copy_images(scene, undistort, out)
+    return scene, undistorted_model(scene, sfm, out / artifacts.IMAGES)
 
 
 def undistorted_model(scene: PosedScene, sfm: Path, images_folder: Path) -> Any:
