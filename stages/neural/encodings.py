@@ -6,8 +6,9 @@ from the gradient of anything with respect to the features [N, C] to its gradien
 A normal is then the vjp of the MLP's gradient with respect to its inputs. Both are differentiable with respect to the
 table and to what the vjp is given, so training needs first-order autograd only.
 
-Two implementations agree to 1e-5: `encode_reference` (pure torch, any device) and the numba kernels behind
-`encode` on the CPU, which add the table's gradient to `table.grad` themselves: `torch.autograd.grad` does not see it.
+Three implementations agree to 1e-5: `encode_reference` (pure torch, any device), numba kernels on the CPU and Triton
+kernels on CUDA, from which `encode` chooses. Kernels add the table's gradient to `table.grad` themselves:
+`torch.autograd.grad` does not see it.
 
 Layout: C channels, level-major. A hash grid's `table` is [rows, features]; level l owns the rows
 offsets[l] .. offsets[l + 1]. A level whose full lattice fits its share is indexed densely, else by the spatial hash.
@@ -15,20 +16,26 @@ offsets[l] .. offsets[l + 1]. A level whose full lattice fits its share is index
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property, partial
+from typing import Protocol
 
 import numpy as np
 import torch
 
 from stages.neural.acceleration import takes_kernel
 
+log = logging.getLogger(__name__)
+
 # Müller et al. 2022, eq. 4: the spatial hash's factors for y and z (x has factor 1).
 PRIME_Y, PRIME_Z = 2654435761, 805459861
 # A table starts as small noise: features begin near zero, so the geometric initialisation is what is rendered.
 INITIAL_AMPLITUDE = 1e-4
+# CUDA kernels that err by more than this, relative to the largest value, are not used: float32 rounding is below.
+AGREEMENT = 1e-5
 
 
 @dataclass(frozen=True)
@@ -37,7 +44,7 @@ class HashGrid:
 
     Attributes:
         levels: number of lattices, geometrically spaced from `coarsest` to `finest` cells along a side.
-        features: channels per level (the CPU kernels are written for 4).
+        features: channels per level (the CPU kernels are written for 4, those for CUDA for powers of two).
         log2_rows: a level holds at most 2**log2_rows rows.
         coarsest, finest: cells along a side of the first and last level.
     """
@@ -110,6 +117,43 @@ Encoding = HashGrid | Frequencies
 Vjp = Callable[[torch.Tensor], torch.Tensor]
 
 
+class EncodingKernels(Protocol):
+    """What `encode` asks of the kernels of a hash grid on a device: `encoding_cpu` (numba), `encoding_cuda` (Triton).
+
+    Tensors are float32; N points, C channels. The Jacobian lies in memory as the kernels please.
+    """
+
+    def forward(
+        self, points: torch.Tensor, table: torch.Tensor, grid: HashGrid, active_levels: int
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Features [N, C] and their Jacobian."""
+
+    def features_forward(
+        self, points: torch.Tensor, table: torch.Tensor, grid: HashGrid, active_levels: int
+    ) -> torch.Tensor:
+        """Features [N, C] alone."""
+
+    def backward(
+        self,
+        points: torch.Tensor,
+        grid: HashGrid,
+        active_levels: int,
+        grad_features: torch.Tensor | None,
+        grad_jacobian: tuple[torch.Tensor, torch.Tensor] | None,
+        grad_table: torch.Tensor,
+    ) -> None:
+        """Add d loss / d table to grad_table [rows, F], given the gradients of features [N, C] and of the Jacobian.
+
+        The latter is of rank one and given by its factors g [N, 3] and u [N, C]. At least one of the two is given.
+        """
+
+    def vjp_forward(self, jacobian: torch.Tensor, cotangent: torch.Tensor) -> torch.Tensor:
+        """The Jacobian times cotangent [N, C] -> [N, 3]."""
+
+    def vjp_backward(self, jacobian: torch.Tensor, grad_gradients: torch.Tensor, channels: int) -> torch.Tensor:
+        """The transposed Jacobian times grad_gradients [N, 3] -> [N, C], C = channels."""
+
+
 def encode(
     points: torch.Tensor, table: torch.Tensor | None, encoding: Encoding, active_levels: int
 ) -> tuple[torch.Tensor, Vjp]:
@@ -117,38 +161,84 @@ def encode(
 
     Channels of levels >= active_levels are zero. A hash grid clamps points to [-1, 1]^3.
     """
-    if isinstance(encoding, Frequencies) or not _has_kernel(points, encoding):
+    kernels = kernels_for(points, encoding)
+    if kernels is None:
         return encode_reference(points, table, encoding, active_levels)
-    features, jacobian, *factors = _KernelEncode.apply(points, table, encoding, active_levels)
-    called = False
-
-    def vjp(cotangent: torch.Tensor) -> torch.Tensor:
-        nonlocal called
-        if called:  # the factors of two products cannot be added
-            raise RuntimeError("the vjp of an encoding was called twice, expected once")
-        called = True
-        return _KernelVjp.apply(cotangent, jacobian, *factors)
-
-    return features, vjp
+    assert table is not None
+    assert isinstance(encoding, HashGrid)
+    return encode_with(kernels, points, table, encoding, active_levels)
 
 
 def encode_features(
     points: torch.Tensor, table: torch.Tensor | None, encoding: Encoding, active_levels: int
 ) -> torch.Tensor:
     """Features [N, C] alone, differentiable with respect to the table: for density without normals."""
-    if isinstance(encoding, Frequencies) or not _has_kernel(points, encoding):
+    kernels = kernels_for(points, encoding)
+    if kernels is None:
         return _reference_features(points, table, encoding, active_levels)
-    return _KernelFeatures.apply(points, table, encoding, active_levels)
+    return _KernelFeatures.apply(points, table, encoding, active_levels, kernels)
 
 
-def _has_kernel(points: torch.Tensor, grid: HashGrid) -> bool:
-    return grid.features == 4 and takes_kernel(points)
+# ---------------------------------------------------------------- which kernels
+def kernels_for(points: torch.Tensor, encoding: Encoding) -> EncodingKernels | None:
+    """The kernels that take these points, or None where the reference does: frequencies, float64, no kernels."""
+    if isinstance(encoding, Frequencies):
+        return None
+    if encoding.features == 4 and takes_kernel(points):
+        from stages.neural import encoding_cpu
+
+        return encoding_cpu
+    if points.device.type == "cuda" and points.dtype == torch.float32 and _is_power_of_two(encoding.features):
+        return _cuda_kernels(encoding.features, points.device)
+    return None
 
 
+def _is_power_of_two(number: int) -> bool:
+    return number & (number - 1) == 0
+
+
+@cache
+def _cuda_kernels(features: int, device: torch.device) -> EncodingKernels | None:
+    """The Triton kernels, if they are there and do on this device what the reference does; says once if not."""
+    try:
+        from stages.neural import encoding_cuda
+
+        error = disagreement(encoding_cuda, HashGrid(3, features, 9, 4, 16), device)
+    except Exception as exception:  # Triton, its compiler and the driver raise what they like; the reference goes on
+        log.warning("no CUDA kernels for the encoding (%s): it goes in plain PyTorch, several times slower", exception)
+        return None
+    if not error < AGREEMENT:
+        log.warning("the CUDA kernels of the encoding are off by %.1e here: it goes in plain PyTorch", error)
+        return None
+    return encoding_cuda
+
+
+@torch.enable_grad()
+def disagreement(kernels: EncodingKernels, grid: HashGrid, device: torch.device | str, num_points: int = 300) -> float:
+    """Largest error of kernels against the reference, relative to the largest value: of features, of a product with the
+    Jacobian and of the gradients of both, at random points, some of which lie on the cube's faces and beyond."""
+    generator = torch.Generator().manual_seed(0)
+    points = (2.4 * torch.rand(num_points, 3, generator=generator) - 1.2).to(device)
+    values = torch.randn(grid.num_rows, grid.features, generator=generator).to(device)
+    pulls = torch.randn(num_points, grid.channels, generator=generator).to(device)
+    results = []
+    for encoder in (partial(encode_with, kernels), encode_reference):
+        table, cotangent = values.clone().requires_grad_(), pulls.clone().requires_grad_()
+        features, vjp = encoder(points, table, grid, grid.levels)
+        gradients = vjp(cotangent)
+        ((features * pulls).sum() + (gradients * torch.sin(3 * points)).sum()).backward()
+        results.append((features, gradients, cotangent.grad, table.grad))
+    return max(
+        float(((got - expected).abs().max() / expected.abs().max()).detach())
+        for got, expected in zip(*results, strict=True)
+    )
+
+
+# ---------------------------------------------------------------- the reference
 def encode_reference(
     points: torch.Tensor, table: torch.Tensor | None, encoding: Encoding, active_levels: int
 ) -> tuple[torch.Tensor, Vjp]:
-    """`encode` in plain torch: the reference of the kernels, and the path on CUDA."""
+    """`encode` in plain torch: the reference of the kernels, and what there is without them."""
     if isinstance(encoding, Frequencies):
         return _encode_frequencies(points, encoding, active_levels)
     assert table is not None
@@ -224,7 +314,7 @@ def _corners(points: torch.Tensor, grid: HashGrid, level: int) -> tuple[torch.Te
     position = (points.clamp(-1, 1) + 1) * scale
     cell = position.detach().long().clamp(0, resolution - 1)
     fraction = position - cell
-    offset = torch.tensor([0, 1], device=points.device)
+    offset = torch.arange(2, device=points.device)
     x, y, z = (cell[:, i, None] + offset for i in range(3))  # [N, 2] each
     if grid.dense[level]:
         side = resolution + 1
@@ -233,6 +323,24 @@ def _corners(points: torch.Tensor, grid: HashGrid, level: int) -> tuple[torch.Te
         hashed = x[:, :, None, None] ^ (y * PRIME_Y)[:, None, :, None] ^ (z * PRIME_Z)[:, None, None, :]
         rows = hashed & (2**grid.log2_rows - 1)
     return rows.flatten(1) + int(grid.offsets[level]), fraction, scale
+
+
+# ---------------------------------------------------------------- the kernels in autograd
+def encode_with(
+    kernels: EncodingKernels, points: torch.Tensor, table: torch.Tensor, grid: HashGrid, active_levels: int
+) -> tuple[torch.Tensor, Vjp]:
+    """`encode` by these kernels."""
+    features, jacobian, *factors = _KernelEncode.apply(points, table, grid, active_levels, kernels)
+    called = False
+
+    def vjp(cotangent: torch.Tensor) -> torch.Tensor:
+        nonlocal called
+        if called:  # the factors of two products cannot be added
+            raise RuntimeError("the vjp of an encoding was called twice, expected once")
+        called = True
+        return _KernelVjp.apply(cotangent, jacobian, kernels, *factors)
+
+    return features, vjp
 
 
 class _KernelEncode(torch.autograd.Function):
@@ -244,101 +352,63 @@ class _KernelEncode(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx, points, table, grid, active_levels):
-        from stages.neural import kernels
-
-        features = torch.empty(len(points), grid.channels)
-        jacobian = torch.empty(len(points), 3, grid.channels)
-        kernels.encode_forward(
-            points.detach().numpy(), table.detach().numpy(), grid.resolutions, grid.offsets, grid.dense,
-            active_levels, features.numpy(), jacobian.numpy(),
-        )  # fmt: skip
+    def forward(ctx, points, table, grid, active_levels, kernels):
+        features, jacobian = kernels.forward(points, table, grid, active_levels)
         ctx.save_for_backward(points, table)
-        ctx.grid, ctx.active_levels = grid, active_levels
+        ctx.grid, ctx.active_levels, ctx.kernels = grid, active_levels, kernels
         ctx.mark_non_differentiable(jacobian)
         ctx.set_materialize_grads(False)
-        return features, jacobian, torch.empty(1, 1).expand(len(points), 3), torch.empty(1, 1).expand_as(features)
+        stand_ins = (torch.empty(1, 1, device=points.device).expand(len(points), size) for size in (3, grid.channels))
+        return features, jacobian, *stand_ins
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, grad_features, _, grad_gradients, cotangent):
-        from stages.neural import kernels
-
         points, table = ctx.saved_tensors
-        grid = ctx.grid
-        arguments = (points.detach().numpy(), grid.resolutions, grid.offsets, grid.dense, ctx.active_levels)
-        if grad_gradients is None:
-            kernels.features_backward(*arguments, grad_features.contiguous().numpy(), _grad_of(table))
-        else:
-            if grad_features is None:
-                grad_features = torch.zeros_like(cotangent)
-            kernels.encode_backward(
-                *arguments, grad_features.contiguous().numpy(), grad_gradients.contiguous().numpy(),
-                cotangent.contiguous().numpy(), _grad_of(table),
-            )  # fmt: skip
-        return None, None, None, None
+        grad_jacobian = None if grad_gradients is None else (grad_gradients, cotangent)
+        ctx.kernels.backward(points, ctx.grid, ctx.active_levels, grad_features, grad_jacobian, _grad_of(table))
+        return None, None, None, None, None
 
 
-def _grad_of(table: torch.Tensor) -> np.ndarray:
+def _grad_of(table: torch.Tensor) -> torch.Tensor:
     """The table's gradient [rows, F], which the kernels add to where it lies.
 
     Through autograd each query of the encoding would make and add a gradient as large as the table.
     """
     if table.grad is None:
         table.grad = torch.zeros_like(table)
-    return table.grad.numpy()
+    return table.grad
 
 
 class _KernelVjp(torch.autograd.Function):
-    """Jacobian [N, 3, C] times cotangent [N, C] -> [N, 3]; hands its factors' gradients on (see `_KernelEncode`)."""
+    """Jacobian times cotangent [N, C] -> [N, 3]; hands its factors' gradients on (see `_KernelEncode`)."""
 
     @staticmethod
-    def forward(ctx, cotangent, jacobian, _grad_gradients, _cotangent):
-        from stages.neural import kernels
-
-        cotangent = cotangent.contiguous()
-        gradients = torch.empty(len(jacobian), 3)
-        kernels.vjp_forward(jacobian.numpy(), cotangent.detach().numpy(), gradients.numpy())
+    def forward(ctx, cotangent, jacobian, kernels, _grad_gradients, _cotangent):
         ctx.save_for_backward(cotangent, jacobian)
-        return gradients
+        ctx.kernels = kernels
+        return kernels.vjp_forward(jacobian, cotangent)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, grad_gradients):
-        from stages.neural import kernels
-
         cotangent, jacobian = ctx.saved_tensors
-        grad_gradients = grad_gradients.contiguous()
-        grad_cotangent = torch.empty_like(cotangent)
-        kernels.vjp_backward(jacobian.numpy(), grad_gradients.numpy(), grad_cotangent.numpy())
-        return grad_cotangent, None, grad_gradients, cotangent
+        grad_cotangent = ctx.kernels.vjp_backward(jacobian, grad_gradients, cotangent.shape[1])
+        return grad_cotangent, None, None, grad_gradients, cotangent
 
 
 class _KernelFeatures(torch.autograd.Function):
-    """`encode_features` through the numba kernels; gradients with respect to the table only."""
+    """Features alone; gradients with respect to the table only."""
 
     @staticmethod
-    def forward(ctx, points, table, grid, active_levels):
-        from stages.neural import kernels
-
-        features = torch.empty(len(points), grid.channels)
-        kernels.features_forward(
-            points.detach().numpy(), table.detach().numpy(), grid.resolutions, grid.offsets, grid.dense,
-            active_levels, features.numpy(),
-        )  # fmt: skip
+    def forward(ctx, points, table, grid, active_levels, kernels):
         ctx.save_for_backward(points, table)
-        ctx.grid, ctx.active_levels = grid, active_levels
-        return features
+        ctx.grid, ctx.active_levels, ctx.kernels = grid, active_levels, kernels
+        return kernels.features_forward(points, table, grid, active_levels)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, grad_features):
-        from stages.neural import kernels
-
         points, table = ctx.saved_tensors
-        grid = ctx.grid
-        kernels.features_backward(
-            points.detach().numpy(), grid.resolutions, grid.offsets, grid.dense, ctx.active_levels,
-            grad_features.contiguous().numpy(), _grad_of(table),
-        )  # fmt: skip
-        return None, None, None, None
+        ctx.kernels.backward(points, ctx.grid, ctx.active_levels, grad_features, None, _grad_of(table))
+        return None, None, None, None, None
