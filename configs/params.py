@@ -192,6 +192,11 @@ class TrainParams(Section):
     holdout: int = Field(0, ge=0, description="leave every n-th photo out and report the PSNR on those; 0: none")
     rays: int = Field(512, ge=1, description="rays per step")
     samples: int = Field(16, ge=2, description="samples per ray inside the region of interest")
+    precision: Literal["auto", "float32", "mixed"] = Field(
+        "auto",
+        description="matrix products of the networks: float32, or bfloat16 for colours and, on CUDA, TF32 for the "
+        "distance; auto: mixed on CUDA only",
+    )
     free_points: int = Field(256, ge=0, description="points per step anywhere in the region, for the Eikonal term")
 
     backbone: Literal["hineus", "neus2", "hfneus", "neuralangelo"] = Field(

@@ -1,18 +1,63 @@
-"""Which implementation takes a tensor: the numba kernels, or plain PyTorch."""
+"""What suits a device: numba kernels or plain PyTorch, rows picked out or shapes that stay, products how precise."""
 
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import cache
 
 import torch
 
 log = logging.getLogger(__name__)
 
+# Devices that work while the host goes on. To ask for a number, or for how many rows pass a test, is to wait for them.
+ASYNCHRONOUS = {"cuda"}
+
 
 def takes_kernel(*tensors: torch.Tensor) -> bool:
     """Whether the kernels of `stages.neural.kernels` take these: float32 on the CPU, and numba is there."""
     return all(t.device.type == "cpu" and t.dtype == torch.float32 for t in tensors) and _has_numba()
+
+
+def fixed_shapes(device: torch.device) -> bool:
+    """Whether shapes should not depend on the data: on CUDA all rows are computed and those not needed masked out.
+
+    On the CPU only the rows that are needed are computed.
+    """
+    return device.type in ASYNCHRONOUS
+
+
+def first_rows(chosen: torch.Tensor, count: int) -> torch.Tensor:
+    """Indices [count] of the first rows that are chosen [N] bool, from the start again where they are fewer.
+
+    Without waiting for how many they are. Where none is chosen, the last row.
+    """
+    upto = torch.cumsum(chosen, 0)
+    rank = torch.arange(count, device=chosen.device) % upto[-1].clamp(min=1)
+    return torch.searchsorted(upto, rank + 1).clamp(max=len(chosen) - 1)
+
+
+def is_mixed(precision: str, device: torch.device) -> bool:
+    """Whether the setting `train.precision` means mixed precision on this device."""
+    return precision == "mixed" or (precision == "auto" and device.type == "cuda")
+
+
+@contextmanager
+def short_products(wanted: bool, device: torch.device) -> Iterator[None]:
+    """Where wanted, float32 products on CUDA take 10 bits of their factors' mantissas and sum in float32 (TF32).
+
+    Not for all of a program: a ray's direction is a product, too, and would be off by half a pixel.
+    """
+    if not wanted or device.type != "cuda":
+        yield
+        return
+    before = torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision("high")
+    try:
+        yield
+    finally:
+        torch.set_float32_matmul_precision(before)
 
 
 @cache

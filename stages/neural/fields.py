@@ -11,10 +11,10 @@ from dataclasses import dataclass
 import torch
 from torch import nn
 
-from stages.neural.acceleration import takes_kernel
+from stages.neural.acceleration import short_products, takes_kernel
 from stages.neural.appearance import FeatureMlp
 from stages.neural.encodings import Encoding, Frequencies, HashGrid, encode, encode_features
-from stages.neural.mlp import kaiming_uniform, mlp, spherical_harmonics
+from stages.neural.mlp import Mlp, kaiming_uniform, mlp, spherical_harmonics
 from stages.neural.proposal import ProposalNetwork
 from stages.neural.reflection import ReflectionNetwork
 
@@ -111,7 +111,12 @@ class SdfNetwork(nn.Module):
 
     The analytic sphere is the geometric initialisation: f is that sphere at step 0, whatever the width and depth. A
     hash encoding is silent then. Frequencies are not, so that their columns of the first layer start at zero.
+
+    Attributes:
+        short: whether products are TF32 on CUDA where f and its gradient are asked for together.
     """
+
+    short = False
 
     def __init__(self, shape: FieldShape, generator: torch.Generator) -> None:
         super().__init__()
@@ -139,11 +144,12 @@ class SdfNetwork(nn.Module):
             values, features, _ = self._mlp(encoded)
             return (values + radius).squeeze(1) - self.radius, features, self._differences(points, active_levels)
         encoded, vjp = encode(points, self.table, self.grid, active_levels)
-        values, features, slopes = self._mlp(encoded)
-        *hidden, last = self.weights
-        cotangent = last[0]  # d MLP / d activation, pulled back to d MLP / d encoding, [N, C]
-        for weight, slope in zip(reversed(hidden), reversed(slopes), strict=True):
-            cotangent = (slope * cotangent) @ weight
+        with short_products(self.short, points.device):
+            values, features, slopes = self._mlp(encoded)
+            *hidden, last = self.weights
+            cotangent = last[0]  # d MLP / d activation, pulled back to d MLP / d encoding, [N, C]
+            for weight, slope in zip(reversed(hidden), reversed(slopes), strict=True):
+                cotangent = (slope * cotangent) @ weight
         gradients = vjp(cotangent) + points / radius.clamp(min=1e-6)
         return (values + radius).squeeze(1) - self.radius, features, gradients
 
@@ -240,6 +246,13 @@ class Fields(nn.Module):
         self.appearance = FeatureMlp(generator) if shape.appearance else None
         self.proposal = ProposalNetwork(generator) if shape.proposal else None
         self.log_scale = None if shape.learned_scale is None else nn.Parameter(torch.tensor(shape.learned_scale).log())
+
+    def use_mixed_precision(self) -> None:
+        """From now on short products: bfloat16 for colours, TF32 for the distance (`docs/adr/0009`)."""
+        self.sdf.short = True
+        for module in self.modules():
+            if isinstance(module, Mlp):
+                module.mixed = True
 
     def tables(self) -> list[nn.Parameter]:
         """The hash tables, which learn at a rate of their own."""

@@ -12,7 +12,26 @@ import torch
 from torch import nn
 
 
-def mlp(widths: list[int], generator: torch.Generator) -> nn.Sequential:
+class Mlp(nn.Sequential):
+    """Layers one after the other.
+
+    Attributes:
+        mixed: whether products and activations are bfloat16; inputs, outputs, weights and their gradients are float32
+            all the same. For colours: outputs are off by about 1/256 of themselves, half a grey level after a sigmoid.
+            Distances need more.
+    """
+
+    mixed = False
+
+    def forward(self, inputs: torch.Tensor) -> torch.Tensor:
+        if not self.mixed:
+            return super().forward(inputs)
+        with torch.autocast(inputs.device.type, torch.bfloat16):
+            outputs = super().forward(inputs)
+        return outputs.float()
+
+
+def mlp(widths: list[int], generator: torch.Generator) -> Mlp:
     """Linear layers from widths[0] inputs to widths[-1] outputs with ReLUs between; small last weights, no biases."""
     layers: list[nn.Module] = []
     for i, (columns, rows) in enumerate(itertools.pairwise(widths)):
@@ -21,7 +40,7 @@ def mlp(widths: list[int], generator: torch.Generator) -> nn.Sequential:
         layer.weight.data = kaiming_uniform(rows, columns, generator) * (0.3 if last else 1.0)
         layer.bias.data.zero_()
         layers += [layer] if last else [layer, nn.ReLU()]
-    return nn.Sequential(*layers)
+    return Mlp(*layers)
 
 
 def kaiming_uniform(rows: int, columns: int, generator: torch.Generator) -> torch.Tensor:

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from stages.geometry.cameras import PinholeCameras
+from stages.neural.acceleration import first_rows, fixed_shapes
 from stages.neural.sampling import intersect_unit_sphere
 
 # More rays are drawn than asked for, since some of a box's rays miss the sphere: a box is 4 / pi its ellipse.
@@ -87,7 +88,10 @@ class Photos:
         return self.masks[first : first + width * height].view(height, width).cpu().numpy()
 
     def draw(self, num_rays: int, generator: torch.Generator) -> RayBatch:
-        """At most num_rays random rays through the unit sphere, photos for training equally likely."""
+        """At most num_rays random rays through the unit sphere, photos for training equally likely.
+
+        On CUDA exactly as many: where fewer of those drawn cross the sphere, the first are taken again.
+        """
         count = int(num_rays * _OVERDRAW)
         images = self._drawn[torch.randint(len(self._drawn), (count,), generator=generator, device=self.device)]
         place = torch.rand(count, 2, generator=generator, device=self.device)
@@ -112,13 +116,19 @@ class Photos:
         return self.pixels[rows].float() / 255, inside
 
     def rays(self, images: torch.Tensor, pixels: torch.Tensor, limit: int | None = None) -> RayBatch:
-        """Rays through the centres of integer pixels [R, 2] (x, y) of photos [R]; those that miss are dropped."""
+        """Rays through the centres of integer pixels [R, 2] (x, y) of photos [R]; those that miss are dropped.
+
+        With a limit the first that hit, as `draw` wants them.
+        """
         homogeneous = torch.nn.functional.pad(pixels + 0.5, (0, 1), value=1.0)
         directions = torch.bmm(self.scene_from_pixel[images], homogeneous.unsqueeze(2)).squeeze(2)
         directions = torch.nn.functional.normalize(directions, dim=1)
         origins = self.centers[images]
         entry, leave, hit = intersect_unit_sphere(origins, directions)
-        kept = torch.nonzero(hit).squeeze(1)[:limit]
+        if limit is not None and fixed_shapes(self.device):
+            kept = first_rows(hit, limit)
+        else:
+            kept = torch.nonzero(hit).squeeze(1)[:limit]
         images, pixels = images[kept], pixels[kept].long()
         rows = self.first[images] + pixels[:, 1] * self.sizes[images, 0] + pixels[:, 0]
         return RayBatch(

@@ -12,6 +12,7 @@ import torch
 
 from configs.params import TrainParams
 from stages.neural import reflection
+from stages.neural.acceleration import fixed_shapes
 from stages.neural.fields import BackgroundNetwork, Fields
 from stages.neural.photos import RayBatch
 from stages.neural.proposal import proposal_distances
@@ -21,6 +22,8 @@ from stages.neural.schedules import Moment
 
 # Samples that weigh less than this get no colour: together they change a pixel by less than one grey level.
 _COLOR_THRESHOLD = 2e-4
+# Rays that let less than this through show nothing of the background: two grey levels at most.
+_BACKGROUND_THRESHOLD = 0.01
 # Rays more opaque than this count as having met a surface.
 OPAQUE = 0.5
 # Reflected rays that meet something with less than this probability are not followed: under one grey level.
@@ -98,13 +101,7 @@ class Renderer:
             sdf[:num_points].view(num_rays, num_samples), distances, moment.scale, self.params.density
         )
 
-        seen = torch.nonzero(weights.detach().view(-1) > _COLOR_THRESHOLD).squeeze(1)
-        ray = seen // num_samples
-        normals = torch.nn.functional.normalize(gradients[seen], dim=1)
-        sample_colors = self.fields.radiance(points[seen], normals, batch.directions[ray], features[seen])
-        colors = torch.zeros(num_rays, 3, device=points.device).index_add(
-            0, ray, weights.view(-1)[seen, None] * sample_colors
-        )
+        colors = self._colors(batch, weights, points, gradients, features)
         if self.fields.background is not None:
             colors = colors + self._background(self.fields.background, batch, transmittance, generator)
         rendered = Rendered(
@@ -128,6 +125,32 @@ class Renderer:
             params.proposal_samples, params.samples, generator,
         )  # fmt: skip
         return distances, (edges, weights)
+
+    def _colors(
+        self,
+        batch: RayBatch,
+        weights: torch.Tensor,
+        points: torch.Tensor,
+        gradients: torch.Tensor,
+        features: torch.Tensor,
+    ) -> torch.Tensor:
+        """Colour [R, 3] of the samples that weigh enough, weighted and summed over each ray.
+
+        The first N of the gradients [N + E, 3] and features [N + E, G] belong to the samples.
+        """
+        num_rays, num_samples = weights.shape
+        heavy = weights.detach().view(-1) > _COLOR_THRESHOLD
+        if fixed_shapes(weights.device):
+            directions = batch.directions[:, None].expand(-1, num_samples, -1).reshape(-1, 3)
+            normals = torch.nn.functional.normalize(gradients[: len(points)], dim=1)
+            colors = self.fields.radiance(points, normals, directions, features[: len(points)])
+            return composite(weights * heavy.view_as(weights), colors.view(num_rays, num_samples, 3))
+        seen = torch.nonzero(heavy).squeeze(1)
+        ray = seen // num_samples
+        normals = torch.nn.functional.normalize(gradients[seen], dim=1)
+        colors = self.fields.radiance(points[seen], normals, batch.directions[ray], features[seen])
+        nothing = torch.zeros(num_rays, 3, device=points.device)
+        return nothing.index_add(0, ray, weights.view(-1)[seen, None] * colors)
 
     def _with_reflections(self, rendered: Rendered, moment: Moment, generator: torch.Generator | None) -> Rendered:
         """C' = (1 - rho S) C + rho S g of the rays that met a surface (paper, Self-Reflection Compensation).
@@ -177,15 +200,30 @@ class Renderer:
         transmittance: torch.Tensor,
         generator: torch.Generator | None,
     ) -> torch.Tensor:
-        """Background colour [R, 3] weighted by the transmittance [R] that the surface leaves.
+        """Background colour [R, 3] weighted by the transmittance [R] that the surface leaves."""
+        shining = transmittance.detach() > _BACKGROUND_THRESHOLD
+        if fixed_shapes(transmittance.device):
+            color = self._background_color(background, batch.origins, batch.directions, generator)
+            return (transmittance * shining)[:, None] * color
+        behind = torch.nonzero(shining).squeeze(1)
+        color = self._background_color(background, batch.origins[behind], batch.directions[behind], generator)
+        nothing = torch.zeros(len(batch.leave), 3, device=transmittance.device)
+        return nothing.index_add(0, behind, transmittance[behind, None] * color)
+
+    def _background_color(
+        self,
+        background: BackgroundNetwork,
+        origins: torch.Tensor,
+        directions: torch.Tensor,
+        generator: torch.Generator | None,
+    ) -> torch.Tensor:
+        """What rays [Q] see of the background, colours [Q, 3].
 
         Samples are even in the inverse of their distance from the scene's centre, from the unit sphere outwards
         (NeRF++), so that half of them look at what lies within twice the region's radius.
         """
-        count, device = self.params.background_samples, transmittance.device
-        behind = torch.nonzero(transmittance.detach() > 0.01).squeeze(1)
-        origins, directions = batch.origins[behind], batch.directions[behind]
-        inverse = 1 - _BACKGROUND_REACH * stratified(len(behind), count + 1, generator, device)
+        count = self.params.background_samples
+        inverse = 1 - _BACKGROUND_REACH * stratified(len(origins), count + 1, generator, origins.device)
         middle = -(origins * directions).sum(1, keepdim=True)
         closest_squared = (origins**2).sum(1, keepdim=True) - middle**2
         distances = middle + (1 / inverse**2 - closest_squared).clamp(min=0).sqrt()
@@ -194,9 +232,8 @@ class Renderer:
         delta = inverse[:, :-1] - inverse[:, 1:]  # the contracted radius is 2 - inverse
         dirs = directions[:, None].expand(-1, count, -1).reshape(-1, 3)
         density, colors = background(points, dirs)
-        tau = density.view(len(behind), count) * delta
+        tau = density.view(len(origins), count) * delta
         weights, left = weights_from_optical_depth(tau)
         # What is left behind the last sample belongs to it: the background is opaque at infinity.
         weights = torch.cat([weights[:, :-1], weights[:, -1:] + left[:, None]], 1)
-        color = composite(weights, colors.view(len(behind), count, 3))
-        return torch.zeros(len(batch.leave), 3, device=device).index_add(0, behind, transmittance[behind, None] * color)
+        return composite(weights, colors.view(len(origins), count, 3))

@@ -121,9 +121,12 @@ class Terms:
         Zero without the MLP, and in the paper's form.
         """
         mlp, params, batch = self.fields.appearance, self.params, rendered.batch
+        nothing = torch.zeros((), device=self.device)
+        if mlp is None or "stable" not in (params.planar, params.eikonal):
+            return nothing
         hit = torch.nonzero(rendered.opacity.detach() > OPAQUE).squeeze(1)[: params.planar_rays]
-        if mlp is None or "stable" not in (params.planar, params.eikonal) or len(hit) == 0:
-            return torch.zeros((), device=self.device)
+        if len(hit) == 0:
+            return nothing
         surface = rendered.surface[0][hit]
         predicted = mlp.color(mlp(surface, batch.directions[hit]))
         gains = torch.exp(self.fields.log_gains.detach())[batch.images[hit]]

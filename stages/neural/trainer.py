@@ -12,6 +12,7 @@ import torch
 
 from configs.params import TrainParams
 from stages.neural import losses, schedules
+from stages.neural.acceleration import is_mixed, short_products
 from stages.neural.encodings import Frequencies, HashGrid
 from stages.neural.fields import Fields, FieldShape, points_at_a_time
 from stages.neural.photos import Photos, RayBatch
@@ -57,6 +58,9 @@ class Trainer:
         self.device = torch.device(device)
         background = params.background and photos.masks is None
         self.fields = Fields(field_shape(params, len(photos), background), params.seed).to(device)
+        self.mixed = is_mixed(params.precision, self.device)
+        if self.mixed:
+            self.fields.use_mixed_precision()
         tables = self.fields.tables()
         table_ids = {id(table) for table in tables}
         networks = [p for p in self.fields.parameters() if id(p) not in table_ids]
@@ -163,7 +167,8 @@ class Trainer:
             + proposal_loss
         )
         self._forget_gradients()
-        loss.backward()
+        with short_products(self.mixed, self.device):
+            loss.backward()
         decay = schedules.warm_up_then_decay if params.lr_decay == "cosine" else schedules.warm_up_then_exponential
         factor = decay(progress, params.lr_warm_up, params.lr_final)
         for group in self.optimizer.param_groups:
