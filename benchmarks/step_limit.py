@@ -1,17 +1,18 @@
-"""How near the networks' step comes to what this machine can do, and what its cores add.
+"""How fast a training step is with each implementation of the encoding, and how near that is to this machine's limit.
 
-python -m benchmarks.step_limit
+python -m benchmarks.step_limit                  the GPU where there is one, else the CPU
+python -m benchmarks.step_limit --device cpu
 
-The step: signed distance, normal and colour of 16k points on rays, one backward pass through all of them and one step
-of the optimiser; eight levels of four features, a hidden layer of 64 for the distance, two for the colour. No rays are
-drawn, no background, nothing else of a training step.
+The networks' step: signed distance, normal and colour of points on rays (16k on a CPU, 128k on a GPU), one backward
+pass through all of them and one step of the optimiser, with the networks of the preset `cpu` (`gpu`): no rays are
+drawn, no background, nothing else of a training step. The whole step is a training step of that preset, on noise.
 
-The limit: the matrix products of that step and its reads and additions in the table, alone, one after the other: with
-those shapes, on the same points, as fast as this machine does them. All else (interpolation, activations, losses, the
-optimiser) would have to cost nothing to reach it.
+The limit: the matrix products of the networks' step and its reads and additions in the table, alone, one after the
+other: with those shapes, on the same points, as fast as this machine does them. All else (interpolation, activations,
+losses, the optimiser) would have to cost nothing to reach it. On a GPU the products are as short as training has them.
 
-Median seconds over repetitions; what is compared takes turns. A run with all threads is set against one with a single
-thread; so are two processes with a thread each, to see what the second core adds where nothing has to be shared.
+Median seconds over repetitions; what is compared takes turns. On a CPU a run with all threads is set against one with a
+single thread; so are two processes with a thread each, to see what the second core adds where nothing has to be shared.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from __future__ import annotations
 import argparse
 import itertools
 import multiprocessing
+import resource
 import statistics
 import sys
 import time
@@ -30,57 +32,85 @@ import torch
 from numba import njit, prange
 
 from benchmarks.run_sets import markdown_table
-from benchmarks.step_speed import POINTS, alternate
-from stages.neural import encodings, fields, losses
+from benchmarks.step_speed import (
+    CHOSEN,
+    POINTS,
+    Encoder,
+    alternate,
+    ball_trainer,
+    best_device,
+    cores_of,
+    encoders,
+    points_of_step,
+    preset_for,
+    training_step,
+)
+from configs.load import load_config
+from configs.params import TrainParams
+from stages.neural import encodings, losses
+from stages.neural.acceleration import short_products
 from stages.neural.encodings import HashGrid
 from stages.neural.fields import Fields, FieldShape
+from stages.neural.trainer import field_shape
 
-LOG2_ROWS = (15, 17)
+LOG2_ROWS = {"cpu": (15, 17), "cuda": (17, 19)}
 PROCESS_SECONDS = 4.0  # each process of the two works that long
 
 
-def shape_of(log2_rows: int) -> FieldShape:
-    """The networks of the `cpu` preset, with tables of 2**log2_rows rows a level."""
-    return FieldShape(HashGrid(log2_rows=log2_rows), 1, 64, 2, 64, True, 15, 0.5, None, 1)
+def settings(log2_rows: int, device: str) -> TrainParams:
+    """The preset of the device, with tables of 2**log2_rows rows a level."""
+    return load_config(preset_for(device), None, [f"train.log2_rows={log2_rows}"]).train
 
 
-def points_on_rays() -> tuple[torch.Tensor, torch.Tensor]:
+def shape_of(log2_rows: int, device: str = "cpu") -> FieldShape:
+    """The networks of that preset, without a background."""
+    return field_shape(settings(log2_rows, device), 1, background=False)
+
+
+def points_on_rays(device: str) -> tuple[torch.Tensor, torch.Tensor]:
     """Points [N, 3], 16 each near the middle of random lines, and the lines' directions [N, 3]."""
-    generator = torch.Generator().manual_seed(0)
-    starts = 1.2 * torch.rand(POINTS // 16, 1, 3, generator=generator) - 0.6
-    directions = torch.nn.functional.normalize(torch.randn(POINTS // 16, 1, 3, generator=generator), dim=2)
+    generator, rays = torch.Generator().manual_seed(0), POINTS[device] // 16
+    starts = 1.2 * torch.rand(rays, 1, 3, generator=generator) - 0.6
+    directions = torch.nn.functional.normalize(torch.randn(rays, 1, 3, generator=generator), dim=2)
     points = starts + 0.02 * directions * torch.arange(16)[:, None]
-    return points.reshape(-1, 3).contiguous(), directions.expand(-1, 16, -1).reshape(-1, 3).contiguous()
+    directions = directions.expand(-1, 16, -1)
+    return tuple(each.reshape(-1, 3).contiguous().to(device) for each in (points, directions))
 
 
 # ---------------------------------------------------------------- the step
-def networks_step(shape: FieldShape, kernels: bool = True) -> Callable[[], None]:
-    """One step of the networks alone, with the kernels or in plain PyTorch."""
-    networks = Fields(shape)
+def networks_step(shape: FieldShape, encoder: Encoder = CHOSEN, device: str = "cpu") -> Callable[[], None]:
+    """One step of the networks alone."""
+    networks = Fields(shape).to(device)
+    on_gpu = device == "cuda"
+    if on_gpu:
+        networks.use_mixed_precision()
     optimizer = torch.optim.Adam(networks.parameters(), lr=1e-3, betas=(0.9, 0.99), eps=1e-15, fused=True)
-    points, directions = points_on_rays()
-    observed = torch.rand(POINTS, 3, generator=torch.Generator().manual_seed(1))
+    points, directions = points_on_rays(device)
+    observed = torch.rand(len(points), 3, generator=torch.Generator().manual_seed(1)).to(device)
     table = networks.sdf.table
-    encode = encodings.encode if kernels else encodings.encode_reference
 
     def step() -> None:
-        fields.encode = encode
+        encoder.use()
         sdf, features, gradients = networks.sdf(points, shape.sdf_grid.levels)
         colors = networks.radiance(points, torch.nn.functional.normalize(gradients, dim=1), directions, features)
         loss = losses.rgb_error(colors, observed).mean() + losses.eikonal_error(gradients).mean() + sdf.abs().mean()
         kept = table.grad
         optimizer.zero_grad(set_to_none=True)
         table.grad = None if kept is None else kept.zero_()
-        loss.backward()
+        with short_products(on_gpu, points.device):
+            loss.backward()
         optimizer.step()
-        fields.encode = encodings.encode
+        CHOSEN.use()
 
     return step
 
 
 # ---------------------------------------------------------------- the limit
-def products(shape: FieldShape) -> list[tuple[int, int, int]]:
-    """The matrix products of one step as (rows, inner, columns), N written as 0."""
+Product = tuple[int, int, int]
+
+
+def products(shape: FieldShape) -> tuple[list[Product], list[Product]]:
+    """The matrix products of one step as (rows, inner, columns), N written as 0: of the distance and of the colour."""
     encoded, width, outputs = shape.sdf_grid.channels, shape.sdf_width, 1 + shape.features
     distance = [
         (0, encoded, width), (0, width, outputs),  # forward
@@ -94,21 +124,24 @@ def products(shape: FieldShape) -> list[tuple[int, int, int]]:
         for before, after in itertools.pairwise(widths)
         for product in ((0, before, after), (0, after, before), (after, 0, before))
     ]
-    return distance + color
+    return distance, color
 
 
-def product_pass(shape: FieldShape) -> Callable[[], None]:
+def product_pass(shape: FieldShape, device: str) -> Callable[[], None]:
     """All matrix products of one step into memory that is there."""
     generator = torch.Generator().manual_seed(0)
     operands = []
-    for sizes in products(shape):
-        rows, inner, columns = (size or POINTS for size in sizes)
-        left, right = (torch.rand(*size, generator=generator) for size in ((rows, inner), (inner, columns)))
-        operands.append((left, right, torch.empty(rows, columns)))
+    for part, dtype in zip(products(shape), (torch.float32, torch.bfloat16), strict=True):
+        dtype = dtype if device == "cuda" else torch.float32
+        for sizes in part:
+            rows, inner, columns = (size or POINTS[device] for size in sizes)
+            left, right = (torch.rand(*size, generator=generator) for size in ((rows, inner), (inner, columns)))
+            operands.append(tuple(each.to(device, dtype) for each in (left, right, torch.empty(rows, columns))))
 
     def run() -> None:
-        for left, right, out in operands:
-            torch.mm(left, right, out=out)
+        with short_products(True, torch.device(device)):
+            for left, right, out in operands:
+                torch.mm(left, right, out=out)
 
     return run
 
@@ -136,17 +169,33 @@ def _add_to_rows(table, rows, sums, corners):
                     table[row, f] += sums[i, f]
 
 
-def table_pass(grid: HashGrid) -> Callable[[], None]:
+def table_pass(grid: HashGrid, device: str) -> Callable[[], None]:
     """The reads and the additions of one step: each point's eight rows on every level, once each way."""
-    points, _ = points_on_rays()
+    points, _ = points_on_rays(device)
     rows = torch.cat([encodings._corners(points, grid, level)[0] for level in range(grid.levels)], 1)
-    rows = rows.numpy().astype(np.uint32)
+    if device == "cuda":
+        return _table_pass_on_gpu(rows, grid)
     table = np.zeros((grid.num_rows, grid.features), np.float32)
-    sums = np.ones((POINTS, 4), np.float32)
+    sums = np.ones((len(points), 4), np.float32)
+    places = rows.numpy().astype(np.uint32)
 
     def run() -> None:
-        _read_rows(table, rows, sums)
-        _add_to_rows(table, rows, sums, 8)
+        _read_rows(table, places, sums)
+        _add_to_rows(table, places, sums, 8)
+
+    return run
+
+
+def _table_pass_on_gpu(rows: torch.Tensor, grid: HashGrid) -> Callable[[], None]:
+    """Level after level, so that the rows in use are few, as the kernels have it."""
+    table = torch.zeros(grid.num_rows, grid.features, device=rows.device)
+    one = torch.ones(1, grid.features, device=rows.device)
+    levels = [part.contiguous() for part in rows.split(8, 1)]
+
+    def run() -> None:
+        for part in levels:
+            torch.nn.functional.embedding_bag(part, table, mode="sum")
+            table.index_add_(0, part.view(-1), one.expand(part.numel(), -1))
 
     return run
 
@@ -155,7 +204,7 @@ def table_pass(grid: HashGrid) -> Callable[[], None]:
 def _steps_in(seconds: float, start, results) -> None:
     """Steps a second of a process with one thread, once all are ready."""
     use_threads(1)
-    step = networks_step(shape_of(LOG2_ROWS[0]))
+    step = networks_step(shape_of(LOG2_ROWS["cpu"][0]))
     for _ in range(3):
         step()
     start.wait()
@@ -186,37 +235,63 @@ def use_threads(count: int) -> None:
     numba.set_num_threads(count)
 
 
-def limit_rows(threads: int) -> list[list[str]]:
-    """Rows of the table for a number of threads: kilo-points a second and core."""
-    use_threads(threads)
-    rows = []
-    for log2_rows in LOG2_ROWS:
-        shape = shape_of(log2_rows)
-        step, plain, matrix, table = alternate(
-            networks_step(shape), networks_step(shape, kernels=False), product_pass(shape), table_pass(shape.sdf_grid)
+def limit_rows(device: str) -> list[list[str]]:
+    """Rows of the table with the threads that are in use now: kilo-points a second and core."""
+    rows, cores = [], cores_of(device)
+    for log2_rows in LOG2_ROWS[device]:
+        params, shape = settings(log2_rows, device), shape_of(log2_rows, device)
+        found = encoders(device, shape.sdf_grid)
+        *steps, matrix, table = alternate(
+            *(networks_step(shape, encoder, device) for encoder in found),
+            *(training_step(ball_trainer(params, device), encoder) for encoder in found),
+            product_pass(shape, device),
+            table_pass(shape.sdf_grid, device),
         )
-        rates = [POINTS / seconds / threads / 1000 for seconds in (step, plain, matrix + table)]
-        parts = f"{1000 * matrix:.1f} + {1000 * table:.1f}"
-        reached = f"{100 * (matrix + table) / step:.0f} %"
-        cells = [f"2^{log2_rows}", str(threads), *(f"{rate:.0f}" for rate in rates), parts, reached]
-        rows.append(cells)
+        limit = matrix + table
+        for encoder, networks, whole in zip(found, steps, steps[len(found) :], strict=False):
+            rates = [
+                count / seconds / cores / 1000
+                for count, seconds in (
+                    (POINTS[device], networks), (points_of_step(params), whole), (POINTS[device], limit),
+                )
+            ]  # fmt: skip
+            place = "GPU" if device == "cuda" else str(cores)
+            reached, parts = f"{100 * limit / networks:.0f} %", f"{1000 * matrix:.1f} + {1000 * table:.1f}"
+            rows.append([f"2^{log2_rows}", place, encoder.name, *(f"{rate:.0f}" for rate in rates), parts, reached])
     return rows
 
 
+def peak_memory(device: str) -> str:
+    """The most that this process has held so far."""
+    resident = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+    on_gpu = f", {torch.cuda.max_memory_allocated() / 2**30:.2f} GiB on the GPU" if device == "cuda" else ""
+    return f"Peak memory of all of this: {resident:.2f} GiB{on_gpu}."
+
+
 def main(argv: Sequence[str] | None = None) -> int:
-    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args(argv)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--device", choices=["cpu", "cuda"], default=best_device(), help="default: %(default)s")
+    device = parser.parse_args(argv).device
     cores = torch.get_num_threads()
-    counts = sorted({1, cores})
+    counts = sorted({1, cores}) if device == "cpu" else [cores]
     header = [
-        "rows a level", "threads", "step, kpt/s/core", "in PyTorch", "limit", "products + table, ms", "of the limit",
+        "rows a level", "threads", "encoding", "networks' step, kpt/s/core", "whole step, kpt/s/core", "limit",
+        "products + table, ms", "networks of the limit",
     ]  # fmt: skip
-    rows = [row for threads in counts for row in limit_rows(threads)]
+    rows = []
+    for threads in counts:
+        use_threads(threads)
+        rows += limit_rows(device)
     print(markdown_table(header, sorted(rows)))
+    print(f"\n{peak_memory(device)}")
+    if device == "cuda":
+        print(torch.cuda.get_device_name())
+        return 0
     seconds = {}
     for threads in counts:
         use_threads(threads)
-        seconds[threads] = statistics.median(alternate(networks_step(shape_of(LOG2_ROWS[0]))))
-    print(f"\n{cores} threads make the step {seconds[1] / seconds[cores]:.2f} times as fast as one.")
+        seconds[threads] = statistics.median(alternate(networks_step(shape_of(LOG2_ROWS["cpu"][0]))))
+    print(f"{cores} threads make the step {seconds[1] / seconds[cores]:.2f} times as fast as one.")
     alone, together = rate_of_processes(1), rate_of_processes(cores)
     print(f"{cores} processes with a thread each do {together / alone:.2f} times the steps of one.")
     return 0

@@ -1,12 +1,13 @@
-"""How fast a training step is: the CPU kernels against plain PyTorch, and what each part of the method costs.
+"""How fast a training step is: the kernels against plain PyTorch, and what each part of the method costs.
 
 python -m benchmarks.step_speed                                      both tables
 python -m benchmarks.step_speed kernels                              the first
 python -m benchmarks.step_speed parts --variants all --rounds 20     the second, of these variants of the ablation
 
-Medians over repetitions on this machine, all cores; what is compared takes turns, so that a drifting machine hits all.
+Medians over repetitions on this machine, all cores, or its GPU where there is one (`--device cpu`: not); what is
+compared takes turns, so that a drifting machine hits all.
 
-The kernels' scene is a ball seen by eight cameras, the networks are those of the default settings.
+The kernels' scene is a ball seen by eight cameras, the networks are those of the preset `cpu`, or `gpu` on one.
 
 The parts' scene is a heap of balls seen by 47 cameras. The base learns it for a while, all variants start from what it
 has learned, and they are timed at the middle of the training, when every part is at work. Their learning rates are zero
@@ -22,6 +23,7 @@ import statistics
 import sys
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -34,11 +36,13 @@ from configs.params import TrainParams
 from stages.geometry.cameras import PinholeCameras, PosedScene
 from stages.geometry.similarity import Similarity
 from stages.neural import encodings, fields
+from stages.neural.encodings import HashGrid
 from stages.neural.photos import Photos
-from stages.neural.trainer import Sightings, Trainer
+from stages.neural.sightings import Sightings
+from stages.neural.trainer import Trainer, field_shape
 
 REPETITIONS = 15
-POINTS = 16384
+POINTS = {"cpu": 1 << 14, "cuda": 1 << 17}
 PROGRESS = 0.7  # all levels in use
 
 # What is timed if nothing else is asked for: each part alone and all together, then the paper's forms, then choices.
@@ -53,6 +57,16 @@ LEARNING_STEPS = 100
 STEPS_PER_TURN = 2
 
 
+def best_device() -> str:
+    return "cuda" if torch.cuda.is_available() else "cpu"
+
+
+def finish() -> None:
+    """Wait until a GPU has done what it was given."""
+    if torch.cuda.is_available():
+        torch.cuda.synchronize()
+
+
 def alternate(*functions: Callable[[], object]) -> list[float]:
     """Median seconds of each function, called in turn after one warm-up each."""
     for function in functions:
@@ -60,20 +74,46 @@ def alternate(*functions: Callable[[], object]) -> list[float]:
     seconds: list[list[float]] = [[] for _ in functions]
     for _ in range(REPETITIONS):
         for function, times in zip(functions, seconds, strict=True):
+            finish()
             started = time.perf_counter()
             function()
+            finish()
             times.append(time.perf_counter() - started)
     return [statistics.median(times) for times in seconds]
 
 
-def encoding_pass(encode: Callable, grid: encodings.HashGrid) -> Callable[[], None]:
+@dataclass(frozen=True)
+class Encoder:
+    """An implementation of the encoding: `encode` and `encode_features` of `stages.neural.encodings`."""
+
+    name: str
+    encode: Callable
+    encode_features: Callable
+
+    def use(self) -> None:
+        """Let the networks call it."""
+        fields.encode, fields.encode_features = self.encode, self.encode_features
+
+
+REFERENCE = Encoder("PyTorch", encodings.encode_reference, encodings._reference_features)
+CHOSEN = Encoder("chosen", encodings.encode, encodings.encode_features)  # as training takes them
+
+
+def encoders(device: str, grid: HashGrid) -> list[Encoder]:
+    """The implementations there are on a device: its kernels first, then plain PyTorch."""
+    if encodings.kernels_for(torch.zeros(1, 3, device=device), grid) is None:
+        return [REFERENCE]
+    return [replace(CHOSEN, name="Triton" if device == "cuda" else "numba"), REFERENCE]
+
+
+def encoding_pass(encode: Callable, grid: HashGrid, device: str = "cpu") -> Callable[[], None]:
     """Features and spatial gradients of points along rays, and their backward pass."""
-    generator = torch.Generator().manual_seed(0)
-    table = torch.randn(grid.num_rows, grid.features, generator=generator).requires_grad_()
-    starts = torch.rand(POINTS // 16, 1, 3, generator=generator) - 0.5
-    steps = 0.02 * torch.randn(POINTS // 16, 1, 3, generator=generator)
-    points = (starts + steps * torch.arange(16)[None, :, None]).reshape(-1, 3).contiguous()
-    cotangent = torch.randn(POINTS, grid.channels, generator=generator).requires_grad_()
+    generator, rays = torch.Generator().manual_seed(0), POINTS[device] // 16
+    table = torch.randn(grid.num_rows, grid.features, generator=generator).to(device).requires_grad_()
+    starts = torch.rand(rays, 1, 3, generator=generator) - 0.5
+    steps = 0.02 * torch.randn(rays, 1, 3, generator=generator)
+    points = (starts + steps * torch.arange(16)[None, :, None]).reshape(-1, 3).contiguous().to(device)
+    cotangent = torch.randn(16 * rays, grid.channels, generator=generator).to(device).requires_grad_()
 
     def run() -> None:
         features, vjp = encode(points, table, grid, grid.levels)
@@ -83,17 +123,18 @@ def encoding_pass(encode: Callable, grid: encodings.HashGrid) -> Callable[[], No
     return run
 
 
-def training_step(trainer: Trainer, encode: Callable, encode_features: Callable) -> Callable[[], None]:
-    """One optimiser step with the given encoders."""
+def training_step(trainer: Trainer, encoder: Encoder) -> Callable[[], None]:
+    """One optimiser step with the given encoder."""
 
     def run() -> None:
-        fields.encode, fields.encode_features = encode, encode_features
+        encoder.use()
         trainer.step(PROGRESS)
+        CHOSEN.use()
 
     return run
 
 
-def ball_trainer(params: TrainParams) -> Trainer:
+def ball_trainer(params: TrainParams, device: str = "cpu") -> Trainer:
     """A trainer on noise photos of a ring of cameras: what it learns does not matter here."""
     poses = []
     for angle in np.arange(8) * np.pi / 4:
@@ -115,44 +156,55 @@ def ball_trainer(params: TrainParams) -> Trainer:
         cameras, Similarity.identity(), points.astype(np.float32), np.full(500, 0.5, np.float32), observations,
         np.array([0.0, 0, 1]),
     )  # fmt: skip
-    photos = Photos(cameras, [rng.integers(0, 255, (240, 320, 3), dtype=np.uint8) for _ in range(8)], None, "cpu")
-    return Trainer(photos, Sightings.from_scene(scene, "cpu"), params, "cpu")
+    photos = Photos(cameras, [rng.integers(0, 255, (240, 320, 3), dtype=np.uint8) for _ in range(8)], None, device)
+    return Trainer(photos, Sightings.from_scene(scene, device), params, device)
+
+
+def points_of_step(params: TrainParams) -> int:
+    """How many points a training step asks the distance of."""
+    return params.rays * params.samples + 4 * params.sparse_batch + params.free_points
+
+
+def preset_for(device: str) -> str:
+    return "gpu" if device == "cuda" else "cpu"
+
+
+def cores_of(device: str) -> int:
+    """By how many a rate is divided: threads, or one GPU."""
+    return 1 if device == "cuda" else torch.get_num_threads()
 
 
 # ---------------------------------------------------------------- kernels
-def print_kernels() -> None:
+def print_kernels(device: str) -> None:
     """Table of the encoding's and the step's speed with the kernels and in plain PyTorch."""
-    params = TrainParams()
-    grid = encodings.HashGrid(params.levels, params.level_features, params.log2_rows, params.coarsest, params.finest)
-    cores = torch.get_num_threads()
-    kernels = (encodings.encode, encodings.encode_features)
-    reference = (encodings.encode_reference, encodings._reference_features)
-    encoding = alternate(encoding_pass(kernels[0], grid), encoding_pass(reference[0], grid))
-    steps = alternate(training_step(ball_trainer(params), *kernels), training_step(ball_trainer(params), *reference))
-    fields.encode, fields.encode_features = kernels
-    step_points = params.rays * params.samples + 4 * params.sparse_batch + params.free_points
+    params = load_config(preset_for(device), None, []).train
+    grid = field_shape(params, 1, background=False).sdf_grid
+    found = encoders(device, grid)
+    encoding = alternate(*(encoding_pass(encoder.encode, grid, device) for encoder in found))
+    steps = alternate(*(training_step(ball_trainer(params, device), encoder) for encoder in found))
     rows = []
-    for name, count, (fast, slow) in (
-        ("encoding, forward and backward", POINTS, encoding),
-        ("training step", step_points, steps),
+    for name, count, seconds in (
+        ("encoding, forward and backward", POINTS[device], encoding),
+        ("training step", points_of_step(params), steps),
     ):
-        rates = [count / seconds / cores / 1000 for seconds in (fast, slow)]
-        rows.append([name, *(f"{rate:.0f}" for rate in rates), f"{slow / fast:.1f}"])
-    print(markdown_table(["what", "kernels, kpt/s/core", "PyTorch, kpt/s/core", "ratio"], rows))
+        rates = [count / each / cores_of(device) / 1000 for each in seconds]
+        rows.append([name, *(f"{rate:.0f}" for rate in rates), f"{seconds[-1] / seconds[0]:.1f}"])
+    print(markdown_table(["what", *(f"{encoder.name}, kpt/s/core" for encoder in found), "ratio"], rows))
 
 
 # ---------------------------------------------------------------- parts of the method
-def variant_trainers(names: Sequence[str]) -> dict[str, Trainer]:
-    """A trainer a variant, with the preset `cpu`: the first one named has learned the scene, the others take it over.
+def variant_trainers(names: Sequence[str], device: str = "cpu") -> dict[str, Trainer]:
+    """A trainer a variant, with the device's preset: the first one has learned the scene, the others take it over.
 
     What a variant has of its own or in another shape is as it was initialised; a learned scale is about what the
     schedule says.
     """
     cameras = ball_heap.dome_of_cameras()
-    photos = Photos(cameras, [ball_heap.render(cameras, i) for i in range(len(cameras))], None, "cpu")
-    sightings = Sightings.from_scene(ball_heap.posed_scene(cameras), "cpu")
+    photos = Photos(cameras, [ball_heap.render(cameras, i) for i in range(len(cameras))], None, device)
+    sightings = Sightings.from_scene(ball_heap.posed_scene(cameras), device)
+    preset = preset_for(device)
     trainers = {
-        name: Trainer(photos, sightings, load_config("cpu", None, settings_of(VARIANTS[name])).train, "cpu")
+        name: Trainer(photos, sightings, load_config(preset, None, settings_of(VARIANTS[name])).train, device)
         for name in names
     }
     first, *others = trainers.values()
@@ -178,9 +230,11 @@ def time_in_turn(trainers: dict[str, Trainer], rounds: int) -> dict[str, tuple[f
     turns: dict[str, list[tuple[float, float]]] = {name: [] for name in trainers}
     for turn in range(-1, rounds):  # one to warm up
         for name, trainer in trainers.items():
+            finish()
             started = time.perf_counter(), time.process_time()
             for _ in range(STEPS_PER_TURN):
                 trainer.step(PARTS_PROGRESS)
+            finish()
             ended = time.perf_counter(), time.process_time()
             if turn >= 0:
                 turns[name].append((ended[0] - started[0], ended[1] - started[1]))
@@ -210,8 +264,8 @@ def share_of_terms(seconds: dict[str, tuple[float, float]]) -> str:
     return f"The method's terms together take {wall:.0f} % of a step's wall time and {cpu:.0f} % of its CPU time."
 
 
-def print_parts(names: Sequence[str], rounds: int) -> None:
-    seconds = time_in_turn(variant_trainers(names), rounds)
+def print_parts(names: Sequence[str], rounds: int, device: str) -> None:
+    seconds = time_in_turn(variant_trainers(names, device), rounds)
     print(parts_table(seconds))
     if "all" in seconds:
         print(f"\n{share_of_terms(seconds)}")
@@ -223,6 +277,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("table", nargs="?", choices=["kernels", "parts"], help="default: both")
     parser.add_argument("--variants", default=",".join(PARTS), help="names, separated by commas")
     parser.add_argument("--rounds", type=int, default=12, help="turns of each variant")
+    parser.add_argument("--device", choices=["cpu", "cuda"], default=best_device(), help="default: %(default)s")
     arguments = parser.parse_args(argv)
     named = arguments.variants.split(",")
     if unknown := [name for name in named if name not in VARIANTS]:
@@ -230,11 +285,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     if arguments.rounds < 1:
         parser.error("--rounds needs at least 1")
     if arguments.table != "parts":
-        print_kernels()
+        print_kernels(arguments.device)
     if arguments.table is None:
         print()
     if arguments.table != "kernels":
-        print_parts(list(dict.fromkeys([BASE, *named])), arguments.rounds)
+        print_parts(list(dict.fromkeys([BASE, *named])), arguments.rounds, arguments.device)
     return 0
 
 
