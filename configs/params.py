@@ -293,9 +293,19 @@ class TrainParams(Section):
     planar_neighbors: int = Field(4, ge=1, description="places around each of their surface points")
     planar_until: float = Field(1.0, gt=0, le=1, description="progress from which lambda_pla is not scaled down")
 
+    weight_consistency: float = Field(
+        0.1, ge=0, description="weight of the term that compares patches of the photos with each other; 0: off"
+    )
+    consistency_from: float = Field(0.4, ge=0, le=1, description="progress at which that term begins")
+    consistency_rays: int = Field(128, ge=1, description="rays per step that it looks at")
+
     eikonal: Literal["plain", "paper", "stable"] = Field(
         "plain", description="hold the SDF's gradient to length 1 evenly, or less where the photos are not met yet"
     )
+    relaxation_start: float = Field(
+        0.3, gt=0, description="the stable form scales the Eikonal term by this at the start, then on a log scale"
+    )
+    relaxation_end: float = Field(3.0, gt=0, description="the same at the end")
     relaxation_gamma: float = Field(5.0, ge=0, description="how fast colour error relaxes the Eikonal term")
     relaxation_clip: float = Field(0.2, gt=0, description="colour error from which it relaxes no further")
 

@@ -504,3 +504,96 @@ def ray_weights_backward(
             grad_sdf[r, k] = stretch * (grad_near * near_start + of_middle)
             grad_sdf[r, k + 1] += stretch * (grad_far * far_end + of_middle)
             grad_far = grad_near
+
+
+@njit(inline="always")
+def _grey(pixels, row, luma):
+    """Grey value of a pixel, weighted by the parts of each channel."""
+    red, green, blue = np.float32(pixels[row, 0]), np.float32(pixels[row, 1]), np.float32(pixels[row, 2])
+    return luma[0] * red + luma[1] * green + luma[2] * blue
+
+
+@njit(**_OPTIONS)
+def _warped_patch(pixels, first, width, height, x0, y0, side, step, plane, h, e, forward, luma, values, slopes):
+    """Grey values of a patch in another photo and their slopes with respect to the plane; whether it lies inside."""
+    half = np.float32(0.5)
+    for k in range(side * side):
+        px, py = np.float32(x0 + k % side * step) + half, np.float32(y0 + k // side * step) + half
+        inverse_depth = plane[0] * px + plane[1] * py + plane[2]
+        qx = h[0, 0] * px + h[0, 1] * py + h[0, 2] + inverse_depth * e[0]
+        qy = h[1, 0] * px + h[1, 1] * py + h[1, 2] + inverse_depth * e[1]
+        qz = h[2, 0] * px + h[2, 1] * py + h[2, 2] + inverse_depth * e[2]
+        if not qz > forward:
+            return False
+        u, v = qx / qz, qy / qz
+        fx, fy = u - half, v - half
+        if not (fx >= 0 and fy >= 0 and fx < width - 1 and fy < height - 1):
+            return False
+        ix, iy = np.int64(fx), np.int64(fy)
+        fx -= np.float32(ix)
+        fy -= np.float32(iy)
+        row = first + iy * width + ix
+        v00, v01 = _grey(pixels, row, luma), _grey(pixels, row + 1, luma)
+        v10, v11 = _grey(pixels, row + width, luma), _grey(pixels, row + width + 1, luma)
+        top, bottom = v00 + fx * (v01 - v00), v10 + fx * (v11 - v10)
+        values[k] = top + fy * (bottom - top)
+        along_x = (v01 - v00) + fy * ((v11 - v10) - (v01 - v00))
+        slope = (along_x * (e[0] - u * e[2]) + (bottom - top) * (e[1] - v * e[2])) / qz
+        slopes[k, 0], slopes[k, 1], slopes[k, 2] = slope * px, slope * py, slope
+    return True
+
+
+@njit(**_OPTIONS)
+def _centre(values):
+    """Take the mean off; returns the variance."""
+    mean, squared = np.float32(0), np.float32(0)
+    for k in range(len(values)):
+        mean += values[k]
+    mean /= np.float32(len(values))
+    for k in range(len(values)):
+        values[k] -= mean
+        squared += values[k] * values[k]
+    return squared / np.float32(len(values))
+
+
+@njit(parallel=True, **_OPTIONS)
+def patch_errors(
+    pixels, first, sizes, images, centers, planes, views, homographies, epipoles, half, step, noise, forward, outside,
+    luma, errors, slopes,
+):  # fmt: skip
+    """Error of each patch, and its slope with respect to the plane."""
+    side = 2 * half + 1
+    inverse, noise, forward = np.float32(1 / (side * side)), np.float32(noise), np.float32(forward)
+    shares = (np.float32(luma[0] / 255), np.float32(luma[1] / 255), np.float32(luma[2] / 255))
+    for q in prange(len(images)):
+        image, reach = images[q], half * step
+        x0, y0 = centers[q, 0] - reach, centers[q, 1] - reach
+        width, height = sizes[image, 0], sizes[image, 1]
+        errors[q] = outside
+        slopes[q] = 0
+        if x0 < 0 or y0 < 0 or x0 + 2 * reach >= width or y0 + 2 * reach >= height:
+            continue
+        own, other = np.empty(side * side, np.float32), np.empty(side * side, np.float32)
+        other_slopes = np.empty((side * side, 3), np.float32)
+        for k in range(side * side):
+            own[k] = _grey(pixels, first[image] + (y0 + k // side * step) * width + x0 + k % side * step, shares)
+        variance = _centre(own) + noise
+        for m in range(views.shape[1]):
+            view = views[q, m]
+            if not _warped_patch(
+                pixels, first[view], sizes[view, 0], sizes[view, 1], x0, y0, side, step, planes[q],
+                homographies[q, m], epipoles[q, m], forward, shares, other, other_slopes,
+            ):  # fmt: skip
+                continue
+            other_variance = _centre(other) + noise
+            covariance = np.float32(0)
+            for k in range(side * side):
+                covariance += own[k] * other[k]
+            covariance = covariance * inverse + noise
+            root = 1 / np.sqrt(variance * other_variance)
+            errors[q, m] = 1 - covariance * root
+            for k in range(side * side):
+                # Both have mean 0, so the slope of the mean drops out.
+                factor = (covariance / other_variance * other[k] - own[k]) * root * inverse
+                for axis in range(3):
+                    slopes[q, m, axis] += factor * other_slopes[k, axis]

@@ -11,8 +11,9 @@ import torch
 _NORM_EPSILON = 1e-3
 # The relaxed Eikonal term keeps at least this weight, or f stops being a distance and every other term breaks.
 _RELAXATION_FLOOR = 0.2
-# Slope error from which the planar term pulls linearly: about 6 degrees, so that a sharp edge is not rounded away.
-_PLANAR_DELTA = 0.1
+# Slope error from which the planar term pulls linearly: half a degree. So it is against many bends rather than against
+# sharp ones, as total variation is: shallow dents are pulled out, and an edge costs no more than a curve.
+_PLANAR_DELTA = 0.01
 # The literal planar term divides by a length, which may be 0.
 _LENGTH_FLOOR = 1e-9
 
@@ -102,14 +103,18 @@ def planarity_literal(features: torch.Tensor, center_features: torch.Tensor, eps
     return epsilon / (torch.linalg.vector_norm(features - center_features[:, None], dim=2) + epsilon)
 
 
-def planarity(features: torch.Tensor, center_features: torch.Tensor) -> torch.Tensor:
+def planarity(
+    features: torch.Tensor, center_features: torch.Tensor, counted: torch.Tensor | None = None
+) -> torch.Tensor:
     """lambda_pla [Q, K] = sg[tau / (|c(x_k) - c(x_0)| + tau)], tau the batch's median difference (paper lambda_pla^k).
 
     Near 1 where the appearance features [Q, K, F] equal those at the centre [Q, F], 1/2 at the median. The paper's
-    tau = 1e-3 drives it to ~1e-3 everywhere. Detached: else features would be pulled apart to be rid of the term.
+    tau = 1e-3 drives it to ~1e-3 everywhere. Detached: else features would be pulled apart to be rid of the term. The
+    median is that of the rows that are counted [Q] bool, if given.
     """
     difference = torch.linalg.vector_norm(features - center_features[:, None], dim=2).detach()
-    tau = difference.median().clamp(min=1e-6)
+    medians_of = difference if counted is None else torch.where(counted[:, None], difference, torch.nan)
+    tau = medians_of.nanmedian().clamp(min=1e-6)
     return tau / (difference + tau)
 
 

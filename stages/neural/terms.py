@@ -14,7 +14,8 @@ from functools import cached_property
 import torch
 
 from configs.params import TrainParams
-from stages.neural import losses, schedules, visibility
+from stages.neural import consistency, losses, schedules, visibility
+from stages.neural.acceleration import first_rows, fixed_shapes
 from stages.neural.fields import Fields, points_at_a_time
 from stages.neural.photos import Photos
 from stages.neural.renderer import OPAQUE, Rendered
@@ -23,6 +24,10 @@ from stages.neural.schedules import Moment
 
 # Samples that weigh more than this count as near the surface for the relaxed Eikonal term.
 _NEAR_SURFACE_WEIGHT = 0.01
+# Photos that a ray's patch is compared with; half of them, those it matches best, count.
+_CONSISTENCY_VIEWS = 8
+# Pixels from sample to sample of a patch, at first and from this progress on.
+_PATCH_STEPS, _FINE_PATCHES_FROM = (2, 1), 0.75
 
 
 class Terms:
@@ -92,8 +97,7 @@ class Terms:
                 sdf, points, centers, params.visibility_samples, self.generator, beta
             )
         else:
-            voxel = max(moment.voxel, self.cache.cell / 2)
-            margin = visibility.path_margin(facing[ray, view], moment.width, voxel)
+            margin = self._path_margin(facing[ray, view], moment)
             if self.mesh_visibility is not None:
                 factor = self.mesh_visibility(points, centers, margin)
             else:
@@ -104,6 +108,10 @@ class Terms:
         seen = torch.zeros_like(facing)
         seen[ray, view] = factor
         return colors, seen
+
+    def _path_margin(self, facing: torch.Tensor, moment: Moment) -> torch.Tensor:
+        """How far from the surface the paths [...] start that leave it at the cosines `facing` [...]."""
+        return visibility.path_margin(facing, moment.width, max(moment.voxel, self.cache.cell / 2))
 
     def _network_sdf(self, moment: Moment) -> Callable[[torch.Tensor], torch.Tensor]:
         """f [...] of the network at points [..., 3], in parts: they are many."""
@@ -190,7 +198,59 @@ class Terms:
         half = torch.arange(shape[1], device=self.device) % 2 == 0
         return torch.where(half[None, :, None], on_ray * reach, disk)
 
+    # ------------------------------------------------------------------ consistency
+    def consistency_loss(self, rendered: Rendered, moment: Moment) -> torch.Tensor:
+        """Mean disagreement of the photos around the surface points of some of the rays (not in the paper).
+
+        The paper's visibility says which photos see a point, and its ambiguity how far they are to be trusted.
+        """
+        params, photos, batch = self.params, self.photos, rendered.batch
+        if params.weight_consistency == 0 or moment.progress < params.consistency_from:
+            return torch.zeros((), device=self.device)
+        met = rendered.opacity.detach() > OPAQUE
+        if batch.masks is not None:
+            met = met & (batch.masks > 0.5)
+        hit = first_rows(met, params.consistency_rays)
+        images, directions = batch.images[hit], batch.directions[hit]
+        surface = rendered.surface[0][hit]
+        sdf, _, gradients = self.fields.sdf(surface, moment.levels)
+        points = consistency.slide_to_surface(surface, directions, sdf, gradients)
+        normals = torch.nn.functional.normalize(gradients, dim=1)
+        with torch.no_grad():
+            colors, in_frame = photos.observe(points)
+            candidates = in_frame & photos.training
+            views, facing, fit = consistency.views_beside(
+                photos.centers, points, normals, directions, candidates, _CONSISTENCY_VIEWS
+            )
+            smallest = visibility.smallest_sdf_on_paths(
+                self.cache, points[:, None].expand(*views.shape, 3).reshape(-1, 3), photos.centers[views.view(-1)],
+                self._path_margin(facing.reshape(-1), moment), params.visibility_samples, params.visibility_sharpness,
+            )  # fmt: skip
+            seen = fit * visibility.sdf_visibility(smallest, params.visibility_sharpness).view_as(facing)
+            gains = torch.exp(self.fields.log_gains)
+            others = colors.gather(1, views[..., None].expand(-1, -1, 3)) / gains[views]
+            own = batch.colors[hit] / gains[images]
+            distance = visibility.mahalanobis(own[:, None], others, self.color_precision)
+            trust = consistency.patch_trust(visibility.ambiguity(seen, distance)) * met[hit]
+            pixels = consistency.pixels_of(photos, images, points)
+        planes = consistency.tangent_planes(photos, images, points, normals)
+        step = _PATCH_STEPS[0] if moment.progress < _FINE_PATCHES_FROM else _PATCH_STEPS[1]
+        errors = consistency.patch_errors(photos, images, pixels, planes, views, step)
+        valid = (seen > visibility.VISIBLE) & (errors.detach() >= 0)
+        per_ray = consistency.mean_of_best(errors, valid, _CONSISTENCY_VIEWS // 2)
+        return (trust * per_ray).mean()
+
     # ------------------------------------------------------------------ Eikonal relaxation
+    def eikonal_scale(self, moment: Moment) -> float:
+        """What the whole Eikonal term is scaled by in the stable form: little at first, much at the end; else 1.
+
+        The paper's omega grows tenfold with its lambda_pla, which is annealed from 0.1 to 1.
+        """
+        params = self.params
+        if params.eikonal != "stable":
+            return 1.0
+        return schedules.exponential(moment.progress, params.relaxation_start, params.relaxation_end)
+
     def relaxation(
         self, rendered: Rendered, ray_error: torch.Tensor, trust: torch.Tensor, moment: Moment
     ) -> torch.Tensor:
@@ -208,10 +268,14 @@ class Terms:
         weighed = (rendered.opacity.detach() > OPAQUE)[:, None].expand_as(rendered.weights)
         if params.eikonal == "stable":
             weighed = weighed & (rendered.weights.detach() > _NEAR_SURFACE_WEIGHT)
-        ray, sample = torch.nonzero(weighed, as_tuple=True)
-        if len(ray) == 0:
+        weighed = weighed.reshape(-1)
+        if fixed_shapes(self.device):
+            places = torch.arange(len(weighed), device=self.device)
+        else:
+            places = torch.nonzero(weighed).squeeze(1)
+        if len(places) == 0:
             return omega
-        places = ray * rendered.weights.shape[1] + sample
+        ray, weighed = places // rendered.weights.shape[1], weighed[places]
         gamma, clip = params.relaxation_gamma, params.relaxation_clip
         with torch.set_grad_enabled(params.eikonal == "paper"):
             if self.fields.appearance is None:
@@ -223,6 +287,6 @@ class Terms:
                 planarity = self._planarity_scale(moment) * losses.planarity_literal(features[:, None], center)[:, 0]
                 values = losses.eikonal_relaxation_literal(ray_error[ray], planarity, gamma, clip)
             else:
-                planarity = losses.planarity(features[:, None], center)[:, 0]
+                planarity = losses.planarity(features[:, None], center, weighed)[:, 0]
                 values = losses.eikonal_relaxation((ray_error * trust)[ray], planarity, gamma, clip)
-        return omega.index_copy(0, places, values)
+        return omega.index_copy(0, places, torch.where(weighed, values, 1.0))

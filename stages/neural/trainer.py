@@ -155,11 +155,13 @@ class Trainer:
         sparse_loss = sighting_loss(rendered.extra_sdf[: len(places)], sparse_weights, params)
         exposure_loss = losses.exposure_error(self.fields.log_gains).mean()
         proposal_loss = self._proposal_loss(rendered)
+        consistency_loss = self.terms.consistency_loss(rendered, moment)
 
         loss = (
             rgb_loss
-            + params.weight_eikonal * eikonal_loss
+            + params.weight_eikonal * self.terms.eikonal_scale(moment) * eikonal_loss
             + params.weight_planar * planar_loss
+            + params.weight_consistency * consistency_loss
             + params.weight_sparse * schedules.fade_out(progress, params.sparse_until) * sparse_loss
             + params.weight_mask * mask_loss
             + params.weight_exposure * exposure_loss
@@ -186,6 +188,7 @@ class Trainer:
                 "rgb": rgb_loss.detach(),
                 "eikonal": eikonal_loss.detach(),
                 "planar": planar_loss.detach(),
+                "consistency": consistency_loss.detach(),
                 "sparse": sparse_loss.detach(),
                 "mask": mask_loss.detach(),
                 "appearance": appearance_loss.detach(),
