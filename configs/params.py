@@ -246,6 +246,10 @@ class TrainParams(Section):
     adam_beta2: float = Field(0.99, gt=0, lt=1, description="Adam's decay of the squared gradients")
 
     weight_eikonal: float = Field(0.1, ge=0, description="weight of the Eikonal term")
+    eikonal_start: float = Field(
+        1.0, gt=0, description="the Eikonal term is scaled by this at the start, then on a log scale to `eikonal_end`"
+    )
+    eikonal_end: float = Field(1.0, gt=0, description="the Eikonal term is scaled by this at the end")
     weight_sparse: float = Field(1.0, ge=0, description="weight of the SfM points' terms, faded out")
     sparse_until: float = Field(0.8, ge=0, le=1, description="progress at which the SfM points' term is gone")
     sparse_tolerance: float = Field(0.005, gt=0, description="SfM points off by this count linearly, scene units")
@@ -256,10 +260,12 @@ class TrainParams(Section):
     weight_mask: float = Field(0.1, ge=0, description="weight of the mask term, where masks exist")
     weight_exposure: float = Field(0.1, ge=0, description="weight that holds the photos' gains at 1")
 
-    ambiguity: Literal["off", "paper", "stable"] = Field(
-        "off", description="trust photos less where the others that see a place disagree with them"
+    ambiguity: Literal["off", "paper", "bounded", "stable"] = Field(
+        "off",
+        description="trust photos less where the others that see a place disagree: with what is rendered (paper), with "
+        "it but no more than with the photo itself (bounded, for polished things), or with the photo (stable)",
     )
-    ambiguity_from: float = Field(0.2, ge=0, le=1, description="progress at which all but the paper's form begins")
+    ambiguity_from: float = Field(0.2, ge=0, le=1, description="progress at which the stable form begins")
     visibility: Literal["network", "paper", "stable", "mesh"] = Field(
         "stable",
         description="how the ambiguity weight finds out which photos see a place: the paper's product over the SDF "
@@ -294,7 +300,7 @@ class TrainParams(Section):
     planar_until: float = Field(1.0, gt=0, le=1, description="progress from which lambda_pla is not scaled down")
 
     weight_consistency: float = Field(
-        0.1, ge=0, description="weight of the term that compares patches of the photos with each other; 0: off"
+        0.0, ge=0, description="weight of the term that compares patches of the photos with each other; 0: off"
     )
     consistency_from: float = Field(0.4, ge=0, le=1, description="progress at which that term begins")
     consistency_rays: int = Field(128, ge=1, description="rays per step that it looks at")
@@ -302,10 +308,6 @@ class TrainParams(Section):
     eikonal: Literal["plain", "paper", "stable"] = Field(
         "plain", description="hold the SDF's gradient to length 1 evenly, or less where the photos are not met yet"
     )
-    relaxation_start: float = Field(
-        0.3, gt=0, description="the stable form scales the Eikonal term by this at the start, then on a log scale"
-    )
-    relaxation_end: float = Field(3.0, gt=0, description="the same at the end")
     relaxation_gamma: float = Field(5.0, ge=0, description="how fast colour error relaxes the Eikonal term")
     relaxation_clip: float = Field(0.2, gt=0, description="colour error from which it relaxes no further")
 

@@ -93,9 +93,9 @@ def test_planar_error_pulls_the_neighbour_towards_the_plane():
     sdf = torch.tensor([[0.02]], requires_grad=True)
     offsets, normals = torch.tensor([[[0.04, 0, 0]]]), torch.tensor([[0.0, 0, 1]])
     error = losses.planar_error(sdf, torch.zeros(1), normals, offsets, 0.05)
-    assert error.item() == pytest.approx(0.01 * (0.5 - 0.005))  # slope error 0.5, Huber with delta 0.01
+    assert error.item() == pytest.approx(0.1 * (0.5 - 0.05))  # slope error 0.5, Huber with delta 0.1
     error.sum().backward()
-    assert sdf.grad.item() == pytest.approx(0.01 / 0.04)
+    assert sdf.grad.item() == pytest.approx(0.1 / 0.04)
 
 
 def test_literal_planar_error_is_zero_on_a_plane_through_x_0_and_not_on_one_beside_it():

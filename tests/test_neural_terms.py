@@ -14,7 +14,7 @@ from stages.neural import visibility
 from stages.neural.trainer import Trainer
 
 FORMS = {
-    "ambiguity": ["paper", "stable"],
+    "ambiguity": ["paper", "bounded", "stable"],
     "reflection": ["paper", "stable"],
     "planar": ["paper", "stable"],
     "eikonal": ["paper", "stable"],

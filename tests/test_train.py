@@ -29,7 +29,6 @@ TINY = TrainParams(
     steps=60, rays=128, samples=12, levels=4, log2_rows=10, coarsest=8, finest=32, sdf_width=16,
     radiance_width=16, start_levels=2, free_points=64, sparse_batch=32,
     cache_resolution=24, cache_every=16, background_log2_rows=9, background_samples=4,
-    weight_consistency=0,  # the ball is 20 pixels wide: a patch would cover most of it
 )  # fmt: skip
 
 

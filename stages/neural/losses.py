@@ -11,9 +11,8 @@ import torch
 _NORM_EPSILON = 1e-3
 # The relaxed Eikonal term keeps at least this weight, or f stops being a distance and every other term breaks.
 _RELAXATION_FLOOR = 0.2
-# Slope error from which the planar term pulls linearly: half a degree. So it is against many bends rather than against
-# sharp ones, as total variation is: shallow dents are pulled out, and an edge costs no more than a curve.
-_PLANAR_DELTA = 0.01
+# Slope error from which the planar term pulls linearly: about 6 degrees, so that a sharp edge is not rounded away.
+_PLANAR_DELTA = 0.1
 # The literal planar term divides by a length, which may be 0.
 _LENGTH_FLOOR = 1e-9
 

@@ -53,9 +53,10 @@ class Terms:
     def trust(self, rendered: Rendered, exposed: torch.Tensor, moment: Moment) -> torch.Tensor:
         """Weight [R] of each ray's colour error, 1 / (1 + lambda_ambiguity) (paper eq. loss_without_ambiguity).
 
-        The stable form compares photos with photos, carries no gradient, has mean 1 over the surface, and is 1 before
-        `ambiguity_from`: early on, a pattern seen at a wrong depth would pass for a reflection. The paper's form
-        compares the rendered colours `exposed` [R, 3] with the photos, from the first step.
+        The paper's form compares the rendered colours `exposed` [R, 3] with the photos, from the first step; so does
+        the bounded form, as far as the photo itself differs from the others. The stable form compares photos with
+        photos, carries no gradient, has mean 1 over the surface, and is 1 before `ambiguity_from`: early on, a pattern
+        seen at a wrong depth would pass for a reflection.
         """
         params, batch = self.params, rendered.batch
         off = params.ambiguity == "off" or (params.ambiguity == "stable" and moment.progress < params.ambiguity_from)
@@ -65,13 +66,19 @@ class Terms:
         met = rendered.opacity.detach() > OPAQUE
         hit = torch.nonzero(met if batch.masks is None else met & (batch.masks > 0.5)).squeeze(1)
         colors, seen = self._views(hit, rendered, moment)
+
+        def ambiguity(own: torch.Tensor, others: torch.Tensor) -> torch.Tensor:
+            return visibility.ambiguity(seen, visibility.mahalanobis(own[:, None], others, self.color_precision))
+
         if params.ambiguity == "paper":
-            distance = visibility.mahalanobis(exposed[hit, None], colors, self.color_precision)
-            return weights.index_copy(0, hit, visibility.trust_literal(visibility.ambiguity(seen, distance)))
+            return weights.index_copy(0, hit, visibility.trust_literal(ambiguity(exposed[hit], colors)))
         gains = torch.exp(self.fields.log_gains.detach())
-        own = batch.colors[hit] / gains[batch.images[hit]]
-        distance = visibility.mahalanobis(own[:, None], colors / gains, self.color_precision)
-        return weights.index_copy(0, hit, visibility.trust(visibility.ambiguity(seen, distance)))
+        own_gains, others = gains[batch.images[hit]], colors / gains
+        of_photo = ambiguity(batch.colors[hit] / own_gains, others)
+        if params.ambiguity == "bounded":
+            of_render = ambiguity(exposed[hit] / own_gains, others)
+            return weights.index_copy(0, hit, visibility.trust_bounded(of_render, of_photo))
+        return weights.index_copy(0, hit, visibility.trust(of_photo))
 
     @torch.no_grad()
     def _views(self, hit: torch.Tensor, rendered: Rendered, moment: Moment) -> tuple[torch.Tensor, torch.Tensor]:
@@ -241,16 +248,6 @@ class Terms:
         return (trust * per_ray).mean()
 
     # ------------------------------------------------------------------ Eikonal relaxation
-    def eikonal_scale(self, moment: Moment) -> float:
-        """What the whole Eikonal term is scaled by in the stable form: little at first, much at the end; else 1.
-
-        The paper's omega grows tenfold with its lambda_pla, which is annealed from 0.1 to 1.
-        """
-        params = self.params
-        if params.eikonal != "stable":
-            return 1.0
-        return schedules.exponential(moment.progress, params.relaxation_start, params.relaxation_end)
-
     def relaxation(
         self, rendered: Rendered, ray_error: torch.Tensor, trust: torch.Tensor, moment: Moment
     ) -> torch.Tensor:

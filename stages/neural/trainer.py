@@ -157,9 +157,12 @@ class Trainer:
         proposal_loss = self._proposal_loss(rendered)
         consistency_loss = self.terms.consistency_loss(rendered, moment)
 
+        eikonal_weight = params.weight_eikonal * schedules.exponential(
+            progress, params.eikonal_start, params.eikonal_end
+        )
         loss = (
             rgb_loss
-            + params.weight_eikonal * self.terms.eikonal_scale(moment) * eikonal_loss
+            + eikonal_weight * eikonal_loss
             + params.weight_planar * planar_loss
             + params.weight_consistency * consistency_loss
             + params.weight_sparse * schedules.fade_out(progress, params.sparse_until) * sparse_loss
