@@ -10,9 +10,9 @@ known cameras (`cameras_sphere.npz`), and the score is the PSNR of photos that w
 
 Photos and poses are made ready once a set and shared by all its runs. A run is the stages train, extract and cleanup,
 called in a process of its own with one thread; as many run side by side as there are cores. Results go to
-benchmarks/results/ablation/SET-VARIANT-SEED.json as each ends; runs that have one with the same steps, preset and
-settings are skipped, so an interrupted call goes on where it stopped. Run folders lie in benchmarks/out/ablation/ until
-scored, and the log of a run that failed stays there.
+benchmarks/results/ablation/SET-VARIANT-SEED-POSES.json as each ends; runs that have one with the same steps, preset,
+settings and poses are skipped, so an interrupted call goes on where it stopped. Run folders lie in
+benchmarks/out/ablation/ until scored, and the log of a run that failed stays there.
 """
 
 from __future__ import annotations
@@ -411,7 +411,7 @@ def run_plans(plans: Sequence[Plan], data: Path, jobs: int, keep: bool) -> list[
 # ---------------------------------------------------------------- result files
 def save_run(run: Run) -> None:
     RUNS.mkdir(parents=True, exist_ok=True)
-    path = RUNS / f"{run.plan.name}.json"
+    path = RUNS / f"{run.plan.name}-{run.poses}.json"
     partial = path.with_suffix(".partial")
     partial.write_text(json.dumps(asdict(run), indent=1, allow_nan=False) + "\n", encoding="utf-8")
     partial.replace(path)
@@ -568,16 +568,18 @@ def main(argv: Sequence[str] | None = None) -> int:
         if not arguments.sets:
             names = [name for name in names if has_truth(data / name) or has_cameras(data / name)]
         sets = {name: 0 if has_truth(data / name) else HOLDOUT for name in names}
-        done = set() if arguments.again else {run.plan for run in load_runs()}
-        plans = [p for p in make_plans(sets, variants, arguments.seeds, arguments.steps, preset) if p not in done]
-        print(f"{len(plans)} runs to make (others have a result; --again measures them anew)", file=sys.stderr)
-        for name in dict.fromkeys(plan.set for plan in plans):
+        plans = make_plans(sets, variants, arguments.seeds, arguments.steps, preset)
+        poses: dict[str, str] = {}
+        for name in sets:
             try:
                 prepare(name, data, preset)
+                poses[name] = poses_hash(FOLDERS / name / "shared" / SHARED)
             except (RuntimeError, HineusError) as error:
                 print(f"{name}: {error}", file=sys.stderr)
                 failed += [plan.name for plan in plans if plan.set == name]
-                plans = [plan for plan in plans if plan.set != name]
+        done = set() if arguments.again else {(run.plan, run.poses) for run in load_runs()}
+        plans = [plan for plan in plans if plan.set in poses and (plan, poses[plan.set]) not in done]
+        print(f"{len(plans)} runs to make (others have a result; --again measures them anew)", file=sys.stderr)
         jobs = arguments.jobs or (1 if has_cuda() else available_cores())
         failed += run_plans(plans, data, jobs, arguments.keep)
     write_table()

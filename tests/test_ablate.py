@@ -175,6 +175,7 @@ def test_runs_that_have_a_result_are_skipped_and_a_failure_stops_no_other(here, 
         save_run(_run(plan=plan))
 
     monkeypatch.setattr(ablate, "run_apart", run_apart)
+    monkeypatch.setattr(ablate, "poses_hash", lambda folder: "p")
     command = [str(here / "data"), "--steps", "9", "--variants", "planar,base", "--preset", "cpu", "--jobs", "1"]
     every = ["helmet-base-0", "scan-base-0", "helmet-base-1", "scan-base-1",
              "helmet-planar-0", "scan-planar-0", "helmet-planar-1", "scan-planar-1"]  # fmt: skip
@@ -185,8 +186,11 @@ def test_runs_that_have_a_result_are_skipped_and_a_failure_stops_no_other(here, 
     assert made[8:] == ["scan-planar-1"]
     ablate.main([*command, "--steps", "10", "--seeds", "1"])
     assert made[9:] == [every[0], every[1], every[4], every[5]]
+    monkeypatch.setattr(ablate, "poses_hash", lambda folder: "q")  # photos and poses were made ready anew
+    ablate.main([*command, "--steps", "10", "--seeds", "1"])
+    assert len(made) == 17
     ablate.main([*command, "--table-only"])
-    assert len(made) == 13
+    assert len(made) == 17
     page = (here / "page.md").read_text()
     assert page.startswith("top\n")
     assert "| planar | 10 |" in page
