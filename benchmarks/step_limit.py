@@ -231,8 +231,8 @@ def rate_of_processes(count: int) -> float:
 # ---------------------------------------------------------------- command
 def use_threads(count: int) -> None:
     """Let PyTorch and the kernels use that many threads."""
-    torch.set_num_threads(count)
     numba.set_num_threads(count)
+    torch.set_num_threads(count)  # last: numba's first call may set the number of OpenMP's threads, which they share
 
 
 def limit_rows(device: str) -> list[list[str]]:

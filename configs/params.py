@@ -195,7 +195,7 @@ class TrainParams(Section):
     precision: Literal["auto", "float32", "mixed"] = Field(
         "auto",
         description="matrix products of the networks: float32, or bfloat16 for colours and, on CUDA, TF32 for the "
-        "distance; auto: mixed on CUDA only",
+        "distance; auto: mixed on CUDA only, from Ampere on",
     )
     free_points: int = Field(256, ge=0, description="points per step anywhere in the region, for the Eikonal term")
 

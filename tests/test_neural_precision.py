@@ -17,10 +17,12 @@ def mixed(**settings):
     return TINY.model_copy(update={"precision": "mixed", **settings})
 
 
-def test_auto_is_mixed_on_cuda_only():
-    cpu, cuda = torch.device("cpu"), torch.device("cuda", 0)
-    assert [is_mixed(name, cpu) for name in ("auto", "float32", "mixed")] == [False, False, True]
-    assert [is_mixed(name, cuda) for name in ("auto", "float32", "mixed")] == [True, False, True]
+def test_auto_is_mixed_on_cuda_only_where_it_is_fast(monkeypatch):
+    names = ("auto", "float32", "mixed")
+    assert [is_mixed(name, torch.device("cpu")) for name in names] == [False, False, True]
+    for capability, auto in (((9, 0), True), ((8, 0), True), ((7, 5), False)):
+        monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device, found=capability: found)
+        assert [is_mixed(name, torch.device("cuda", 0)) for name in names] == [auto, False, True]
 
 
 def test_products_are_short_on_cuda_and_only_there_where_wanted():

@@ -11,6 +11,8 @@ import torch
 
 log = logging.getLogger(__name__)
 
+# The first GPUs (NVIDIA Ampere) that multiply in bfloat16 and TF32; older ones would do so slowly or not at all.
+SHORT_CAPABILITY = (8, 0)
 # Devices that work while the host goes on. To ask for a number, or for how many rows pass a test, is to wait for them.
 ASYNCHRONOUS = {"cuda"}
 
@@ -40,7 +42,9 @@ def first_rows(chosen: torch.Tensor, count: int) -> torch.Tensor:
 
 def is_mixed(precision: str, device: torch.device) -> bool:
     """Whether the setting `train.precision` means mixed precision on this device."""
-    return precision == "mixed" or (precision == "auto" and device.type == "cuda")
+    if precision == "auto":
+        return device.type == "cuda" and torch.cuda.get_device_capability(device) >= SHORT_CAPABILITY
+    return precision == "mixed"
 
 
 @contextmanager
