@@ -10,7 +10,7 @@ known cameras (`cameras_sphere.npz`), and the score is the PSNR of photos that w
 
 Photos and poses are made ready once a set and shared by all its runs. A run is the stages train, extract and cleanup,
 called in a process of its own with one thread; as many run side by side as there are cores. Results go to
-benchmarks/results/ablation/SET-VARIANT-SEED-POSES.json as each ends; runs that have one with the same steps, preset,
+benchmarks/results/ablation/SET-VARIANT-SEED-STEPS-POSES.json as each ends; runs that have one with the same steps, preset,
 settings and poses are skipped, so an interrupted call goes on where it stopped. Run folders lie in
 benchmarks/out/ablation/ until scored, and the log of a run that failed stays there.
 """
@@ -411,7 +411,7 @@ def run_plans(plans: Sequence[Plan], data: Path, jobs: int, keep: bool) -> list[
 # ---------------------------------------------------------------- result files
 def save_run(run: Run) -> None:
     RUNS.mkdir(parents=True, exist_ok=True)
-    path = RUNS / f"{run.plan.name}-{run.poses}.json"
+    path = RUNS / f"{run.plan.name}-{run.plan.steps}-{run.poses}.json"
     partial = path.with_suffix(".partial")
     partial.write_text(json.dumps(asdict(run), indent=1, allow_nan=False) + "\n", encoding="utf-8")
     partial.replace(path)
