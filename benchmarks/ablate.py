@@ -10,8 +10,8 @@ known cameras (`cameras_sphere.npz`), and the score is the PSNR of photos that w
 
 Photos and poses are made ready once a set and shared by all its runs. A run is the stages train, extract and cleanup,
 called in a process of its own with one thread; as many run side by side as there are cores. Results go to
-benchmarks/results/ablation/SET-VARIANT-SEED-STEPS-POSES.json as each ends; runs that have one with the same steps, preset,
-settings and poses are skipped, so an interrupted call goes on where it stopped. Run folders lie in
+benchmarks/results/ablation/SET-VARIANT-SEED-STEPS-POSES.json as each ends; runs that have one with the same steps,
+preset, settings and poses are skipped, so an interrupted call goes on where it stopped. Run folders lie in
 benchmarks/out/ablation/ until scored, and the log of a run that failed stays there.
 """
 

@@ -162,8 +162,8 @@ def test_the_best_photos_count():
 
 
 def test_doubtful_patches_count_less():
-    doubt = torch.tensor([0.0, 0.5, 1.5], requires_grad=True)
-    assert torch.allclose(patch_trust(doubt), torch.tensor([1, 0.5, 0.1]))
+    doubt = torch.tensor([0.0, 0.5, 1.0], requires_grad=True)
+    assert torch.allclose(patch_trust(doubt), torch.tensor([1, 0.5, 1 / 17]))
     assert not patch_trust(doubt).requires_grad
 
 

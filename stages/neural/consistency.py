@@ -159,12 +159,12 @@ def mean_of_best(errors: torch.Tensor, valid: torch.Tensor, count: int) -> torch
 
 
 def patch_trust(lambda_ambiguity: torch.Tensor) -> torch.Tensor:
-    """Weight [Q] of a patch's error: sg[1 / (1 + (lambda / 0.5)^2)].
+    """Weight [Q] of a patch's error: sg[1 / (1 + (lambda / 0.5)^4)].
 
     Photos that disagree on the colour of a place (the paper's lambda_ambiguity) mirror something there: where the
     patches match then is not where the surface is.
     """
-    return 1 / (1 + (lambda_ambiguity.detach() / _DOUBT) ** 2)
+    return 1 / (1 + (lambda_ambiguity.detach() / _DOUBT) ** 4)
 
 
 def _grey(photos: Photos, rows: torch.Tensor) -> torch.Tensor:
