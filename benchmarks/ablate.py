@@ -68,8 +68,6 @@ BASE_SETTINGS = {
 BACKBONES = ("neus2", "hfneus", "neuralangelo")
 TERMS = {f"train.{term}": "stable" for term in ("ambiguity", "reflection", "planar", "eikonal")}
 
-EIKONAL_ANNEALED = {"train.eikonal_start": "0.3", "train.eikonal_end": "3"}
-
 
 def _all_but(term: str) -> dict[str, str]:
     return {key: value for key, value in TERMS.items() if key != f"train.{term}"}
@@ -96,10 +94,8 @@ VARIANTS: dict[str, dict[str, str]] = {
     "eikonal-paper": {"train.planar": "paper", "train.eikonal": "paper"},
     "all-paper": {**dict.fromkeys(TERMS, "paper"), "train.visibility": "paper"},
     # forms of our own: see docs/math.md
-    "ambiguity-bounded": {"train.ambiguity": "bounded"},
-    "eikonal-annealed": EIKONAL_ANNEALED,
+    "eikonal-annealed": {"train.eikonal_start": "0.3", "train.eikonal_end": "3"},
     "consistency": {"train.weight_consistency": "0.1"},
-    "bounded+annealed": {"train.ambiguity": "bounded", **EIKONAL_ANNEALED},
     # the colours and the Eikonal term alone, as in NeuS: no SfM points, no reflected direction
     "rgb+eikonal": {"train.weight_sparse": "0", "train.radiance_inputs": "view"},
     "density-neus": {"train.density": "neus"},

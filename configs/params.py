@@ -260,10 +260,8 @@ class TrainParams(Section):
     weight_mask: float = Field(0.1, ge=0, description="weight of the mask term, where masks exist")
     weight_exposure: float = Field(0.1, ge=0, description="weight that holds the photos' gains at 1")
 
-    ambiguity: Literal["off", "paper", "bounded", "stable"] = Field(
-        "off",
-        description="trust photos less where the others that see a place disagree: with what is rendered (paper), with "
-        "it but no more than with the photo itself (bounded, for polished things), or with the photo (stable)",
+    ambiguity: Literal["off", "paper", "stable"] = Field(
+        "off", description="trust photos less where the others that see a place disagree with them"
     )
     ambiguity_from: float = Field(0.2, ge=0, le=1, description="progress at which the stable form begins")
     visibility: Literal["network", "paper", "stable", "mesh"] = Field(

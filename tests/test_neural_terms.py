@@ -14,7 +14,7 @@ from stages.neural import visibility
 from stages.neural.trainer import Trainer
 
 FORMS = {
-    "ambiguity": ["paper", "bounded", "stable"],
+    "ambiguity": ["paper", "stable"],
     "reflection": ["paper", "stable"],
     "planar": ["paper", "stable"],
     "eikonal": ["paper", "stable"],

@@ -259,16 +259,6 @@ def test_the_paper_s_precision_is_the_plain_inverse_and_fails_on_grey_photos():
     assert vis.color_precision(grey, draw(0)).isfinite().all()
 
 
-def test_bounded_trust_follows_the_render_as_far_as_the_photo_goes():
-    of_render = torch.tensor([0.5, 3.0], requires_grad=True)
-    of_photo = torch.tensor([1.0, 1.0], requires_grad=True)
-    weights = vis.trust_bounded(of_render, of_photo)
-    assert weights.tolist() == pytest.approx([1 / 1.5, 1 / 2])
-    weights.sum().backward()
-    assert of_render.grad.tolist() == pytest.approx([-1 / 1.5**2, 0])  # pulls, then no further
-    assert of_photo.grad is None
-
-
 def test_ambiguity_counts_visible_views_only():
     visibility = torch.tensor([[0.95, 0.5, 1.0], [0.1, 0.2, 0.3]])
     distance = torch.tensor([[2.0, 100, 4], [5, 5, 5]])

@@ -102,18 +102,14 @@ def planarity_literal(features: torch.Tensor, center_features: torch.Tensor, eps
     return epsilon / (torch.linalg.vector_norm(features - center_features[:, None], dim=2) + epsilon)
 
 
-def planarity(
-    features: torch.Tensor, center_features: torch.Tensor, counted: torch.Tensor | None = None
-) -> torch.Tensor:
+def planarity(features: torch.Tensor, center_features: torch.Tensor) -> torch.Tensor:
     """lambda_pla [Q, K] = sg[tau / (|c(x_k) - c(x_0)| + tau)], tau the batch's median difference (paper lambda_pla^k).
 
     Near 1 where the appearance features [Q, K, F] equal those at the centre [Q, F], 1/2 at the median. The paper's
-    tau = 1e-3 drives it to ~1e-3 everywhere. Detached: else features would be pulled apart to be rid of the term. The
-    median is that of the rows that are counted [Q] bool, if given.
+    tau = 1e-3 drives it to ~1e-3 everywhere. Detached: else features would be pulled apart to be rid of the term.
     """
     difference = torch.linalg.vector_norm(features - center_features[:, None], dim=2).detach()
-    medians_of = difference if counted is None else torch.where(counted[:, None], difference, torch.nan)
-    tau = medians_of.nanmedian().clamp(min=1e-6)
+    tau = difference.median().clamp(min=1e-6)
     return tau / (difference + tau)
 
 

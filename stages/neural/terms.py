@@ -15,7 +15,7 @@ import torch
 
 from configs.params import TrainParams
 from stages.neural import consistency, losses, schedules, visibility
-from stages.neural.acceleration import first_rows, fixed_shapes
+from stages.neural.acceleration import first_rows
 from stages.neural.fields import Fields, points_at_a_time
 from stages.neural.photos import Photos
 from stages.neural.renderer import OPAQUE, Rendered
@@ -53,10 +53,9 @@ class Terms:
     def trust(self, rendered: Rendered, exposed: torch.Tensor, moment: Moment) -> torch.Tensor:
         """Weight [R] of each ray's colour error, 1 / (1 + lambda_ambiguity) (paper eq. loss_without_ambiguity).
 
-        The paper's form compares the rendered colours `exposed` [R, 3] with the photos, from the first step; so does
-        the bounded form, as far as the photo itself differs from the others. The stable form compares photos with
-        photos, carries no gradient, has mean 1 over the surface, and is 1 before `ambiguity_from`: early on, a pattern
-        seen at a wrong depth would pass for a reflection.
+        The stable form compares photos with photos, carries no gradient, has mean 1 over the surface, and is 1 before
+        `ambiguity_from`: early on, a pattern seen at a wrong depth would pass for a reflection. The paper's form
+        compares the rendered colours `exposed` [R, 3] with the photos, from the first step.
         """
         params, batch = self.params, rendered.batch
         off = params.ambiguity == "off" or (params.ambiguity == "stable" and moment.progress < params.ambiguity_from)
@@ -66,19 +65,13 @@ class Terms:
         met = rendered.opacity.detach() > OPAQUE
         hit = torch.nonzero(met if batch.masks is None else met & (batch.masks > 0.5)).squeeze(1)
         colors, seen = self._views(hit, rendered, moment)
-
-        def ambiguity(own: torch.Tensor, others: torch.Tensor) -> torch.Tensor:
-            return visibility.ambiguity(seen, visibility.mahalanobis(own[:, None], others, self.color_precision))
-
         if params.ambiguity == "paper":
-            return weights.index_copy(0, hit, visibility.trust_literal(ambiguity(exposed[hit], colors)))
+            distance = visibility.mahalanobis(exposed[hit, None], colors, self.color_precision)
+            return weights.index_copy(0, hit, visibility.trust_literal(visibility.ambiguity(seen, distance)))
         gains = torch.exp(self.fields.log_gains.detach())
-        own_gains, others = gains[batch.images[hit]], colors / gains
-        of_photo = ambiguity(batch.colors[hit] / own_gains, others)
-        if params.ambiguity == "bounded":
-            of_render = ambiguity(exposed[hit] / own_gains, others)
-            return weights.index_copy(0, hit, visibility.trust_bounded(of_render, of_photo))
-        return weights.index_copy(0, hit, visibility.trust(of_photo))
+        own = batch.colors[hit] / gains[batch.images[hit]]
+        distance = visibility.mahalanobis(own[:, None], colors / gains, self.color_precision)
+        return weights.index_copy(0, hit, visibility.trust(visibility.ambiguity(seen, distance)))
 
     @torch.no_grad()
     def _views(self, hit: torch.Tensor, rendered: Rendered, moment: Moment) -> tuple[torch.Tensor, torch.Tensor]:
@@ -265,14 +258,10 @@ class Terms:
         weighed = (rendered.opacity.detach() > OPAQUE)[:, None].expand_as(rendered.weights)
         if params.eikonal == "stable":
             weighed = weighed & (rendered.weights.detach() > _NEAR_SURFACE_WEIGHT)
-        weighed = weighed.reshape(-1)
-        if fixed_shapes(self.device):
-            places = torch.arange(len(weighed), device=self.device)
-        else:
-            places = torch.nonzero(weighed).squeeze(1)
-        if len(places) == 0:
+        ray, sample = torch.nonzero(weighed, as_tuple=True)
+        if len(ray) == 0:
             return omega
-        ray, weighed = places // rendered.weights.shape[1], weighed[places]
+        places = ray * rendered.weights.shape[1] + sample
         gamma, clip = params.relaxation_gamma, params.relaxation_clip
         with torch.set_grad_enabled(params.eikonal == "paper"):
             if self.fields.appearance is None:
@@ -284,6 +273,6 @@ class Terms:
                 planarity = self._planarity_scale(moment) * losses.planarity_literal(features[:, None], center)[:, 0]
                 values = losses.eikonal_relaxation_literal(ray_error[ray], planarity, gamma, clip)
             else:
-                planarity = losses.planarity(features[:, None], center, weighed)[:, 0]
+                planarity = losses.planarity(features[:, None], center)[:, 0]
                 values = losses.eikonal_relaxation((ray_error * trust)[ray], planarity, gamma, clip)
-        return omega.index_copy(0, places, torch.where(weighed, values, 1.0))
+        return omega.index_copy(0, places, values)

@@ -215,16 +215,6 @@ def trust_literal(lambda_ambiguity: torch.Tensor) -> torch.Tensor:
     return 1 / (1 + lambda_ambiguity)
 
 
-def trust_bounded(of_render: torch.Tensor, of_photo: torch.Tensor) -> torch.Tensor:
-    """Weight of each ray's colour error [R]: 1 / (1 + min(lambda, sg[lambda'])) (paper eq. loss_without_ambiguity).
-
-    lambda compares the rendered colour with what the other photos show, lambda' does the photo's own. As in the paper's
-    form the loss falls where the rendered colour departs from theirs, but only as far as the photo's does: it is least
-    where render and photo agree, and colours cannot run away.
-    """
-    return trust_literal(torch.minimum(of_render, of_photo.detach()))
-
-
 def trust(lambda_ambiguity: torch.Tensor) -> torch.Tensor:
     """Weight of each ray's colour error [R]: sg[1 / (1 + lambda)], scaled to mean 1 (paper eq. loss_without_ambiguity).
 
