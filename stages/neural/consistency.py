@@ -17,8 +17,8 @@ from stages.neural.photos import Photos
 
 # A patch is 7 x 7 pixels: this many steps to either side.
 HALF = 3
-# Variance of grey values in [0, 1] that passes for noise: two and a half levels of 255. A flat patch tells nothing.
-NOISE_VARIANCE = 1e-4
+# Variance of grey values in [0, 1] below which a patch says little: 8 levels of 255. Faint shading is no texture.
+NOISE_VARIANCE = 1e-3
 # Error of a patch that leaves one of the two photos.
 NO_PATCH = -1.0
 # Luma of red, green and blue (BT.601).
