@@ -20,6 +20,7 @@ import numpy as np
 from stages.artifacts import ImageSet
 from stages.errors import InputError
 from stages.posing.evidence import MIN_PNP, MIN_VERIFIED
+from stages.posing.joining import join_models
 from stages.posing.ladder import Rung, Solution
 
 log = logging.getLogger(__name__)
@@ -366,14 +367,12 @@ class Workbench:
         A start that was found on the same features and has most photos is gone on with; else all begins anew.
         """
         self._latest = base
-        out = self.work / f"models-{self._maps}"
-        self._maps += 1
-        out.mkdir()
         if mapper == "global":
-            models = self._map_global(base, out)
+            models = self._map_global(base)
         else:
-            continued = start is not None and start.base == base and 2 * len(start.registered) > len(self.names)
-            models = self._map_incremental(base, out, start if continued else None)
+            if start is not None and (start.base != base or 2 * len(start.registered) <= len(self.names)):
+                start = None
+            models = self._join(base, self._map_incremental(base, start and start.model))
         if not models:
             return None
         largest = max(models, key=lambda model: (model.num_reg_images(), model.num_points3D()))
@@ -386,10 +385,26 @@ class Workbench:
             base=base,
         )
 
-    def _map_global(self, base: Base, out: Path) -> list[Any]:
+    def _join(self, base: Base, models: list[Any]) -> list[Any]:
+        """Models that fit onto each other made one, and the photos placed that match that one only."""
+        joined = join_models(models, self.database(base), self._mapping_options())
+        if len(joined) == len(models):
+            return models
+        placed = frozenset[str]().union(*map(_names, joined))
+        if placed == self.names:
+            return joined
+        return [*self._map_incremental(base, joined[0]), *joined[1:]]
+
+    def _new_folder(self) -> Path:
+        out = self.work / f"models-{self._maps}"
+        self._maps += 1
+        out.mkdir()
+        return out
+
+    def _map_global(self, base: Base) -> list[Any]:
         import pycolmap
 
-        path = self.database(base)
+        path, out = self.database(base), self._new_folder()
         if not (base.focal_priors and self.priors):  # it needs focal lengths; the database of the others stays as it is
             path = out / path.name
             shutil.copyfile(self.database(base), path)
@@ -398,7 +413,7 @@ class Workbench:
         options.num_threads, options.random_seed = self.threads, self.params.seed
         return list(pycolmap.global_mapping(path, self.images_folder, out, options).values())
 
-    def _map_incremental(self, base: Base, out: Path, start: Solution | None) -> list[Any]:
+    def _mapping_options(self) -> Any:
         import pycolmap
 
         options, seed = pycolmap.IncrementalPipelineOptions(), self.params.seed
@@ -414,12 +429,18 @@ class Workbench:
             options.mapper.abs_pose_min_inlier_ratio = RELAXED_PNP_SHARE
             options.mapper.init_min_num_inliers = RELAXED_INIT_INLIERS
             options.mapper.init_min_tri_angle = RELAXED_INIT_ANGLE_DEG
-        placed, total, input_path = 2, len(self.names), ""
+        return options
+
+    def _map_incremental(self, base: Base, start: Any | None) -> list[Any]:
+        """Photos placed one after another, from the model `start` on where there is one."""
+        import pycolmap
+
+        placed, total, out, input_path = 2, len(self.names), self._new_folder(), ""
         if start is not None:
             input_path = str(out / "start")
             Path(input_path).mkdir()
-            start.model.write(input_path)
-            placed = len(start.registered)
+            start.write(input_path)
+            placed = start.num_reg_images()
 
         def one_more() -> None:
             nonlocal placed
@@ -431,7 +452,7 @@ class Workbench:
             self.database(base),
             self.images_folder,
             out,
-            options,
+            self._mapping_options(),
             input_path=input_path,
             next_image_callback=one_more,
         )
