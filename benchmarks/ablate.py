@@ -245,7 +245,8 @@ def prepare(name: str, data: Path, preset: str) -> None:
         partial.rename(shared / SHARED)
         return
     photos = photos_of(data / name)
-    run_hineus(["run", str(photos), "--workspace", str(shared), "--until", SHARED, "--preset", preset, "--json"])
+    arguments = ["run", str(photos), "--workspace", str(shared), "--until", SHARED, "--preset", preset, "--json"]
+    run_hineus([*arguments, "--set", "sfm.deterministic=true"])
 
 
 def poses_hash(folder: Path) -> str:

@@ -128,7 +128,7 @@ def align(first: Any, second: Any, common: np.ndarray, seed: int = 0) -> tuple[A
     search = pycolmap.RANSACOptions()
     search.max_error = SEARCH_DISTANCE * _view_distance(first)
     search.random_seed = seed
-    found = pycolmap.estimate_sim3d_robust(others, places, search)
+    found: Any = pycolmap.estimate_sim3d_robust(others, places, search)
     if found is None:
         return None
     first_from_second = found["tgt_from_src"]
@@ -147,19 +147,19 @@ def _view_distance(model: Any) -> float:
         for point in model.points3D.values()
         for element in point.track.elements[:1]
     ]
-    return float(np.median(distances))
+    return float(np.median(np.array(distances)))
 
 
 def _errors_px(model: Any, ids: Sequence[int], places: np.ndarray) -> np.ndarray:
     """[N] median distance in pixels between the features of a model's points and where places [N, 3] would appear."""
     errors = np.full(len(ids), np.inf)
     for k, (point_id, place) in enumerate(zip(ids, places, strict=True)):
-        seen = []
+        seen: list[float] = []
         for element in model.points3D[point_id].track.elements:
             image = model.images[element.image_id]
             pixel = image.project_point(place)  # None behind the camera
             feature = image.points2D[element.point2D_idx].xy
-            seen.append(np.inf if pixel is None else np.linalg.norm(pixel - feature))
+            seen.append(np.inf if pixel is None else float(np.linalg.norm(pixel - feature)))
         errors[k] = np.median(seen)
     return errors
 
@@ -181,7 +181,7 @@ def put_together(first: Any, second: Any, first_from_second: Any, same: np.ndarr
     for i in sorted(added):
         image = moved.images[i]
         if image.camera_id not in known:
-            joint.cameras[image.camera_id].params = moved.cameras[image.camera_id].params
+            joint.cameras[image.camera_id].params = list(moved.cameras[image.camera_id].params)
         joint.frames[image.frame_id].rig_from_world = moved.frames[image.frame_id].rig_from_world
         joint.register_frame(image.frame_id)
     new_id = {}
