@@ -24,8 +24,8 @@ MIN_COMMON = MIN_PNP
 # COLMAP's own `align_reconstructions_via_reprojections`, which knows points of common photos only.
 MIN_AGREEING, MAX_ERROR_PX = 0.3, 8.0
 # The search for the similarity takes two points for one within this part of the median distance from a camera to its
-# points: depth is known worse than what a pixel spans.
-SEARCH_DISTANCE = 0.05
+# points. A wide search fits wrong pairs, too, and a narrow one misses points whose depth is badly known: all are tried.
+SEARCH_DISTANCES = (0.01, 0.02, 0.05)
 # Rounds of bundle adjustment, and the part of the observations that changes in the last one (COLMAP's defaults).
 REFINEMENTS, REFINEMENT_CHANGE = 5, 0.0005
 
@@ -125,16 +125,17 @@ def align(first: Any, second: Any, common: np.ndarray, seed: int = 0) -> tuple[A
         return None
     places = np.array([first.points3D[i].xyz for i in common[:, 0].tolist()])
     others = np.array([second.points3D[i].xyz for i in common[:, 1].tolist()])
-    search = pycolmap.RANSACOptions()
-    search.max_error = SEARCH_DISTANCE * _view_distance(first)
-    search.random_seed = seed
-    found: Any = pycolmap.estimate_sim3d_robust(others, places, search)
-    if found is None:
-        return None
-    first_from_second = found["tgt_from_src"]
-    errors = _errors_px(first, common[:, 0].tolist(), first_from_second * others)
-    back = _errors_px(second, common[:, 1].tolist(), first_from_second.inverse() * places)
-    agreeing = np.maximum(errors, back) < MAX_ERROR_PX
+    fits = []
+    for distance in SEARCH_DISTANCES:
+        search = pycolmap.RANSACOptions()
+        search.max_error, search.random_seed = distance * _view_distance(first), seed
+        found: Any = pycolmap.estimate_sim3d_robust(others, places, search)
+        if found is not None:
+            first_from_second = found["tgt_from_src"]
+            errors = _errors_px(first, common[:, 0].tolist(), first_from_second * others)
+            back = _errors_px(second, common[:, 1].tolist(), first_from_second.inverse() * places)
+            fits.append((first_from_second, np.maximum(errors, back) < MAX_ERROR_PX))
+    first_from_second, agreeing = max(fits, key=lambda fit: fit[1].sum(), default=(None, np.zeros(0, bool)))
     if agreeing.sum() < max(MIN_COMMON, MIN_AGREEING * len(common)):
         return None
     return first_from_second, agreeing
