@@ -41,7 +41,7 @@ SEEN_WHOLE_MARGIN = 1.2
 ALONE_RADII, ALONE_SHARE = 2.5, 0.97
 ALONE_PERCENTILES, ALONE_MARGIN = (0.5, 99.5), 1.05
 # An object that fills the frame hides the table: this part of all points at least stands above it, by this part of the
-# region's radius (three times what is taken for the table). On four captures that show more table it was 3 to 19 %.
+# region's radius (three times what is taken for the table). On five captures that show more table it was 3 to 31 %.
 FILLING_SHARE, STANDING = 0.5, 0.03
 # Free space around silhouettes' visual hull: 10 % of the radius.
 HULL_MARGIN = 1.1
