@@ -117,6 +117,12 @@ def test_components_that_share_photos_become_one_model_without_any_match_between
     assert largest_error(capture, joint) < 0.002
 
 
+def test_a_component_whose_photos_are_all_in_another_is_dropped(tmp_path: Path):
+    capture = two_parts(tmp_path / "a.db", links=0)
+    whole = capture.part(FIRST)
+    assert join_models([capture.part(range(2, 5)), whole], capture.path, options()) == [whole]
+
+
 @pytest.mark.parametrize(("links", "mixed"), [(0, False), (4, False), (16, True)])
 def test_components_with_no_few_or_wrong_matches_between_them_stay_apart(tmp_path: Path, links: int, mixed: bool):
     capture = two_parts(tmp_path / "a.db", links, mixed)

@@ -65,6 +65,8 @@ def _join(models: list[Any], matches: Matches, cache: Any, options: Any) -> list
 
 def _joined(first: Any, second: Any, matches: Matches, cache: Any, options: Any) -> Any | None:
     """A model of the photos of both, or None where they do not fit."""
+    if set(second.reg_image_ids()) <= set(first.reg_image_ids()):
+        return first
     sizes = first.num_reg_images(), second.num_reg_images()
     common = common_points(first, second, matches)
     found = align(first, second, common, options.random_seed)
