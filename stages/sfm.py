@@ -71,7 +71,7 @@ def run(context: StageContext) -> dict[str, Any]:
     if best is None:
         raise _nothing_matched(evidence, names, steps, params)
     unregistered = [
-        {"name": name, "reason": evidence.reason(name, best.registered, best.others)}
+        {"name": name, "reason": evidence.reason(name, best.registered, best.others, bench.verified, bench.agreeing)}
         for name in names
         if name not in best.registered
     ]

@@ -294,12 +294,18 @@ class Workbench:
 
     def _matching(self) -> dict[str, Any]:
         return match_options(
-            self.params, self.threads, self.cuda, self._guided, self._verified, self._stationary
+            self.params, self.threads, self.cuda, self._guided, self.verified, self._stationary
         )  # fmt: skip
 
     @property
-    def _verified(self) -> int:
+    def verified(self) -> int:
+        """So many matches of a pair are enough now."""
         return RELAXED_VERIFIED if self._relaxed else MIN_VERIFIED
+
+    @property
+    def agreeing(self) -> int:
+        """So many 3D points that agree on a photo's position are enough now."""
+        return RELAXED_PNP if self._relaxed else MIN_PNP
 
     def _match(self, base: Base) -> None:
         import pycolmap
@@ -333,7 +339,7 @@ class Workbench:
             database.clear_two_view_geometries()
         options = pycolmap.GeometricVerifierOptions()
         options.num_threads = self.threads
-        judged = verification_options(self.params, self._verified, self._stationary)
+        judged = verification_options(self.params, self.verified, self._stationary)
         pycolmap.geometric_verification(self.database(base), verifier_options=options, two_view_geometry_options=judged)
 
     # ------------------------------------------------------------ poses
@@ -392,10 +398,9 @@ class Workbench:
     def _mapping(self) -> Any:
         options = mapping_options(self.params, self.threads)
         options.min_model_size = 3  # small captures are captures too
-        options.mapper.abs_pose_min_num_inliers = MIN_PNP
+        options.mapper.abs_pose_min_num_inliers = self.agreeing
         if self._relaxed:
-            options.min_num_matches = RELAXED_VERIFIED
-            options.mapper.abs_pose_min_num_inliers = RELAXED_PNP
+            options.min_num_matches = self.verified
             options.mapper.abs_pose_min_inlier_ratio = RELAXED_PNP_SHARE
             options.mapper.init_min_num_inliers = RELAXED_INIT_INLIERS
             options.mapper.init_min_tri_angle = RELAXED_INIT_ANGLE_DEG
