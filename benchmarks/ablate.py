@@ -27,7 +27,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -250,7 +250,8 @@ def prepare(name: str, data: Path, preset: str) -> None:
         partial.rename(shared / SHARED)
         return
     photos = photos_of(data / name)
-    run_hineus(["run", str(photos), "--workspace", str(shared), "--until", SHARED, "--preset", preset, "--json"])
+    arguments = ["run", str(photos), "--workspace", str(shared), "--until", SHARED, "--preset", preset, "--json"]
+    run_hineus([*arguments, "--set", "sfm.deterministic=true"])
 
 
 def poses_hash(folder: Path) -> str:
@@ -339,9 +340,11 @@ def command(plan: Plan) -> str:
     return " ".join([*words, f"--seeds {plan.seed + 1}"])
 
 
-def score_clean_mesh(folder: Path, shared: Path, truth: Path) -> dict[str, float] | None:
-    """Distances of the run's clean mesh to the known surface, None where there is none."""
-    from hineus_cli.scoring import has_truth, score_mesh
+def score_clean_mesh(
+    folder: Path, shared: Path, truth: Path, known_stem: Callable[[str], str] | None = None
+) -> dict[str, float] | None:
+    """Distances of the run's clean mesh to the known surface, None where there is none; see `score_mesh`."""
+    from hineus_cli.scoring import file_stem, has_truth, score_mesh
     from stages import artifacts
 
     if not has_truth(truth):
@@ -350,7 +353,9 @@ def score_clean_mesh(folder: Path, shared: Path, truth: Path) -> dict[str, float
     world_from_scene = artifacts.load_scene(shared / SHARED).world_from_scene
     with tempfile.TemporaryDirectory() as world:
         artifacts.save_mesh(Path(world), world_from_scene.apply(vertices), faces)
-        return score_mesh(Path(world) / artifacts.MESH, artifacts.model_path(shared / "sfm"), truth)
+        return score_mesh(
+            Path(world) / artifacts.MESH, artifacts.model_path(shared / "sfm"), truth, known_stem or file_stem
+        )
 
 
 def _run_folder(plan: Plan) -> Path:

@@ -3,6 +3,7 @@
 python -m benchmarks.hard_variants DATA                        every row that has no result yet
 python -m benchmarks.hard_variants DATA synth_helmet-blurred   these
 python -m benchmarks.hard_variants DATA --mesh                 go on to the clean mesh where its truth is known
+python -m benchmarks.hard_variants DATA --mesh --set train.steps=2000    with a smaller budget
 python -m benchmarks.hard_variants --table-only                only rewrite the table of docs/benchmarks.md
 
 A row is a set of DATA, or SET-VARIANT: see `VARIANTS` for what each does to the photos, and `BASES` for the sets it is
@@ -79,7 +80,7 @@ class Row:
         cpu_s: CPU seconds of the sfm stage, all attempts.
         failure: message and hint of the error that ended the row, or None.
         score: distances of the clean mesh to the truth, see `stages.meshing.evaluation`; None where it was not made.
-        mesh_preset: preset of the training behind that mesh.
+        mesh_preset: preset of the training behind that mesh; mesh_settings: what was set over it, SECTION.KEY=VALUE.
     """
 
     name: str
@@ -94,6 +95,7 @@ class Row:
     failure: dict[str, str] | None
     score: dict[str, float] | None = None
     mesh_preset: str | None = None
+    mesh_settings: tuple[str, ...] = ()
 
 
 # ---------------------------------------------------------------- variants
@@ -289,13 +291,9 @@ def center_error(workspace: Path, data: Path, row: str) -> dict[str, float] | No
     if truth is None or source is None:
         return None
     centers, extent = truth
-    stems = [path.stem for path in sorted(source.iterdir())]
+    stems, stem_of = _stems(source), known_stem(source, variant)
     found = _found_centers(artifacts.model_path(workspace / "sfm"))
-    if variant == "video":
-        frames = frame_numbers(list(found))
-        pairs = [(found[name], centers[frame // VIDEO_HOLD]) for name, frame in frames.items()]
-    else:
-        pairs = [(center, centers[stems.index(Path(name).stem)]) for name, center in found.items()]
+    pairs = [(center, centers[stems.index(stem_of(name))]) for name, center in found.items()]
     if len(pairs) < 3:
         return None
     estimated, true = (np.array(side) for side in zip(*pairs, strict=True))
@@ -306,9 +304,21 @@ def center_error(workspace: Path, data: Path, row: str) -> dict[str, float] | No
     }
 
 
-def frame_numbers(names: Sequence[str]) -> dict[str, int]:
-    """Frames of a video by the number at the end of their names."""
-    return {name: int(Path(name).stem.rsplit("_", 1)[-1]) for name in names}
+def known_stem(source: Path, variant: str) -> Callable[[str], str]:
+    """Name of a photo of a variant -> that of the photo in `source` that it was made from, both without the suffix.
+
+    Frames of a video have their numbers at the end of their names.
+    """
+    from hineus_cli.scoring import file_stem
+
+    if variant != "video":
+        return file_stem
+    stems = _stems(source)
+    return lambda name: stems[int(Path(name).stem.rsplit("_", 1)[-1]) // VIDEO_HOLD]
+
+
+def _stems(source: Path) -> list[str]:
+    return [path.stem for path in sorted(source.iterdir())]
 
 
 def _found_centers(model: Path) -> dict[str, np.ndarray]:
@@ -318,7 +328,7 @@ def _found_centers(model: Path) -> dict[str, np.ndarray]:
 
 
 # ---------------------------------------------------------------- one row
-def run_row(row: str, data: Path, mesh: bool, preset: str) -> Row:
+def run_row(row: str, data: Path, mesh: bool, preset: str, settings: Sequence[str] = ()) -> Row:
     """Find the poses of one row, and its clean mesh if wanted and its truth is known.
 
     Raises:
@@ -329,20 +339,27 @@ def run_row(row: str, data: Path, mesh: bool, preset: str) -> Row:
 
     photos = make_photos(row, data)
     workspace = FOLDERS / row / "workspace"
-    arguments = ["run", str(photos), "--workspace", str(workspace), "--preset", preset]
+    given = [word for setting in settings for word in ("--set", setting)]
+    arguments = ["run", str(photos), "--workspace", str(workspace), "--preset", preset, *given]
     answer = _ask([*arguments, "--until", POSES])
     score, failure = None, None if answer["ok"] else _failure(answer)
-    name = row.partition("-")[0]
-    if mesh and failure is None and has_truth(data / name):
+    name, _, variant = row.partition("-")
+    source = photos_of(data / name)
+    if mesh and failure is None and source is not None and has_truth(data / name):
         answer = _ask([*arguments, "--until", CLEAN])
         if answer["ok"]:
-            score = score_clean_mesh(workspace, workspace, data / name)
+            score = score_clean_mesh(workspace, workspace, data / name, known_stem=known_stem(source, variant))
         else:
             failure = _failure(answer)
     stages = {stage["name"]: stage for stage in answer.get("stages", ())}
     placed = "sfm" in stages
     registration = artifacts.load_registration(workspace / "sfm") if placed else {}
-    words = ["python -m benchmarks.hard_variants DATA", row, *(["--mesh", f"--preset {preset}"] if mesh else [])]
+    words = [
+        "python -m benchmarks.hard_variants DATA",
+        row,
+        *(["--mesh", f"--preset {preset}"] if mesh else []),
+        *given,
+    ]
     return Row(
         name=row,
         command=" ".join(words),
@@ -356,6 +373,7 @@ def run_row(row: str, data: Path, mesh: bool, preset: str) -> Row:
         failure=failure,
         score=score,
         mesh_preset=preset if score else None,
+        mesh_settings=tuple(settings) if score else (),
     )
 
 
@@ -409,7 +427,8 @@ def load_rows() -> list[Row]:
     rows = []
     for path in ROWS.glob("*.json"):
         data = json.loads(path.read_text(encoding="utf-8"))
-        rows.append(Row(**{**data, "attempts": tuple(data["attempts"])}))
+        lists = {key: tuple(data[key]) for key in ("attempts", "mesh_settings") if key in data}
+        rows.append(Row(**{**data, **lists}))
     order = {name: place for place, name in enumerate(VARIANTS)}
 
     def place(row: Row) -> tuple[bool, str, int, str]:
@@ -431,7 +450,7 @@ def pose_table(rows: Sequence[Row]) -> str:
             *(f"{row.center_error[key]:.2f}" if row.center_error else "-" for key in ("median", "max")),
             attempts_cell(row),
             "-" if row.cpu_s is None else f"{row.cpu_s:.0f}",
-            f"{row.score['mean']:.2f} ({row.mesh_preset})" if row.score else "-",
+            f"{row.score['mean']:.2f} ({' '.join((str(row.mesh_preset), *row.mesh_settings))})" if row.score else "-",
         ]
         for row in rows
     ]
@@ -461,6 +480,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("rows", nargs="*", help="SET or SET-VARIANT; default: all")
     parser.add_argument("--mesh", action="store_true", help="make and score the clean mesh, too")
     parser.add_argument("--preset", help="of the training; default: that of `hineus run`")
+    parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="as of `hineus run`")
     parser.add_argument("--again", action="store_true", help="also rows that have a result")
     parser.add_argument("--table-only", action="store_true", help="run nothing")
     arguments = parser.parse_args(argv)
@@ -481,7 +501,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             if arguments.again:
                 shutil.rmtree(FOLDERS / row, ignore_errors=True)
             try:
-                save_row(run_row(row, data, arguments.mesh, arguments.preset or default_preset()))
+                save_row(run_row(row, data, arguments.mesh, arguments.preset or default_preset(), arguments.set))
             except RuntimeError as error:
                 print(f"{row}: {error}", file=sys.stderr)
                 failed.append(row)

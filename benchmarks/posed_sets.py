@@ -14,12 +14,9 @@ import numpy as np
 from stages import artifacts
 from stages.geometry.cameras import PinholeCameras, PosedScene
 from stages.geometry.similarity import Similarity
-from stages.posing.neus import decompose
+from stages.posing.neus import PIXEL_SHIFT, decompose
 
 CAMERAS = "cameras_sphere.npz"
-# NeuS counts pixel centres at whole numbers, we at halves. The photos of DTU are halved and their cameras with them,
-# so of that half a pixel a quarter is left.
-PIXEL_SHIFT = 0.25
 
 
 def has_cameras(folder: Path) -> bool:

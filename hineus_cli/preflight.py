@@ -25,9 +25,11 @@ SFM_BASE_GIB, SFM_GIB_PER_THREAD_MP = 0.25, 0.25  # finding features: 0.32 GiB a
 MEMORY_MARGIN = 1.3  # an estimate this near to what is there gets a warning
 SFM_CPU_S_PER_MP = 2.8  # 2.3 to 3.3 CPU seconds a megapixel looked at
 SFM_CPU_S_PER_PAIR = 0.01  # too little in those sets to be told from nothing; larger ones are quadratic
-TRAIN_CPU_S_PER_RAY_SAMPLE = 8.6e-6  # 560 CPU seconds for 8000 steps of 512 rays of 16 samples
-OTHER_CPU_S = 75.0  # everything after training: 60 to 85
-MEASURED_CORES = 2  # more were not measured, so they are not counted on
+TRAIN_CPU_S_PER_RAY_SAMPLE = 4.9e-6  # 317 to 329 CPU seconds for 8000 steps of 512 rays of 16 samples
+OTHER_CPU_S = 50.0  # everything after training: 37 to 47
+# Part of the work that cores share: two made training 1.53 to 1.80 times as fast, poses 1.7 times. What more cores
+# bring was not measured; by Amdahl's law it is at most five times one core.
+PARALLEL_SHARE = 0.8
 DISK_BASE_GB = 0.3  # checkpoint, meshes, textures, report: an allowance
 DISK_BYTES_PER_PIXEL = 2.0  # undistorted images are PNG: 1.4 to 2 bytes a pixel
 
@@ -138,12 +140,12 @@ def estimate(seen: Inspection, config: Config, device: str, workers: int) -> Nee
 def _minutes(looked_at: list[float], config: Config, workers: int) -> float:
     count, train = len(looked_at), config.train
     pairs = count * (count - 1) / 2 if count <= config.sfm.exhaustive_max else 10 * count
-    cores = min(workers, MEASURED_CORES)
-    training_s = train.steps * train.rays * train.samples * TRAIN_CPU_S_PER_RAY_SAMPLE / cores
+    wall_per_cpu = 1 - PARALLEL_SHARE + PARALLEL_SHARE / workers
+    training_s = train.steps * train.rays * train.samples * TRAIN_CPU_S_PER_RAY_SAMPLE * wall_per_cpu
     if train.minutes is not None:
         training_s = 60 * train.minutes
     other_s = SFM_CPU_S_PER_MP * sum(looked_at) / 1e6 + SFM_CPU_S_PER_PAIR * pairs + OTHER_CPU_S
-    return (training_s + other_s / cores) / 60
+    return (training_s + other_s * wall_per_cpu) / 60
 
 
 def _warnings(seen: Inspection, config: Config) -> list[str]:
@@ -157,14 +159,12 @@ def _warnings(seen: Inspection, config: Config) -> list[str]:
     if seen.alike:
         pairs = tuple(f"{earlier} = {later}" for earlier, later in seen.alike)
         found.append(f"Nearly the same picture: {_named(pairs)}. They take time and add nothing.")
-    unusable = tuple(item.source for item in seen.skipped if not item.reason.startswith(EXPECTED))
-    if unusable:
-        found.append(f"Left out: {_named(unusable)}; the first because: {_reason(seen, unusable[0])}.")
+    unusable: dict[str, list[str]] = {}
+    for item in seen.skipped:
+        if not item.reason.startswith(EXPECTED):
+            unusable.setdefault(item.reason, []).append(item.source)
+    found += [f"Left out {_named(tuple(names))}: {reason}." for reason, names in unusable.items()]
     return found
-
-
-def _reason(seen: Inspection, source: str) -> str:
-    return next(item.reason for item in seen.skipped if item.source == source)
 
 
 def _named(names: tuple[str, ...]) -> str:

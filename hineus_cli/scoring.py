@@ -8,6 +8,7 @@ no ICP.
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -59,22 +60,33 @@ def load_model_centers(model: Path) -> dict[str, np.ndarray]:
     return centers
 
 
-def score_mesh(mesh_path: Path, model: Path, truth: Path) -> dict[str, float]:
-    """Distances of a mesh (in the frame of the COLMAP model) to the known object, see `SurfaceScore`."""
+def file_stem(name: str) -> str:
+    """Name of a file without folders and suffix."""
+    return Path(name).stem
+
+
+def score_mesh(
+    mesh_path: Path, model: Path, truth: Path, known_stem: Callable[[str], str] = file_stem
+) -> dict[str, float]:  # fmt: skip
+    """Distances of a mesh (in the frame of the COLMAP model) to the known object, see `SurfaceScore`.
+
+    Args:
+        known_stem: name of a photo in the model -> that of the truth without its suffix. Photos may have been renamed
+            on the way in (another suffix): the stem decides.
+    """
     import trimesh
 
     known, true_centers = load_known_surface(truth)
     centers = load_model_centers(model)
-    # Photos may have been renamed on the way in (another extension): the stem decides.
-    true_by_stem = {Path(name).stem: center for name, center in true_centers.items()}
-    shared = [name for name in sorted(centers) if Path(name).stem in true_by_stem]
+    true_by_stem = {file_stem(name): center for name, center in true_centers.items()}
+    shared = [name for name in sorted(centers) if known_stem(name) in true_by_stem]
     if len(shared) < 3:
         raise InputError(
             f"Only {len(shared)} of {len(centers)} cameras of {model} have a known pose (need 3).",
             f"Check that {truth} belongs to these photos.",
         )
     world_from_model = align_points(
-        np.array([centers[name] for name in shared]), np.array([true_by_stem[Path(n).stem] for n in shared])
+        np.array([centers[name] for name in shared]), np.array([true_by_stem[known_stem(name)] for name in shared])
     )
     mesh = trimesh.load(mesh_path, process=False, force="mesh")
     try:

@@ -148,7 +148,10 @@ def _frames_of(videos: list[str], folder: Path, context: StageContext) -> tuple[
 
 
 def _too_few(folder: Path, found: int, needed: int, skipped: list[SkippedImage]) -> InputError:
-    hint = "Photograph the object from all sides: 30 to 100 sharp photos that overlap by two thirds."
+    hint = (
+        f"Photograph the object from all sides: 30 to 100 sharp photos that overlap by two thirds. "
+        f"`hineus check {folder}` says what can be used."
+    )
     if not skipped and not found and folder.is_dir():
         return InputError(f"The folder {folder} is empty: found 0 photos, need at least {needed}.", hint)
     message = f"Found {found} usable photo{'' if found == 1 else 's'} in {folder}, need at least {needed}."

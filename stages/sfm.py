@@ -71,7 +71,7 @@ def run(context: StageContext) -> dict[str, Any]:
     if best is None:
         raise _nothing_matched(evidence, names, steps, params)
     unregistered = [
-        {"name": name, "reason": evidence.reason(name, best.registered, best.others)}
+        {"name": name, "reason": evidence.reason(name, best.registered, best.others, bench.verified, bench.agreeing)}
         for name in names
         if name not in best.registered
     ]
@@ -157,7 +157,7 @@ def _from_known_poses(context: StageContext) -> dict[str, Any]:
             params,
             threads=1 if params.deterministic else max(1, context.workers),
             workers=context.workers,
-            device=pycolmap.Device.cuda if pycolmap.has_cuda and context.device == "cuda" else pycolmap.Device.cpu,
+            cuda=pycolmap.has_cuda and context.device == "cuda",
             progress=context.progress,
         )
     points = model.num_points3D()

@@ -324,8 +324,7 @@ def _find_region(
             "`--set 'undistort.region=sphere X Y Z RADIUS'`.",
         ) from error
     ground = find_ground(points, cameras.centers, held.direction, region.center, region.radius)
-    if ground is None:
-        region = grown_alone(region, points)
+    region = grown_alone(region, points, ground)
     form, numbers = read_region(params.region)
     if form != "auto":
         region = given_region(form, numbers, region.kind)
@@ -359,7 +358,7 @@ def _check_seen(region: RegionOfInterest, cameras: PinholeCameras, text: str) ->
 
 UNDISTORT = Stage(
     name="undistort",
-    version=2,
+    version=3,
     needs=("ingest", "sfm"),
     params="undistort",
     run=run,

@@ -60,6 +60,18 @@ def dome_on_a_table(seed: int = 0, noise: float = 0.002) -> tuple[PinholeCameras
     return capture(poses), points + noise * random.normal(size=points.shape)
 
 
+def long_object_on_a_table(seed: int = 0) -> tuple[PinholeCameras, np.ndarray]:
+    """A long body, 5 x 1.2 x 1.2, that is printed all over, longer than the photos are wide, on a printed table."""
+    random = np.random.default_rng(seed)
+    middle = np.array([0.0, 0.0, 0.6])
+    poses = [pose for pitch in (15, 40) for pose in ring(middle, count=14, distance=4.0, pitch_deg=pitch)]
+    body = random.normal(size=(3000, 3))
+    body = middle + body / np.linalg.norm(body, axis=1, keepdims=True) * (2.5, 0.6, 0.6)
+    table = random.uniform(-3, 3, (1500, 3)) * (1, 1, 0)
+    points = np.concatenate([body, table])
+    return capture(poses), points + 0.005 * random.normal(size=points.shape)
+
+
 def room(seed: int = 0) -> tuple[PinholeCameras, np.ndarray]:
     """A circle of cameras that look outwards in a room of 6 x 5 x 2.5, points on its walls, floor and ceiling."""
     random = np.random.default_rng(seed)

@@ -302,7 +302,7 @@ def test_the_mesh_is_scored_in_the_world_frame(here, monkeypatch):
     monkeypatch.setattr(artifacts, "load_scene", lambda path: SimpleNamespace(world_from_scene=world))
     seen = {}
 
-    def score_mesh(mesh, model, where):
+    def score_mesh(mesh, model, where, known_stem):
         seen["vertices"], seen["model"] = artifacts.load_mesh(mesh.parent)[0], model
         return {"mean": 1.0}
 

@@ -105,6 +105,14 @@ def test_center_error_is_in_percent_of_the_extent_whatever_the_frame(data, monke
     assert error["median"] < 0.6
 
 
+def test_every_photo_of_a_variant_is_found_again_among_those_of_its_set(data):
+    source = data / "synth_helmet" / "images"
+    assert hard.known_stem(source, "rotated")("005.png") == "005"
+    of_frame = hard.known_stem(source, "video")
+    frames = ["capture.mp4/000000.jpg", "capture.mp4/000009.jpg", "capture.mp4/000010.jpg", "000069.jpg"]
+    assert [of_frame(name) for name in frames] == ["000", "000", "001", "006"]
+
+
 def test_results_survive_their_files_and_failures_stand_under_the_table(data):
     failed = _row("synth_helmet-blurred", registered=0, center_error=None, attempts=(), cpu_s=None,
                   failure={"message": "None of the 47 photos could be registered.", "hint": "Add photos."})  # fmt: skip
@@ -114,6 +122,10 @@ def test_results_survive_their_files_and_failures_stand_under_the_table(data):
     rows = load_rows()
     assert [row.name for row in rows] == ["viking", "synth_helmet-no_exif", "synth_helmet-blurred"]
     table = pose_table(rows).splitlines()
+    hard.save_row(_row("viking", score={"mean": 0.5}, mesh_preset="cpu", mesh_settings=("train.steps=9",)))
+    (again,) = (row for row in load_rows() if row.name == "viking")
+    assert again.mesh_settings == ("train.steps=9",)
+    assert "| 0.50 (cpu train.steps=9) |" in pose_table([again])
     assert table[2] == "| viking | 47 of 47 | - | - | **exhaustive matching 15** | 31 | - |"
     assert table[3] == "| synth helmet: no exif | 47 of 47 | 0.13 | 0.85 | **exhaustive matching 15** | 31 | - |"
     assert table[4] == "| synth helmet: blurred | 0 of 47 | - | - | - | - | - |"

@@ -354,7 +354,7 @@ def test_unusable_files_are_named_and_counted(photos: Path):
     assert [record.name for record in image_set.images] == names
     assert numbers["skipped"] == len(why) == 6
     assert "truncated" in why["cut.jpg"]
-    assert why["text.jpg"].startswith("cannot be read")
+    assert why["text.jpg"].startswith("no image, whatever its name says")
     assert why["notes.txt"] == "not an image (.txt)"
     assert "video" in why["clip.mp4"]
     assert why["twin.jpg"] == "same file as 000.jpg"

@@ -65,14 +65,14 @@ def test_an_object_alone_gets_a_sphere_that_takes_in_its_far_ends():
     shell *= 1.4 * fits / np.linalg.norm(shell, axis=1, keepdims=True)
     shell += 0.5 * fits * EAST  # larger than the frame, and not in its middle
     frusta = find_region(cameras, TARGET + shell)
-    region = grown_alone(frusta, TARGET + shell)
+    region = grown_alone(frusta, TARGET + shell, None)
     assert np.linalg.norm(region.center - TARGET - 0.5 * fits * EAST) < 0.05 * fits
     assert region.radius == pytest.approx(1.05 * 1.4 * fits, rel=0.03)
     # amid other things these points are not known to be the object
     wide = np.random.default_rng(1).uniform(-9, 9, (500, 3))
-    assert grown_alone(frusta, TARGET + np.concatenate([shell, wide])) is frusta
+    assert grown_alone(frusta, TARGET + np.concatenate([shell, wide]), None) is frusta
     # and a small object does not shrink what the views show
-    assert grown_alone(frusta, TARGET + 0.3 * shell) is frusta
+    assert grown_alone(frusta, TARGET + 0.3 * shell, None) is frusta
 
 
 def test_photos_of_something_else_do_not_move_the_center():

@@ -478,8 +478,6 @@ def test_silhouettes_of_a_real_set_agree_with_its_cameras(data_dir: Path):
 @pytest.mark.slow
 def test_points_of_a_real_set_fit_its_cameras(data_dir: Path, tmp_path: Path):
     """A mean reprojection error under a pixel, which cameras with other axes or another order could not give."""
-    import pycolmap
-
     from configs.params import SfmParams
     from stages.artifacts import ImageRecord
     from stages.posing.triangulation import triangulate
@@ -490,7 +488,7 @@ def test_points_of_a_real_set_fit_its_cameras(data_dir: Path, tmp_path: Path):
         for camera in read_poses(root).cameras[:4]
     }
     params = SfmParams(max_features=2000, max_image_size=400)
-    model, _ = triangulate(tmp_path, root, chosen, params, 1, 2, pycolmap.Device.cpu, lambda *progress: None)
+    model, _ = triangulate(tmp_path, root, chosen, params, 1, 2, cuda=False, progress=lambda *progress: None)
     assert model.num_points3D() > 50
     assert model.compute_mean_reprojection_error() < 0.8
 

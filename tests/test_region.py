@@ -6,7 +6,18 @@ import json
 
 import numpy as np
 import pytest
-from rigs import UP, capture, dome_on_a_table, facade, flight, look_at, ring, room, room_from_its_walls
+from rigs import (
+    UP,
+    capture,
+    dome_on_a_table,
+    facade,
+    flight,
+    long_object_on_a_table,
+    look_at,
+    ring,
+    room,
+    room_from_its_walls,
+)
 
 from stages.geometry.normalisation import rotation_onto
 from stages.geometry.plane import find_ground
@@ -123,7 +134,22 @@ def test_a_larger_plane_above_the_cameras_is_no_ground():
 def test_an_object_on_a_table_does_not_grow_over_it():
     _, points, region, _, ground = found(dome_on_a_table())
     assert ground is not None
-    assert grown_alone(region, points[:600]).radius >= region.radius
+    assert grown_alone(region, points, ground) is region
+    assert grown_alone(region, points[:600], None).radius >= region.radius
+
+
+def test_a_long_object_that_fills_the_frame_is_taken_whole_without_its_table():
+    _, points, region, _, ground = found(long_object_on_a_table())
+    assert ground is not None
+    assert region.radius < 2.3  # its ends are out of the frame
+    grown = grown_alone(region, points, ground)
+    ends = np.array([[-2.5, 0, 0.6], [2.5, 0, 0.6]])
+    assert (np.linalg.norm(ends - grown.center, axis=1) < grown.radius).all()
+    assert grown.radius < 3.0
+    assert grown.source == "the sparse points above the ground"
+    # other things that stand around it are no part of it
+    clutter = np.random.default_rng(1).uniform([6, 6, 0], [9, 9, 2], (300, 3))
+    assert grown_alone(region, np.concatenate([points, clutter]), ground) is region
 
 
 # ---------------------------------------------------------------- up

@@ -211,6 +211,9 @@ def test_every_reason_for_a_photo_left_out():
     assert "left out too (best pair: 40" in evidence.reason("pair", registered, others)
     assert "could not be placed: 1 registered" in evidence.reason("weak", registered, others)
     assert evidence.best_pair == 40
+    # with relaxed thresholds other numbers were needed
+    assert "best pair has 9 verified matches, need 10" in evidence.reason("lone", registered, others, 10, 12)
+    assert "fewer than 12 of its 3D points" in evidence.reason("weak", registered, others, 10, 12)
 
 
 @pytest.mark.parametrize("model", ["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"])

@@ -68,11 +68,20 @@ def read_photo(file: Path) -> Photo:
     except (UnusableError, MemoryError):
         raise
     except Exception as error:  # decoders raise nearly anything on a damaged file
-        raise UnusableError(f"cannot be read ({error})") from error
+        raise unreadable(error) from error
     width, height = photo.rgb.size
     if max(width, height) < MIN_SIDE:
         raise UnusableError(f"only {width} x {height} pixels")
     return photo
+
+
+def unreadable(error: Exception) -> UnusableError:
+    """What a decoder says of a file, without the file's name: that is told beside it."""
+    from PIL import UnidentifiedImageError
+
+    if isinstance(error, UnidentifiedImageError):
+        return UnusableError("no image, whatever its name says (empty, damaged, or another format)")
+    return UnusableError(f"cannot be read ({error})")
 
 
 def _decode(file: Path) -> Photo:

@@ -18,7 +18,7 @@ from stages.artifacts import SkippedImage
 from stages.capture.background import find_background
 from stages.capture.exif import ORIENTATION, camera_key, focal_px
 from stages.capture.listing import list_captures
-from stages.capture.photos import MIN_SIDE, RAW_SUFFIXES, UnusableError, read_photo, register_formats
+from stages.capture.photos import MIN_SIDE, RAW_SUFFIXES, UnusableError, read_photo, register_formats, unreadable
 from stages.capture.quality import sharpness
 from stages.capture.video import video_size
 
@@ -143,7 +143,7 @@ def glance(file: Path, source: str) -> Glance:
     except (UnusableError, MemoryError):
         raise
     except Exception as error:  # decoders raise nearly anything on a damaged file
-        raise UnusableError(f"cannot be read ({error})") from error
+        raise unreadable(error) from error
     if max(width, height) < MIN_SIDE:
         raise UnusableError(f"only {width} x {height} pixels")
     small = _thumbnail(pixels)

@@ -160,7 +160,12 @@ def _frames(
 def _open(video: Path) -> Any:
     import cv2
 
-    capture = cv2.VideoCapture(str(video), cv2.CAP_FFMPEG)
+    level = cv2.utils.logging.getLogLevel()
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)  # it warns of damaged files, which we name
+    try:
+        capture = cv2.VideoCapture(str(video), cv2.CAP_FFMPEG)
+    finally:
+        cv2.utils.logging.setLogLevel(level)
     if not capture.isOpened():
         raise UnusableError("cannot be read as a video (damaged, or a codec that FFmpeg does not have)")
     return capture

@@ -31,8 +31,20 @@ class Evidence:
         """Verified matches of the best pair of photos."""
         return max((count for pairs in self.pairs.values() for count in pairs.values()), default=0)
 
-    def reason(self, name: str, registered: Iterable[str], others: Iterable[Iterable[str]]) -> str:
-        """Why the photo `name` is not in the model, in words."""
+    def reason(
+        self,
+        name: str,
+        registered: Iterable[str],
+        others: Iterable[Iterable[str]],
+        verified: int = MIN_VERIFIED,
+        agreeing: int = MIN_PNP,
+    ) -> str:
+        """Why the photo `name` is not in the model, in words.
+
+        Args:
+            registered, others: photos of the model, and of each other one.
+            verified, agreeing: matches of a pair and points of a photo that were enough in the last attempt.
+        """
         registered = set(registered)
         features = self.features.get(name, 0)
         if features < MIN_FEATURES:
@@ -42,12 +54,12 @@ class Evidence:
                 return f"in another component of {len(other)} photos that does not connect to this one"
         pairs = self.pairs.get(name, {})
         best = max(pairs.values(), default=0)
-        if best < MIN_VERIFIED:
-            return f"matches no other photo: best pair has {best} verified matches, need {MIN_VERIFIED}"
+        if best < verified:
+            return f"matches no other photo: best pair has {best} verified matches, need {verified}"
         linked = [count for other, count in pairs.items() if other in registered]
         if not linked:
             return f"matches only photos that are left out too (best pair: {best} verified matches)"
         return (
             f"could not be placed: {len(linked)} registered photos match it (best pair: {max(linked)} "
-            f"verified matches), but fewer than {MIN_PNP} of its 3D points agreed on one position"
+            f"verified matches), but fewer than {agreeing} of its 3D points agreed on one position"
         )

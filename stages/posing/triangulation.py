@@ -12,6 +12,7 @@ import numpy as np
 from stages.artifacts import ImageRecord
 from stages.errors import InputError
 from stages.posing.known import MAX_STRETCH, KnownCamera
+from stages.posing.settings import feature_options, mapping_options, match_options
 
 log = logging.getLogger(__name__)
 
@@ -52,7 +53,7 @@ def triangulate(
     params: Any,
     threads: int,
     workers: int,
-    device: Any,
+    cuda: bool,
     progress: Callable[[float, float, str], None],
 ) -> tuple[Any, str]:
     """The model, and how pairs were matched.
@@ -62,6 +63,7 @@ def triangulate(
         cameras: name under `images_folder` -> its camera and record.
         params: `configs.params.SfmParams`.
         threads: for what depends on their number (matching). workers: for the rest.
+        cuda: whether to use a GPU.
 
     Raises:
         InputError: see `fitted_camera`.
@@ -71,21 +73,15 @@ def triangulate(
     database_path = work / "database.db"
     model = _posed_model(database_path, images_folder, cameras)
     progress(0.02, 1, "features")
-    extraction = pycolmap.FeatureExtractionOptions()
-    extraction.max_image_size, extraction.num_threads = params.max_image_size, workers
-    extraction.sift.max_num_features = params.max_features
-    extraction.use_gpu = device == pycolmap.Device.cuda
-    pycolmap.extract_features(database_path, images_folder, extraction_options=extraction, device=device)
+    pycolmap.extract_features(database_path, images_folder, **feature_options(params, workers, cuda))
     progress(PART_FEATURES, 1, "matches")
-    matcher = _match(database_path, model, params, threads, device)
+    matcher = _match(database_path, model, params, threads, cuda)
     progress(PART_MATCHES, 1, "points")
-    options = pycolmap.IncrementalPipelineOptions()
-    options.num_threads = options.mapper.num_threads = threads
-    options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = params.seed
-    options.extract_colors = False
     out = work / "points"
     out.mkdir()
-    return pycolmap.triangulate_points(model, database_path, images_folder, out, options=options), matcher
+    return pycolmap.triangulate_points(
+        model, database_path, images_folder, out, options=mapping_options(params, threads)
+    ), matcher
 
 
 def _posed_model(
@@ -124,15 +120,11 @@ def _posed_model(
     return model
 
 
-def _match(database_path: Path, model: Any, params: Any, threads: int, device: Any) -> str:
+def _match(database_path: Path, model: Any, params: Any, threads: int, cuda: bool) -> str:
     """All pairs of small sets, else neighbours in space: the poses say which these are."""
     import pycolmap
 
-    matching = pycolmap.FeatureMatchingOptions()
-    matching.num_threads, matching.use_gpu = threads, device == pycolmap.Device.cuda
-    verification = pycolmap.TwoViewGeometryOptions()
-    verification.ransac.random_seed = params.seed
-    common = {"matching_options": matching, "verification_options": verification, "device": device}
+    common = match_options(params, threads, cuda)
     matcher = params.matcher
     if matcher == "auto":
         matcher = "exhaustive" if model.num_reg_images() <= params.exhaustive_max else "spatial"

@@ -20,7 +20,9 @@ import numpy as np
 from stages.artifacts import ImageSet
 from stages.errors import InputError
 from stages.posing.evidence import MIN_PNP, MIN_VERIFIED
+from stages.posing.joining import join_models
 from stages.posing.ladder import Rung, Solution
+from stages.posing.settings import STATIONARY_PX, feature_options, mapping_options, match_options, verification_options
 
 log = logging.getLogger(__name__)
 
@@ -28,13 +30,9 @@ DEFAULT_FOCAL_FACTOR = 1.2  # COLMAP's guess where nothing is known: focal = 1.2
 # A focal length that comes out this many times longer or shorter than the photos' EXIF says makes the EXIF doubtful:
 # rounding in EXIF costs a few percent, stabilised or cropped pictures up to a fifth.
 DOUBTFUL_FOCAL = 1.25
-# A match is stationary when it lies at the same place in both photos, within this many pixels (COLMAP's default).
-STATIONARY_PX = 4.0
 # A background that stands still while the object turns matches itself between most photos, also distant ones. Where
 # the camera moves, only photos that are nearly the same have such matches.
 STATIONARY_SHARE = 0.5
-# Affine features are also looked for where there is less contrast, this many times the usual threshold.
-AFFINE_PEAK = 0.5
 RELAXED = "relaxed thresholds"
 # Relaxed thresholds, with COLMAP's defaults: matches of a pair, 3D points that agree on a photo's position and their
 # share, matches and angle of the first pair.
@@ -284,14 +282,6 @@ class Workbench:
         """Features; finding them is deterministic with any number of threads."""
         import pycolmap
 
-        options = pycolmap.FeatureExtractionOptions()
-        options.max_image_size = self.params.max_image_size
-        options.num_threads = self.workers
-        options.sift.max_num_features = self.params.max_features
-        if base.affine:  # the CPU's only
-            options.sift.estimate_affine_shape = True
-            options.sift.peak_threshold *= AFFINE_PEAK
-        options.use_gpu = self.cuda and not base.affine
         reader = pycolmap.ImageReaderOptions()
         if base.masked:
             reader.mask_path = str(self.masks_folder)
@@ -299,29 +289,23 @@ class Workbench:
             self.database(base),
             self.images_folder,
             reader_options=reader,
-            extraction_options=options,
-            device=pycolmap.Device.cuda if options.use_gpu else pycolmap.Device.cpu,
+            **feature_options(self.params, self.workers, self.cuda, base.affine),
         )
 
-    def _matching_options(self) -> dict[str, Any]:
-        import pycolmap
+    def _matching(self) -> dict[str, Any]:
+        return match_options(
+            self.params, self.threads, self.cuda, self._guided, self.verified, self._stationary
+        )  # fmt: skip
 
-        matching = pycolmap.FeatureMatchingOptions()
-        matching.num_threads = self.threads
-        matching.use_gpu = self.cuda
-        matching.guided_matching = self._guided
-        device = pycolmap.Device.cuda if self.cuda else pycolmap.Device.cpu
-        return {"matching_options": matching, "verification_options": self._verification(), "device": device}
+    @property
+    def verified(self) -> int:
+        """So many matches of a pair are enough now."""
+        return RELAXED_VERIFIED if self._relaxed else MIN_VERIFIED
 
-    def _verification(self) -> Any:
-        import pycolmap
-
-        verification = pycolmap.TwoViewGeometryOptions()
-        verification.min_num_inliers = RELAXED_VERIFIED if self._relaxed else MIN_VERIFIED
-        verification.ransac.random_seed = self.params.seed
-        verification.filter_stationary_matches = self._stationary
-        verification.stationary_matches_max_error = STATIONARY_PX
-        return verification
+    @property
+    def agreeing(self) -> int:
+        """So many 3D points that agree on a photo's position are enough now."""
+        return RELAXED_PNP if self._relaxed else MIN_PNP
 
     def _match(self, base: Base) -> None:
         import pycolmap
@@ -331,7 +315,7 @@ class Workbench:
             "spatial": pycolmap.match_spatial,
             "sequential": pycolmap.match_sequential,
         }
-        matchers[self.matcher](self.database(base), **self._matching_options())
+        matchers[self.matcher](self.database(base), **self._matching())
 
     def _match_pairs(self, base: Base, pairs: Iterable[tuple[int, int]]) -> None:
         """Match and verify pairs of image ids; those that are verified already are left as they are."""
@@ -344,7 +328,7 @@ class Workbench:
         pairing = pycolmap.ImportedPairingOptions()
         pairing.match_list_path = str(listed)
         with _named_by_number(path):
-            pycolmap.match_image_pairs(path, pairing_options=pairing, **self._matching_options())
+            pycolmap.match_image_pairs(path, pairing_options=pairing, **self._matching())
         self._tell(PART_MATCHES, "poses")
 
     def _verify_again(self, base: Base) -> None:
@@ -355,9 +339,8 @@ class Workbench:
             database.clear_two_view_geometries()
         options = pycolmap.GeometricVerifierOptions()
         options.num_threads = self.threads
-        pycolmap.geometric_verification(
-            self.database(base), verifier_options=options, two_view_geometry_options=self._verification()
-        )
+        judged = verification_options(self.params, self.verified, self._stationary)
+        pycolmap.geometric_verification(self.database(base), verifier_options=options, two_view_geometry_options=judged)
 
     # ------------------------------------------------------------ poses
     def _solve(self, base: Base, mapper: str, start: Solution | None = None) -> Solution | None:
@@ -366,14 +349,12 @@ class Workbench:
         A start that was found on the same features and has most photos is gone on with; else all begins anew.
         """
         self._latest = base
-        out = self.work / f"models-{self._maps}"
-        self._maps += 1
-        out.mkdir()
         if mapper == "global":
-            models = self._map_global(base, out)
+            models = self._map_global(base)
         else:
-            continued = start is not None and start.base == base and 2 * len(start.registered) > len(self.names)
-            models = self._map_incremental(base, out, start if continued else None)
+            if start is not None and (start.base != base or 2 * len(start.registered) <= len(self.names)):
+                start = None
+            models = self._join(base, self._map_incremental(base, start and start.model))
         if not models:
             return None
         largest = max(models, key=lambda model: (model.num_reg_images(), model.num_points3D()))
@@ -386,10 +367,26 @@ class Workbench:
             base=base,
         )
 
-    def _map_global(self, base: Base, out: Path) -> list[Any]:
+    def _join(self, base: Base, models: list[Any]) -> list[Any]:
+        """Models that fit onto each other made one, and the photos placed that match that one only."""
+        joined = join_models(models, self.database(base), self._mapping())
+        if len(joined) == len(models):
+            return models
+        placed = frozenset[str]().union(*map(_names, joined))
+        if placed == self.names:
+            return joined
+        return [*self._map_incremental(base, joined[0]), *joined[1:]]
+
+    def _new_folder(self) -> Path:
+        out = self.work / f"models-{self._maps}"
+        self._maps += 1
+        out.mkdir()
+        return out
+
+    def _map_global(self, base: Base) -> list[Any]:
         import pycolmap
 
-        path = self.database(base)
+        path, out = self.database(base), self._new_folder()
         if not (base.focal_priors and self.priors):  # it needs focal lengths; the database of the others stays as it is
             path = out / path.name
             shutil.copyfile(self.database(base), path)
@@ -398,28 +395,27 @@ class Workbench:
         options.num_threads, options.random_seed = self.threads, self.params.seed
         return list(pycolmap.global_mapping(path, self.images_folder, out, options).values())
 
-    def _map_incremental(self, base: Base, out: Path, start: Solution | None) -> list[Any]:
-        import pycolmap
-
-        options, seed = pycolmap.IncrementalPipelineOptions(), self.params.seed
-        options.num_threads, options.random_seed = self.threads, seed
-        options.mapper.num_threads, options.mapper.random_seed = self.threads, seed
-        options.triangulation.random_seed = seed
+    def _mapping(self) -> Any:
+        options = mapping_options(self.params, self.threads)
         options.min_model_size = 3  # small captures are captures too
-        options.extract_colors = False
-        options.mapper.abs_pose_min_num_inliers = MIN_PNP
+        options.mapper.abs_pose_min_num_inliers = self.agreeing
         if self._relaxed:
-            options.min_num_matches = RELAXED_VERIFIED
-            options.mapper.abs_pose_min_num_inliers = RELAXED_PNP
+            options.min_num_matches = self.verified
             options.mapper.abs_pose_min_inlier_ratio = RELAXED_PNP_SHARE
             options.mapper.init_min_num_inliers = RELAXED_INIT_INLIERS
             options.mapper.init_min_tri_angle = RELAXED_INIT_ANGLE_DEG
-        placed, total, input_path = 2, len(self.names), ""
+        return options
+
+    def _map_incremental(self, base: Base, start: Any | None) -> list[Any]:
+        """Photos placed one after another, from the model `start` on where there is one."""
+        import pycolmap
+
+        placed, total, out, input_path = 2, len(self.names), self._new_folder(), ""
         if start is not None:
             input_path = str(out / "start")
             Path(input_path).mkdir()
-            start.model.write(input_path)
-            placed = len(start.registered)
+            start.write(input_path)
+            placed = start.num_reg_images()
 
         def one_more() -> None:
             nonlocal placed
@@ -431,7 +427,7 @@ class Workbench:
             self.database(base),
             self.images_folder,
             out,
-            options,
+            self._mapping(),
             input_path=input_path,
             next_image_callback=one_more,
         )
