@@ -286,7 +286,7 @@ def _too_few(
 
 SFM = Stage(
     name="sfm",
-    version=2,
+    version=3,
     needs=("ingest",),
     params="sfm",
     run=run,
