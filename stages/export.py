@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from importlib.metadata import PackageNotFoundError, version
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -13,6 +14,9 @@ from stages.errors import ReconstructionError
 from stages.geometry.cameras import PosedScene
 from stages.geometry.orientation import y_up_rotation
 
+if TYPE_CHECKING:
+    from stages.meshing.writing import Textures
+
 
 def run(context: StageContext) -> dict[str, Any]:
     """Write each format of the settings. Returns counts, extents in world units, and bytes of each file."""
@@ -20,7 +24,7 @@ def run(context: StageContext) -> dict[str, Any]:
 
     scene = artifacts.load_scene(context.inputs["undistort"])
     atlas = artifacts.load_atlas(context.inputs["atlas"])
-    texture_png = artifacts.base_color_path(context.inputs["bake"]).read_bytes()
+    textures = load_textures(context.inputs["bake"])
     world = scene.world_from_scene
     vertices = world.apply(atlas.vertices.astype(np.float64))
     normals = unit_normals(atlas.vertices, atlas.normals, atlas.faces) @ world.rotation.T
@@ -40,7 +44,7 @@ def run(context: StageContext) -> dict[str, Any]:
                 normals @ gltf_from_world.T,
                 atlas.uvs,
                 atlas.faces,
-                texture_png,
+                textures,
                 generator=generator(),
                 extras=provenance(scene, gltf_from_world),
             )
@@ -48,13 +52,18 @@ def run(context: StageContext) -> dict[str, Any]:
             sizes["glb"] = len(data)
         if "obj" in context.params.formats:
             texture_path, mtl = artifacts.obj_texture_path(context.out), artifacts.mtl_path(context.out)
-            texture_path.write_bytes(texture_png)
-            mtl.write_text(mtl_text(texture_path.name), encoding="utf-8")
+            texture_path.write_bytes(textures.base_color)
+            normal_map_name = None
+            if textures.normal is not None:
+                normal_map_path = artifacts.obj_normal_map_path(context.out)
+                normal_map_path.write_bytes(textures.normal)
+                normal_map_name = normal_map_path.name
+            mtl.write_text(mtl_text(texture_path.name, normal_map_name), encoding="utf-8")
             text = obj_text(vertices, normals, atlas.uvs, atlas.faces, mtl.name, note)
             artifacts.obj_path(context.out).write_text(text, encoding="utf-8")
             sizes["obj"] = len(text)
         if "ply" in context.params.formats:
-            colors = vertex_colors(texture_png, atlas.uvs)
+            colors = vertex_colors(textures.base_color, atlas.uvs)
             data = ply_bytes(vertices, normals, colors, atlas.faces, note)
             artifacts.ply_path(context.out).write_bytes(data)
             sizes["ply"] = len(data)
@@ -63,6 +72,15 @@ def run(context: StageContext) -> dict[str, Any]:
             f"The mesh cannot be exported: {error}.", "Rebuild it: `hineus run PHOTOS --from cleanup`."
         ) from error
     return {**numbers, "bytes": sizes}
+
+
+def load_textures(baked: Path) -> Textures:
+    """The images that the bake stage left."""
+    from stages.meshing.writing import Textures
+
+    optional = (artifacts.normal_map_path(baked), artifacts.occlusion_path(baked))
+    normal, occlusion = (path.read_bytes() if path.exists() else None for path in optional)
+    return Textures(artifacts.base_color_path(baked).read_bytes(), normal, occlusion)
 
 
 def unit_normals(vertices: np.ndarray, normals: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -124,7 +142,7 @@ def provenance(scene: PosedScene, gltf_from_world: np.ndarray) -> dict[str, Any]
 
 EXPORT = Stage(
     name="export",
-    version=2,
+    version=3,
     needs=("undistort", "atlas", "bake"),
     params="export",
     run=run,

@@ -25,7 +25,7 @@ from stages.geometry.cameras import PinholeCameras, PosedScene
 from stages.geometry.orientation import y_up_rotation
 from stages.geometry.place import Place
 from stages.geometry.similarity import Similarity
-from stages.meshing.writing import glb_bytes, obj_text, ply_bytes
+from stages.meshing.writing import Textures, glb_bytes, obj_text, ply_bytes
 
 ROOT = Path(__file__).parents[1]
 # No rotation maps this tetrahedron with its four colours to its mirror image.
@@ -87,6 +87,8 @@ def workspace(tmp_path: Path, params: ExportParams | None = None) -> StageContex
     artifacts.save_scene(folders["undistort"], scene)
     artifacts.save_atlas(folders["atlas"], atlas)
     write_png(artifacts.base_color_path(folders["bake"]), texture)
+    write_png(artifacts.normal_map_path(folders["bake"]), np.full((32, 32, 3), (128, 128, 255), np.uint8))
+    write_png(artifacts.occlusion_path(folders["bake"]), np.full((32, 32), 200, np.uint8))
     return StageContext(
         inputs={name: folders[name] for name in EXPORT.needs},
         sources={},
@@ -139,6 +141,43 @@ def test_glb_read_by_trimesh_is_y_up_and_not_mirrored(exported):
     np.testing.assert_allclose((up[0] - up[1]) / WORLD.scale, [0, 1, 0], atol=1e-9)
     outward = np.asarray(mesh.vertex_normals)
     assert ((np.asarray(mesh.vertices) - mesh.vertices.mean(0)) * outward).sum(1).min() > 0
+
+
+def test_glb_names_normals_occlusion_and_the_frame_they_are_for(exported):
+    import trimesh
+
+    mesh = trimesh.load(exported[0] / "model.glb", force="mesh", process=False)
+    assert np.asarray(mesh.visual.material.normalTexture).reshape(-1, 3)[0].tolist() == [128, 128, 255]
+    assert np.asarray(mesh.visual.material.occlusionTexture).ravel()[0] == 200
+    data = (exported[0] / "model.glb").read_bytes()
+    length = struct.unpack_from("<I", data, 12)[0]
+    tree = json.loads(data[20 : 20 + length])
+    accessor = tree["accessors"][tree["meshes"][0]["primitives"][0]["attributes"]["TANGENT"]]
+    view = tree["bufferViews"][accessor["bufferView"]]
+    assert (accessor["type"], accessor["count"]) == ("VEC4", 12)
+    tangents = np.frombuffer(data, np.float32, 48, 28 + length + view["byteOffset"]).reshape(12, 4)
+    for face in mesh.faces:  # the charts' u runs from the first corner to the second
+        along_u = mesh.vertices[face[1]] - mesh.vertices[face[0]]
+        np.testing.assert_allclose(tangents[face, :3], np.tile(along_u / np.linalg.norm(along_u), (3, 1)), atol=1e-5)
+        assert (tangents[face, 3] == 1).all()
+
+
+def test_files_do_without_normals_and_occlusion_that_were_not_baked(tmp_path):
+    context = workspace(tmp_path)
+    artifacts.normal_map_path(context.inputs["bake"]).unlink()
+    artifacts.occlusion_path(context.inputs["bake"]).unlink()
+    EXPORT.run(context)
+    data = artifacts.glb_path(context.out).read_bytes()
+    for word in (b"TANGENT", b"normalTexture", b"occlusionTexture"):
+        assert word not in data
+    assert "norm" not in artifacts.mtl_path(context.out).read_text()
+    assert not artifacts.obj_normal_map_path(context.out).exists()
+
+
+def test_mtl_names_the_normal_map(exported):
+    lines = (exported[0] / "model.mtl").read_text().splitlines()
+    assert {"norm model_normal.png", "map_bump model_normal.png"} <= set(lines)
+    assert (exported[0] / "model_normal.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_glb_read_by_open3d(exported):
@@ -297,11 +336,11 @@ def test_normals_without_length_are_mended():
 def test_wrong_arrays_are_refused():
     atlas, _ = tetrahedron()
     with pytest.raises(ValueError, match="unit normals"):
-        glb_bytes(atlas.vertices, atlas.normals * 2, atlas.uvs, atlas.faces, b"")
+        glb_bytes(atlas.vertices, atlas.normals * 2, atlas.uvs, atlas.faces, Textures(b""))
     with pytest.raises(ValueError, match=r"vertices in \[0, 12\)"):
         obj_text(atlas.vertices, atlas.normals, atlas.uvs, atlas.faces + 5, "m.mtl")
     with pytest.raises(ValueError, match="finite"):
-        glb_bytes(atlas.vertices * np.nan, atlas.normals, atlas.uvs, atlas.faces, b"")
+        glb_bytes(atlas.vertices * np.nan, atlas.normals, atlas.uvs, atlas.faces, Textures(b""))
 
 
 def test_ply_header_counts():
