@@ -179,7 +179,9 @@ class BakeParams(Section):
 class ExportParams(Section):
     """Textured mesh to files."""
 
-    formats: tuple[Literal["glb", "obj", "ply"], ...] = Field(("glb", "obj", "ply"), description="files to write")
+    formats: tuple[Literal["glb", "usdz", "obj", "ply", "stl"], ...] = Field(
+        ("glb", "usdz", "obj", "ply"), description="files to write; stl is the bare shape"
+    )
 
 
 class ReportParams(Section):

@@ -377,7 +377,7 @@ def occlusion_path(folder: Path) -> Path:
     return folder / OCCLUSION
 
 
-# ---------------------------------------------------------------- export: model.glb, .obj, .mtl, .png, .ply
+# ------------------------------------------------------------ export: model.glb, .usdz, .obj, .mtl, .ply, .stl, .png
 def glb_path(folder: Path) -> Path:
     return folder / "model.glb"
 
@@ -402,6 +402,14 @@ def obj_normal_map_path(folder: Path) -> Path:
 
 def ply_path(folder: Path) -> Path:
     return folder / "model.ply"
+
+
+def usdz_path(folder: Path) -> Path:
+    return folder / "model.usdz"
+
+
+def stl_path(folder: Path) -> Path:
+    return folder / "model.stl"
 
 
 # ---------------------------------------------------------------- report: report.html

@@ -19,7 +19,7 @@ from configs.params import ExportParams
 from stages import artifacts
 from stages.artifacts import AtlasMesh
 from stages.engine.stage import StageContext
-from stages.errors import ReconstructionError
+from stages.errors import ReconstructionError, SystemRequirementError
 from stages.export import EXPORT, unit_normals
 from stages.geometry.cameras import PinholeCameras, PosedScene
 from stages.geometry.orientation import y_up_rotation
@@ -94,7 +94,7 @@ def workspace(tmp_path: Path, params: ExportParams | None = None) -> StageContex
         sources={},
         out=folders["out"],
         scratch=folders["scratch"],
-        params=params or ExportParams(),
+        params=params or ExportParams(formats=("glb", "usdz", "obj", "ply", "stl")),
     )
 
 
@@ -124,7 +124,7 @@ def test_numbers(exported):
     folder, numbers = exported
     assert numbers["faces"] == 4
     np.testing.assert_allclose(numbers["extent"], np.ptp(WORLD.apply(CORNERS), axis=0), atol=1e-5)
-    for suffix in ("glb", "obj", "ply"):
+    for suffix in ("glb", "usdz", "obj", "ply", "stl"):
         assert (folder / f"model.{suffix}").stat().st_size == numbers["bytes"][suffix]
 
 
@@ -275,6 +275,87 @@ def test_ply_read_by_trimesh_is_watertight(exported):
     assert mesh.visual.kind == "vertex"
 
 
+def test_stl_read_by_trimesh_and_open3d_is_the_same_solid(exported):
+    import open3d as o3d
+    import trimesh
+
+    mesh = trimesh.load(exported[0] / "model.stl")
+    assert mesh.is_watertight
+    assert mesh.volume == pytest.approx(trimesh.load(exported[0] / "model.ply", process=False).volume, rel=1e-5)
+    other = o3d.io.read_triangle_mesh(str(exported[0] / "model.stl"))
+    assert len(other.triangles) == 4
+    np.testing.assert_allclose(np.asarray(other.vertices).max(0), WORLD.apply(CORNERS).max(0), atol=1e-5)
+
+
+def test_usdz_read_by_pxr_is_y_up_in_metres_and_not_mirrored(exported):
+    from pxr import Usd, UsdGeom, UsdShade
+
+    stage = Usd.Stage.Open(str(exported[0] / "model.usdz"))
+    assert UsdGeom.GetStageUpAxis(stage) == "Y"
+    assert UsdGeom.GetStageMetersPerUnit(stage) == 1.0
+    extras = json.loads(stage.GetRootLayer().customLayerData["hineus"])
+    assert extras["units"] == "arbitrary units"
+    mesh = UsdGeom.Mesh(stage.GetPrimAtPath("/model/mesh"))
+    points, faces = np.array(mesh.GetPointsAttr().Get()), np.array(mesh.GetFaceVertexIndicesAttr().Get()).reshape(-1, 3)
+    uvs = np.array(UsdGeom.PrimvarsAPI(mesh).GetPrimvar("st").Get())
+    material, _ = UsdShade.MaterialBindingAPI(mesh).ComputeBoundMaterial()
+    surface = material.ComputeSurfaceSource("")[0]
+    files = {}
+    for name in ("diffuseColor", "normal", "occlusion"):
+        source = surface.GetInput(name).GetConnectedSources()[0][0].source
+        shader = UsdShade.Shader(source.GetPrim())
+        files[name] = shader.GetInput("file").Get().resolvedPath
+    expect_marks(points, faces, color_of(packed_image(files["diffuseColor"]), uvs[faces].mean(1)), to_gltf)
+    assert packed_image(files["normal"])[0, 0].tolist() == [128, 128, 255]
+    assert packed_image(files["occlusion"])[0, 0].tolist() == [200, 200, 200]
+
+
+def packed_image(address: str) -> np.ndarray:
+    """[H, W, 3] RGB of a resolved path "package.usdz[file.png]"."""
+    import zipfile
+
+    import cv2
+
+    package, _, name = address.rstrip("]").partition("[")
+    data = zipfile.ZipFile(package).read(name)
+    return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
+
+
+def test_usdz_passes_all_validators_of_usd(exported):
+    from pxr import Usd
+
+    validation = pytest.importorskip("pxr.UsdValidation")
+    validators = validation.ValidationRegistry().GetOrLoadAllValidators()
+    assert {"usdUtilsValidators:UsdzPackageValidator", "usdShadeValidators:NormalMapTextureValidator"} <= {
+        validator.GetMetadata().name for validator in validators
+    }
+    stage = Usd.Stage.Open(str(exported[0] / "model.usdz"))
+    found = validation.ValidationContext(validators).Validate(stage)
+    assert [error.GetErrorAsString() for error in found] == []
+
+
+def test_usdz_is_packed_as_arkit_asks(exported):
+    import zipfile
+
+    with zipfile.ZipFile(exported[0] / "model.usdz") as package:
+        entries = package.infolist()
+    assert [entry.filename for entry in entries] == ["model.usdc", "base_color.png", "normal.png", "occlusion.png"]
+    data = (exported[0] / "model.usdz").read_bytes()
+    for entry in entries:
+        assert entry.compress_type == zipfile.ZIP_STORED
+        name, extra = struct.unpack_from("<HH", data, entry.header_offset + 26)
+        assert (entry.header_offset + 30 + name + extra) % 64 == 0
+
+
+def test_without_usd_core_the_command_to_get_it_is_named(tmp_path, monkeypatch):
+    import sys
+
+    monkeypatch.setitem(sys.modules, "pxr", None)
+    with pytest.raises(SystemRequirementError) as caught:
+        EXPORT.run(workspace(tmp_path))
+    assert "pip install usd-core" in caught.value.hint
+
+
 def test_only_the_wanted_formats_are_written(tmp_path):
     context = workspace(tmp_path, ExportParams(formats=("glb",)))
     EXPORT.run(context)
@@ -288,6 +369,13 @@ def test_glb_tells_the_way_back_to_the_world(exported):
     assert asset["generator"].startswith("hineus")
     turn = np.array(asset["extras"]["gltf_from_world_rotation"])
     np.testing.assert_allclose(WORLD.apply(CORNERS) @ turn.T, to_gltf(CORNERS))
+
+
+def test_glb_names_the_run_it_comes_from(tmp_path):
+    context = workspace(tmp_path)
+    assert "run" not in extras_of(context)
+    (context.inputs["bake"] / "manifest.json").write_text('{"fingerprint": "c0ffee"}')
+    assert extras_of(context)["run"] == "c0ffee"
 
 
 def test_gltf_validator_finds_nothing(exported):

@@ -1,4 +1,4 @@
-"""Textured meshes as bytes: GLB, OBJ + MTL, PLY. Arrays in, bytes out."""
+"""Textured meshes as bytes: GLB, OBJ + MTL, PLY, STL. Arrays in, bytes out."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def glb_bytes(
     Raises:
         ValueError: an index is out of range, a normal is not unit or a number is not finite.
     """
-    vertices, normals, uvs, faces = _checked(vertices, normals, uvs, faces)
+    vertices, normals, uvs, faces = checked_mesh(vertices, normals, uvs, faces)
     flipped = uvs.copy()
     flipped[:, 1] = 1 - flipped[:, 1]
     bounds = {"min": vertices.min(0).tolist(), "max": vertices.max(0).tolist()}
@@ -155,7 +155,7 @@ def obj_text(
     comment: str = "",
 ) -> str:
     """An OBJ with positions, UVs (bottom-left origin), normals, the material "textured" of `mtl_name`, a comment."""
-    vertices, normals, uvs, faces = _checked(vertices, normals, uvs, faces)
+    vertices, normals, uvs, faces = checked_mesh(vertices, normals, uvs, faces)
     lines = [f"# {comment}"] if comment else []
     lines += [f"mtllib {mtl_name}", "o model"]
     lines += [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in vertices.tolist()]
@@ -212,7 +212,24 @@ def ply_bytes(
     return ("\n".join(header) + "\n").encode() + vertex.tobytes() + face.tobytes()
 
 
-def _checked(
+def stl_bytes(vertices: np.ndarray, faces: np.ndarray, comment: str = "") -> bytes:
+    """A binary STL: shape only.
+
+    Args:
+        vertices, faces: [V, 3], [F, 3].
+        comment: ASCII, cut to the header's 80 bytes.
+    """
+    corners = vertices[faces].astype(np.float32)
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    triangles = np.zeros(len(faces), dtype=[("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("unused", "<u2")])
+    triangles["normal"] = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+    triangles["corners"] = corners
+    # A file that begins with "solid" is taken for the text form.
+    header = f"STL {comment}".encode("ascii", "replace")[:80].ljust(80)
+    return header + struct.pack("<I", len(faces)) + triangles.tobytes()
+
+
+def checked_mesh(
     vertices: np.ndarray, normals: np.ndarray, uvs: np.ndarray, faces: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """The arrays as float32 and uint32; wrong ones are refused."""
