@@ -169,12 +169,19 @@ class BakeParams(Section):
     robust_sigma: float = Field(
         2.5, gt=0, description="colours further than this many (robust) standard deviations are rejected"
     )
+    normal_map: bool = Field(True, description="keep the detail that decimation takes away as a normal map")
+    occlusion_rays: int = Field(64, ge=0, le=4096, description="rays per sample of the occlusion map; 0: no such map")
+    occlusion_reach: float = Field(
+        0.5, gt=0, description="what lies further off occludes nothing, in radii of the region of interest"
+    )
 
 
 class ExportParams(Section):
     """Textured mesh to files."""
 
-    formats: tuple[Literal["glb", "obj", "ply"], ...] = Field(("glb", "obj", "ply"), description="files to write")
+    formats: tuple[Literal["glb", "usdz", "obj", "ply", "stl"], ...] = Field(
+        ("glb", "usdz", "obj", "ply"), description="files to write; stl is the bare shape"
+    )
 
 
 class ReportParams(Section):

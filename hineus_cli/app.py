@@ -463,6 +463,46 @@ def demo(
         typer.echo(json.dumps({"ok": True, **result}, default=str))
 
 
+def compare(
+    context: typer.Context,
+    first: Annotated[Path, typer.Argument(help="Mesh file or workspace A.", show_default=False)],
+    second: Annotated[Path, typer.Argument(help="Mesh file or workspace B.", show_default=False)],
+    icp: Annotated[bool, typer.Option("--icp", help="Move A onto B first (rigid); else they share a frame.")] = False,
+    distance_map: Annotated[
+        Path | None, typer.Option("--map", help="Write A, coloured by distance to B, as PLY.", show_default=False)
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """How far two meshes, or two workspaces' results, are from each other, both ways."""
+    from rich.table import Table
+
+    from hineus_cli.comparison import compare as compare_meshes
+    from hineus_cli.console import product
+
+    session: Session = context.obj
+    session.json = as_json
+    found = compare_meshes(first, second, icp, distance_map)
+    if as_json:
+        typer.echo(json.dumps({"ok": True, **found}))
+        return
+    table = Table(header_style="bold")
+    table.add_column("distance")
+    for heading in ("A to B", "B to A", "A to B, % of the extent", "B to A, % of the extent"):
+        table.add_column(heading, justify="right")
+    for key, label in (("mean", "mean"), ("median", "median"), ("p95", "95 %"), ("max", "largest")):
+        ways = [found[way][key] for way in ("a_to_b", "b_to_a")]
+        table.add_row(label, *(f"{d:.4g}" for d in ways), *(f"{100 * d / found['extent']:.3f}" for d in ways))
+    console = product()
+    console.print(table)
+    scores = ", ".join(f"{100 * float(part):g} %: {score:.1f}" for part, score in found["f_scores"].items())
+    lines = [f"F-score (percent) within parts of the extent, {found['extent']:.4g}: {scores}"]
+    lines.append("alignment: A moved onto B by ICP" if icp else "alignment: none, taken to be in one frame")
+    if distance_map is not None:
+        lines.append(f"distance map: {distance_map}")
+    for line in lines:
+        console.print(line, markup=False, soft_wrap=True)
+
+
 # ---------------------------------------------------------------- poses for other programs
 OutFolder = Annotated[Path, typer.Argument(help="New or empty folder to write.", show_default=False)]
 OfWorkspace = Annotated[Path, typer.Argument(help="The workspace's folder.", show_default=False)]
@@ -525,7 +565,7 @@ def build_app(pipeline: Sequence[Stage] = PIPELINE) -> typer.Typer:
     ) -> None:
         """Photos in, textured 3D asset out. Start with `hineus doctor`, then `hineus run PHOTOS`."""
 
-    for command in (run, check, status, doctor, presets, demo):
+    for command in (run, check, status, compare, doctor, presets, demo):
         app.command()(command)
     app.command("config")(show_config)
     app.command("export-colmap")(export_colmap)

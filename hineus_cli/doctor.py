@@ -38,6 +38,7 @@ REQUIRED = {
     "xatlas": "xatlas",
     "fast_simplification": "fast-simplification",
     "jinja2": "jinja2",
+    "pxr": "usd-core",
 }
 OPTIONAL = {"rawpy": ("rawpy", "camera raw files are left out")}
 

@@ -297,22 +297,23 @@ def checkpoint_path(scratch: Path) -> Path:
     return scratch / CHECKPOINT
 
 
-# ---------------------------------------------------------------- extract, cleanup: mesh.ply
+# ---------------------------------------------------------------- extract, cleanup: mesh.ply; cleanup: full_mesh.ply
 MESH = "mesh.ply"
+FULL_MESH = "full_mesh.ply"
 
 
-def save_mesh(folder: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
+def save_mesh(folder: Path, vertices: np.ndarray, faces: np.ndarray, name: str = MESH) -> None:
     """Write mesh.ply (binary): vertices [V, 3] in the scene frame, faces [F, 3]."""
     import trimesh
 
-    trimesh.Trimesh(vertices, faces, process=False).export(folder / MESH)
+    trimesh.Trimesh(vertices, faces, process=False).export(folder / name)
 
 
-def load_mesh(folder: Path) -> tuple[np.ndarray, np.ndarray]:
+def load_mesh(folder: Path, name: str = MESH) -> tuple[np.ndarray, np.ndarray]:
     """Vertices [V, 3] float32 in the scene frame and faces [F, 3] int32."""
     import trimesh
 
-    mesh = trimesh.load(folder / MESH, process=False)
+    mesh = trimesh.load(folder / name, process=False)
     return np.asarray(mesh.vertices, dtype=np.float32), np.asarray(mesh.faces, dtype=np.int32)
 
 
@@ -348,9 +349,12 @@ def load_atlas(folder: Path) -> AtlasMesh:
         return AtlasMesh(data["vertices"], data["normals"], data["uvs"], data["faces"], int(data["texture_size"]))
 
 
-# ---------------------------------------------------------------- bake: base_color.png, provenance.png
+# ---------------------------------------------------------------- bake: base_color.png, provenance.png, and as set:
+# normal_map.png, occlusion.png
 BASE_COLOR = "base_color.png"
 PROVENANCE = "provenance.png"
+NORMAL_MAP = "normal_map.png"
+OCCLUSION = "occlusion.png"
 
 
 def base_color_path(folder: Path) -> Path:
@@ -363,7 +367,17 @@ def provenance_path(folder: Path) -> Path:
     return folder / PROVENANCE
 
 
-# ---------------------------------------------------------------- export: model.glb, .obj, .mtl, .png, .ply
+def normal_map_path(folder: Path) -> Path:
+    """8-bit tangent-space normals, +Y up, see `stages.meshing.relief.bake_normals`. May not exist."""
+    return folder / NORMAL_MAP
+
+
+def occlusion_path(folder: Path) -> Path:
+    """8-bit grey, 255 where all is open, see `stages.meshing.relief.bake_occlusion`. May not exist."""
+    return folder / OCCLUSION
+
+
+# ------------------------------------------------------------ export: model.glb, .usdz, .obj, .mtl, .ply, .stl, .png
 def glb_path(folder: Path) -> Path:
     return folder / "model.glb"
 
@@ -381,8 +395,21 @@ def obj_texture_path(folder: Path) -> Path:
     return folder / "model.png"
 
 
+def obj_normal_map_path(folder: Path) -> Path:
+    """The normal map that the MTL names, where there is one."""
+    return folder / "model_normal.png"
+
+
 def ply_path(folder: Path) -> Path:
     return folder / "model.ply"
+
+
+def usdz_path(folder: Path) -> Path:
+    return folder / "model.usdz"
+
+
+def stl_path(folder: Path) -> Path:
+    return folder / "model.stl"
 
 
 # ---------------------------------------------------------------- report: report.html

@@ -1,4 +1,4 @@
-"""Charts and photos to a base-colour texture, with a map of where each texel's colour came from."""
+"""Charts and photos to a base-colour texture, with maps of where colours came from, of normals and of occlusion."""
 
 from __future__ import annotations
 
@@ -14,8 +14,9 @@ from stages.geometry.cameras import PinholeCameras
 
 
 def run(context: StageContext) -> dict[str, Any]:
-    """Bake the texture. Returns `stages.meshing.baking.Baked.numbers`."""
+    """Bake the textures. Returns `stages.meshing.baking.Baked.numbers`, and how much of the normal map is known."""
     from stages.meshing.baking import bake_texture
+    from stages.meshing.relief import bake_normals, bake_occlusion
     from stages.neural.field import load_field
 
     undistorted = context.inputs["undistort"]
@@ -44,7 +45,24 @@ def run(context: StageContext) -> dict[str, Any]:
         ) from error
     artifacts.write_png(artifacts.base_color_path(context.out), baked.base_color)
     artifacts.write_png(artifacts.provenance_path(context.out), baked.provenance)
-    return baked.numbers
+    numbers = dict(baked.numbers)
+    if params.normal_map:
+        full = artifacts.load_mesh(context.inputs["cleanup"], artifacts.FULL_MESH)
+        normal_map, met = bake_normals(
+            atlas, *full, atlas.texture_size, lambda done, total: context.progress(done, total, "normals")
+        )
+        artifacts.write_png(artifacts.normal_map_path(context.out), normal_map)
+        numbers["normals_share"] = round(met, 4)
+    if params.occlusion_rays > 0:
+        occlusion = bake_occlusion(
+            atlas,
+            atlas.texture_size,
+            params.occlusion_rays,
+            params.occlusion_reach,
+            lambda done, total: context.progress(done, total, "occlusion"),
+        )
+        artifacts.write_png(artifacts.occlusion_path(context.out), occlusion)
+    return numbers
 
 
 def load_photo(undistorted: Path, cameras: PinholeCameras, index: int) -> tuple[np.ndarray, np.ndarray | None]:
@@ -56,9 +74,9 @@ def load_photo(undistorted: Path, cameras: PinholeCameras, index: int) -> tuple[
 
 BAKE = Stage(
     name="bake",
-    version=2,
-    needs=("undistort", "train", "atlas"),
+    version=3,
+    needs=("undistort", "train", "cleanup", "atlas"),
     params="bake",
     run=run,
-    summary="charts + photos -> texture",
+    summary="charts + photos -> textures",
 )

@@ -79,6 +79,8 @@ def run(context: StageContext) -> dict[str, Any]:
             "Look at the masks (white is the object), or try `--set cleanup.mask_hull=false`.",
         )
 
+    # The detail that decimation takes away, for the normal map.
+    artifacts.save_mesh(context.out, vertices, faces, artifacts.FULL_MESH)
     context.progress(1, 5, "lightening")
     vertices, faces = decimate(vertices, faces, WORKING_FACES * params.target_faces)
 
@@ -199,7 +201,7 @@ def _seen_faces(vertices: np.ndarray, faces: np.ndarray, seen: np.ndarray, param
 
 CLEANUP = Stage(
     name="cleanup",
-    version=2,
+    version=3,
     needs=("undistort", "extract"),
     params="cleanup",
     run=run,

@@ -1,26 +1,31 @@
-"""The textured mesh to GLB, OBJ + MTL + PNG and PLY, back in the world frame."""
+"""The textured mesh to GLB, USDZ, OBJ + MTL + PNG, PLY and STL, back in the world frame."""
 
 from __future__ import annotations
 
 from importlib.metadata import PackageNotFoundError, version
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from stages import artifacts
+from stages.engine.manifest import MANIFEST
 from stages.engine.stage import Stage, StageContext
-from stages.errors import ReconstructionError
+from stages.errors import ReconstructionError, SystemRequirementError
 from stages.geometry.cameras import PosedScene
 from stages.geometry.orientation import y_up_rotation
+
+if TYPE_CHECKING:
+    from stages.meshing.writing import Textures
 
 
 def run(context: StageContext) -> dict[str, Any]:
     """Write each format of the settings. Returns counts, extents in world units, and bytes of each file."""
-    from stages.meshing.writing import glb_bytes, mtl_text, obj_text, ply_bytes
+    from stages.meshing.writing import glb_bytes, mtl_text, obj_text, ply_bytes, stl_bytes
 
     scene = artifacts.load_scene(context.inputs["undistort"])
     atlas = artifacts.load_atlas(context.inputs["atlas"])
-    texture_png = artifacts.base_color_path(context.inputs["bake"]).read_bytes()
+    textures = load_textures(context.inputs["bake"])
     world = scene.world_from_scene
     vertices = world.apply(atlas.vertices.astype(np.float64))
     normals = unit_normals(atlas.vertices, atlas.normals, atlas.faces) @ world.rotation.T
@@ -33,36 +38,78 @@ def run(context: StageContext) -> dict[str, Any]:
     note = "" if scene.place is None else scene.place.describe().replace("±", "+-")
     sizes: dict[str, int] = {}
     try:
+        gltf_from_world = y_up_rotation(world.rotation @ scene.up)
+        extras = provenance(scene, gltf_from_world, run_id(context.inputs["bake"]))
         if "glb" in context.params.formats:
-            gltf_from_world = y_up_rotation(world.rotation @ scene.up)
             data = glb_bytes(
                 vertices @ gltf_from_world.T,
                 normals @ gltf_from_world.T,
                 atlas.uvs,
                 atlas.faces,
-                texture_png,
+                textures,
                 generator=generator(),
-                extras=provenance(scene, gltf_from_world),
+                extras=extras,
             )
             artifacts.glb_path(context.out).write_bytes(data)
             sizes["glb"] = len(data)
+        if "usdz" in context.params.formats:
+            data = _usdz(vertices @ gltf_from_world.T, normals @ gltf_from_world.T, atlas, textures, extras)
+            artifacts.usdz_path(context.out).write_bytes(data)
+            sizes["usdz"] = len(data)
         if "obj" in context.params.formats:
             texture_path, mtl = artifacts.obj_texture_path(context.out), artifacts.mtl_path(context.out)
-            texture_path.write_bytes(texture_png)
-            mtl.write_text(mtl_text(texture_path.name), encoding="utf-8")
+            texture_path.write_bytes(textures.base_color)
+            normal_map_name = None
+            if textures.normal is not None:
+                normal_map_path = artifacts.obj_normal_map_path(context.out)
+                normal_map_path.write_bytes(textures.normal)
+                normal_map_name = normal_map_path.name
+            mtl.write_text(mtl_text(texture_path.name, normal_map_name), encoding="utf-8")
             text = obj_text(vertices, normals, atlas.uvs, atlas.faces, mtl.name, note)
             artifacts.obj_path(context.out).write_text(text, encoding="utf-8")
             sizes["obj"] = len(text)
         if "ply" in context.params.formats:
-            colors = vertex_colors(texture_png, atlas.uvs)
+            colors = vertex_colors(textures.base_color, atlas.uvs)
             data = ply_bytes(vertices, normals, colors, atlas.faces, note)
             artifacts.ply_path(context.out).write_bytes(data)
             sizes["ply"] = len(data)
+        if "stl" in context.params.formats:
+            data = stl_bytes(vertices, atlas.faces, note)
+            artifacts.stl_path(context.out).write_bytes(data)
+            sizes["stl"] = len(data)
     except ValueError as error:
         raise ReconstructionError(
             f"The mesh cannot be exported: {error}.", "Rebuild it: `hineus run PHOTOS --from cleanup`."
         ) from error
     return {**numbers, "bytes": sizes}
+
+
+def _usdz(
+    vertices: np.ndarray,
+    normals: np.ndarray,
+    atlas: artifacts.AtlasMesh,
+    textures: Textures,
+    extras: dict[str, Any],
+) -> bytes:
+    """The USDZ package; lengths without a known unit are taken for metres, as glTF does with all."""
+    from stages.meshing.usd import usdz_bytes
+
+    try:
+        return usdz_bytes(vertices, normals, atlas.uvs, atlas.faces, textures, meters_per_unit=1.0, extras=extras)
+    except ImportError as error:
+        raise SystemRequirementError(
+            f"USDZ files are written with usd-core, which cannot be imported: {error}.",
+            "Try `pip install usd-core`, or take usdz out of `export.formats`.",
+        ) from error
+
+
+def load_textures(baked: Path) -> Textures:
+    """The images that the bake stage left."""
+    from stages.meshing.writing import Textures
+
+    optional = (artifacts.normal_map_path(baked), artifacts.occlusion_path(baked))
+    normal, occlusion = (path.read_bytes() if path.exists() else None for path in optional)
+    return Textures(artifacts.base_color_path(baked).read_bytes(), normal, occlusion)
 
 
 def unit_normals(vertices: np.ndarray, normals: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -102,9 +149,15 @@ def generator() -> str:
         return "hineus"
 
 
-def provenance(scene: PosedScene, gltf_from_world: np.ndarray) -> dict[str, Any]:
-    """What a GLB says of its origin: photos, units, place on Earth, and the way back to the other frames."""
-    extras = {
+def run_id(baked: Path) -> str | None:
+    """What tells this asset from others: the fingerprint of its textures, and so of photos, settings and versions."""
+    return artifacts.read_json(baked / MANIFEST)["fingerprint"] if (baked / MANIFEST).exists() else None
+
+
+def provenance(scene: PosedScene, gltf_from_world: np.ndarray, run: str | None) -> dict[str, Any]:
+    """What an asset says of its origin: run, photos, units, place on Earth, and the way back to the other frames."""
+    extras: dict[str, Any] = {} if run is None else {"run": run}
+    extras |= {
         "photos": len(scene.cameras),
         "units": "arbitrary units" if scene.place is None else scene.place.units,
         "gltf_from_world_rotation": gltf_from_world.tolist(),
@@ -124,9 +177,9 @@ def provenance(scene: PosedScene, gltf_from_world: np.ndarray) -> dict[str, Any]
 
 EXPORT = Stage(
     name="export",
-    version=2,
+    version=4,
     needs=("undistort", "atlas", "bake"),
     params="export",
     run=run,
-    summary="textured mesh -> GLB, OBJ, PLY",
+    summary="textured mesh -> GLB, USDZ, OBJ, PLY, STL",
 )

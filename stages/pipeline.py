@@ -23,6 +23,6 @@ PIPELINE: tuple[Stage, ...] = (
     CLEANUP,  # mesh -> clean, light mesh
     ATLAS,  # clean mesh -> UV charts
     BAKE,  # charts + photos -> texture
-    EXPORT,  # textured mesh -> GLB, OBJ, PLY
+    EXPORT,  # textured mesh -> GLB, USDZ, OBJ, PLY, STL
     REPORT,  # everything -> one HTML page
 )

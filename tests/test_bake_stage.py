@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from types import ModuleType, SimpleNamespace
 
 import numpy as np
@@ -46,6 +47,7 @@ def context(tmp_path, monkeypatch) -> StageContext:
         64,
     )
     artifacts.save_atlas(folders["atlas"], atlas)
+    artifacts.save_mesh(folders["cleanup"], atlas.vertices + 0.05 * atlas.normals, atlas.faces, artifacts.FULL_MESH)
     up = np.array([0.0, 0, 1])
     views = [look_at(np.array([x, -2.5, 0.2]), np.zeros(3), up, 48, 40, 40) for x in (-0.5, 0.6)]
     cameras = PinholeCameras(
@@ -82,6 +84,24 @@ def test_files_and_numbers(context):
     assert (kinds == Provenance.FIELD).sum() > 1000
     assert numbers["seen_share"] == pytest.approx(0.5, abs=0.06)  # the rim of a photo's silhouette is not used
     assert numbers["mean_views"] == pytest.approx(2, abs=0.1)
+
+
+def test_maps_of_normals_and_occlusion_are_made_as_set(context):
+    import cv2
+
+    numbers = BAKE.run(context)
+    normal_map = cv2.imread(str(artifacts.normal_map_path(context.out)))[..., ::-1]
+    assert numbers["normals_share"] == 1.0
+    assert np.abs(normal_map.astype(int) - [128, 128, 255]).max() <= 1  # the full mesh is as flat
+    occlusion = cv2.imread(str(artifacts.occlusion_path(context.out)), cv2.IMREAD_UNCHANGED)
+    assert occlusion.shape == (64, 64)
+    assert (occlusion == 255).all()  # nothing stands before the square
+    for folder in (context.out, context.scratch):
+        for path in folder.iterdir():
+            path.unlink()
+    BAKE.run(replace(context, params=BakeParams(normal_map=False, occlusion_rays=0)))
+    assert not artifacts.normal_map_path(context.out).exists()
+    assert not artifacts.occlusion_path(context.out).exists()
 
 
 def test_a_mask_hides_what_lies_outside_it(context):

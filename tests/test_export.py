@@ -19,13 +19,13 @@ from configs.params import ExportParams
 from stages import artifacts
 from stages.artifacts import AtlasMesh
 from stages.engine.stage import StageContext
-from stages.errors import ReconstructionError
+from stages.errors import ReconstructionError, SystemRequirementError
 from stages.export import EXPORT, unit_normals
 from stages.geometry.cameras import PinholeCameras, PosedScene
 from stages.geometry.orientation import y_up_rotation
 from stages.geometry.place import Place
 from stages.geometry.similarity import Similarity
-from stages.meshing.writing import glb_bytes, obj_text, ply_bytes
+from stages.meshing.writing import Textures, glb_bytes, obj_text, ply_bytes
 
 ROOT = Path(__file__).parents[1]
 # No rotation maps this tetrahedron with its four colours to its mirror image.
@@ -87,12 +87,14 @@ def workspace(tmp_path: Path, params: ExportParams | None = None) -> StageContex
     artifacts.save_scene(folders["undistort"], scene)
     artifacts.save_atlas(folders["atlas"], atlas)
     write_png(artifacts.base_color_path(folders["bake"]), texture)
+    write_png(artifacts.normal_map_path(folders["bake"]), np.full((32, 32, 3), (128, 128, 255), np.uint8))
+    write_png(artifacts.occlusion_path(folders["bake"]), np.full((32, 32), 200, np.uint8))
     return StageContext(
         inputs={name: folders[name] for name in EXPORT.needs},
         sources={},
         out=folders["out"],
         scratch=folders["scratch"],
-        params=params or ExportParams(),
+        params=params or ExportParams(formats=("glb", "usdz", "obj", "ply", "stl")),
     )
 
 
@@ -122,7 +124,7 @@ def test_numbers(exported):
     folder, numbers = exported
     assert numbers["faces"] == 4
     np.testing.assert_allclose(numbers["extent"], np.ptp(WORLD.apply(CORNERS), axis=0), atol=1e-5)
-    for suffix in ("glb", "obj", "ply"):
+    for suffix in ("glb", "usdz", "obj", "ply", "stl"):
         assert (folder / f"model.{suffix}").stat().st_size == numbers["bytes"][suffix]
 
 
@@ -139,6 +141,43 @@ def test_glb_read_by_trimesh_is_y_up_and_not_mirrored(exported):
     np.testing.assert_allclose((up[0] - up[1]) / WORLD.scale, [0, 1, 0], atol=1e-9)
     outward = np.asarray(mesh.vertex_normals)
     assert ((np.asarray(mesh.vertices) - mesh.vertices.mean(0)) * outward).sum(1).min() > 0
+
+
+def test_glb_names_normals_occlusion_and_the_frame_they_are_for(exported):
+    import trimesh
+
+    mesh = trimesh.load(exported[0] / "model.glb", force="mesh", process=False)
+    assert np.asarray(mesh.visual.material.normalTexture).reshape(-1, 3)[0].tolist() == [128, 128, 255]
+    assert np.asarray(mesh.visual.material.occlusionTexture).ravel()[0] == 200
+    data = (exported[0] / "model.glb").read_bytes()
+    length = struct.unpack_from("<I", data, 12)[0]
+    tree = json.loads(data[20 : 20 + length])
+    accessor = tree["accessors"][tree["meshes"][0]["primitives"][0]["attributes"]["TANGENT"]]
+    view = tree["bufferViews"][accessor["bufferView"]]
+    assert (accessor["type"], accessor["count"]) == ("VEC4", 12)
+    tangents = np.frombuffer(data, np.float32, 48, 28 + length + view["byteOffset"]).reshape(12, 4)
+    for face in mesh.faces:  # the charts' u runs from the first corner to the second
+        along_u = mesh.vertices[face[1]] - mesh.vertices[face[0]]
+        np.testing.assert_allclose(tangents[face, :3], np.tile(along_u / np.linalg.norm(along_u), (3, 1)), atol=1e-5)
+        assert (tangents[face, 3] == 1).all()
+
+
+def test_files_do_without_normals_and_occlusion_that_were_not_baked(tmp_path):
+    context = workspace(tmp_path)
+    artifacts.normal_map_path(context.inputs["bake"]).unlink()
+    artifacts.occlusion_path(context.inputs["bake"]).unlink()
+    EXPORT.run(context)
+    data = artifacts.glb_path(context.out).read_bytes()
+    for word in (b"TANGENT", b"normalTexture", b"occlusionTexture"):
+        assert word not in data
+    assert "norm" not in artifacts.mtl_path(context.out).read_text()
+    assert not artifacts.obj_normal_map_path(context.out).exists()
+
+
+def test_mtl_names_the_normal_map(exported):
+    lines = (exported[0] / "model.mtl").read_text().splitlines()
+    assert {"norm model_normal.png", "map_bump model_normal.png"} <= set(lines)
+    assert (exported[0] / "model_normal.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_glb_read_by_open3d(exported):
@@ -236,6 +275,87 @@ def test_ply_read_by_trimesh_is_watertight(exported):
     assert mesh.visual.kind == "vertex"
 
 
+def test_stl_read_by_trimesh_and_open3d_is_the_same_solid(exported):
+    import open3d as o3d
+    import trimesh
+
+    mesh = trimesh.load(exported[0] / "model.stl")
+    assert mesh.is_watertight
+    assert mesh.volume == pytest.approx(trimesh.load(exported[0] / "model.ply", process=False).volume, rel=1e-5)
+    other = o3d.io.read_triangle_mesh(str(exported[0] / "model.stl"))
+    assert len(other.triangles) == 4
+    np.testing.assert_allclose(np.asarray(other.vertices).max(0), WORLD.apply(CORNERS).max(0), atol=1e-5)
+
+
+def test_usdz_read_by_pxr_is_y_up_in_metres_and_not_mirrored(exported):
+    from pxr import Usd, UsdGeom, UsdShade
+
+    stage = Usd.Stage.Open(str(exported[0] / "model.usdz"))
+    assert UsdGeom.GetStageUpAxis(stage) == "Y"
+    assert UsdGeom.GetStageMetersPerUnit(stage) == 1.0
+    extras = json.loads(stage.GetRootLayer().customLayerData["hineus"])
+    assert extras["units"] == "arbitrary units"
+    mesh = UsdGeom.Mesh(stage.GetPrimAtPath("/model/mesh"))
+    points, faces = np.array(mesh.GetPointsAttr().Get()), np.array(mesh.GetFaceVertexIndicesAttr().Get()).reshape(-1, 3)
+    uvs = np.array(UsdGeom.PrimvarsAPI(mesh).GetPrimvar("st").Get())
+    material, _ = UsdShade.MaterialBindingAPI(mesh).ComputeBoundMaterial()
+    surface = material.ComputeSurfaceSource("")[0]
+    files = {}
+    for name in ("diffuseColor", "normal", "occlusion"):
+        source = surface.GetInput(name).GetConnectedSources()[0][0].source
+        shader = UsdShade.Shader(source.GetPrim())
+        files[name] = shader.GetInput("file").Get().resolvedPath
+    expect_marks(points, faces, color_of(packed_image(files["diffuseColor"]), uvs[faces].mean(1)), to_gltf)
+    assert packed_image(files["normal"])[0, 0].tolist() == [128, 128, 255]
+    assert packed_image(files["occlusion"])[0, 0].tolist() == [200, 200, 200]
+
+
+def packed_image(address: str) -> np.ndarray:
+    """[H, W, 3] RGB of a resolved path "package.usdz[file.png]"."""
+    import zipfile
+
+    import cv2
+
+    package, _, name = address.rstrip("]").partition("[")
+    data = zipfile.ZipFile(package).read(name)
+    return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
+
+
+def test_usdz_passes_all_validators_of_usd(exported):
+    from pxr import Usd
+
+    validation = pytest.importorskip("pxr.UsdValidation")
+    validators = validation.ValidationRegistry().GetOrLoadAllValidators()
+    assert {"usdUtilsValidators:UsdzPackageValidator", "usdShadeValidators:NormalMapTextureValidator"} <= {
+        validator.GetMetadata().name for validator in validators
+    }
+    stage = Usd.Stage.Open(str(exported[0] / "model.usdz"))
+    found = validation.ValidationContext(validators).Validate(stage)
+    assert [error.GetErrorAsString() for error in found] == []
+
+
+def test_usdz_is_packed_as_arkit_asks(exported):
+    import zipfile
+
+    with zipfile.ZipFile(exported[0] / "model.usdz") as package:
+        entries = package.infolist()
+    assert [entry.filename for entry in entries] == ["model.usdc", "base_color.png", "normal.png", "occlusion.png"]
+    data = (exported[0] / "model.usdz").read_bytes()
+    for entry in entries:
+        assert entry.compress_type == zipfile.ZIP_STORED
+        name, extra = struct.unpack_from("<HH", data, entry.header_offset + 26)
+        assert (entry.header_offset + 30 + name + extra) % 64 == 0
+
+
+def test_without_usd_core_the_command_to_get_it_is_named(tmp_path, monkeypatch):
+    import sys
+
+    monkeypatch.setitem(sys.modules, "pxr", None)
+    with pytest.raises(SystemRequirementError) as caught:
+        EXPORT.run(workspace(tmp_path))
+    assert "pip install usd-core" in caught.value.hint
+
+
 def test_only_the_wanted_formats_are_written(tmp_path):
     context = workspace(tmp_path, ExportParams(formats=("glb",)))
     EXPORT.run(context)
@@ -249,6 +369,13 @@ def test_glb_tells_the_way_back_to_the_world(exported):
     assert asset["generator"].startswith("hineus")
     turn = np.array(asset["extras"]["gltf_from_world_rotation"])
     np.testing.assert_allclose(WORLD.apply(CORNERS) @ turn.T, to_gltf(CORNERS))
+
+
+def test_glb_names_the_run_it_comes_from(tmp_path):
+    context = workspace(tmp_path)
+    assert "run" not in extras_of(context)
+    (context.inputs["bake"] / "manifest.json").write_text('{"fingerprint": "c0ffee"}')
+    assert extras_of(context)["run"] == "c0ffee"
 
 
 def test_gltf_validator_finds_nothing(exported):
@@ -297,11 +424,11 @@ def test_normals_without_length_are_mended():
 def test_wrong_arrays_are_refused():
     atlas, _ = tetrahedron()
     with pytest.raises(ValueError, match="unit normals"):
-        glb_bytes(atlas.vertices, atlas.normals * 2, atlas.uvs, atlas.faces, b"")
+        glb_bytes(atlas.vertices, atlas.normals * 2, atlas.uvs, atlas.faces, Textures(b""))
     with pytest.raises(ValueError, match=r"vertices in \[0, 12\)"):
         obj_text(atlas.vertices, atlas.normals, atlas.uvs, atlas.faces + 5, "m.mtl")
     with pytest.raises(ValueError, match="finite"):
-        glb_bytes(atlas.vertices * np.nan, atlas.normals, atlas.uvs, atlas.faces, b"")
+        glb_bytes(atlas.vertices * np.nan, atlas.normals, atlas.uvs, atlas.faces, Textures(b""))
 
 
 def test_ply_header_counts():

@@ -26,7 +26,7 @@ from stages.meshing.gains import solve_gains
 from stages.meshing.labels import choose_labels, face_neighbors
 from stages.meshing.observing import blend_texels, gather_texels, sample_points
 from stages.meshing.padding import pad_charts
-from stages.meshing.rasterizing import rasterize_atlas
+from stages.meshing.rasterizing import rasterize_atlas, surface_points
 from stages.meshing.views import View, prepare_view
 
 # (photo index) -> [H, W, 3] uint8 RGB and [H, W] bool mask or None.
@@ -115,7 +115,7 @@ def bake_texture(
     texels, face_ids, corner = rasterize_atlas(atlas.uvs, atlas.faces, texture_size)
     if not len(texels):
         raise ValueError(f"expected charts covering texels of a {texture_size}² texture, got none")
-    points, normals = _surface(atlas, face_ids, corner)
+    points, normals = surface_points(atlas, face_ids, corner)
     num_views = len(cameras)
 
     with ThreadPoolExecutor(max_workers=max(1, workers)) as pool:
@@ -162,19 +162,6 @@ def bake_texture(
     )
 
 
-def _surface(atlas: AtlasMesh, face_ids: np.ndarray, corner: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Positions and unit normals [T, 3] float32 at barycentric weights `corner` [T, 3] of faces `face_ids`
-    [T]."""
-    points = np.zeros((len(face_ids), 3), dtype=np.float32)
-    normals = np.zeros((len(face_ids), 3), dtype=np.float32)
-    for k in range(3):
-        ids = atlas.faces[face_ids, k]
-        points += corner[:, k, None] * atlas.vertices[ids]
-        normals += corner[:, k, None] * atlas.normals[ids]
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-    return points, normals
-
-
 def _prepare(atlas: AtlasMesh, cameras: PinholeCameras, load_photo: LoadPhoto, index: int) -> View:
     photo, mask = load_photo(index)
     return prepare_view(cameras, index, photo, mask, atlas.vertices, atlas.faces)
@@ -204,7 +191,7 @@ def _gains_and_labels(
     """Gains [N, 3] and the label of each face [F], from face centres and a sample of the texels."""
     num_faces = len(atlas.faces)
     thirds = np.full((num_faces, 3), 1 / 3, dtype=np.float32)
-    centers, center_normals = _surface(atlas, np.arange(num_faces), thirds)
+    centers, center_normals = surface_points(atlas, np.arange(num_faces), thirds)
     rng = np.random.default_rng(0)
     extra = rng.choice(len(points), size=min(GAIN_SAMPLES, len(points)), replace=False)
     samples = np.concatenate([centers, points[extra]])
@@ -336,7 +323,7 @@ def _fill_unseen(
         sums = [np.bincount(face_ids[seen], colors[seen, c], minlength=num_faces) for c in range(3)]
         photo_means = np.stack(sums, 1)[known] / count_seen[known, None]
         ids = np.flatnonzero(known)
-        centers, center_normals = _surface(atlas, ids, np.full((len(ids), 3), 1 / 3, dtype=np.float32))
+        centers, center_normals = surface_points(atlas, ids, np.full((len(ids), 3), 1 / 3, dtype=np.float32))
         offsets[ids] = photo_means - 255.0 * color_field(centers, center_normals, -center_normals)
     spread = harmonic_offsets(known, offsets, face_neighbors(atlas.vertices, atlas.faces))
     at_vertices = vertex_means(spread, atlas.vertices, atlas.faces)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from stages.artifacts import AtlasMesh
 from stages.geometry.cameras import PinholeCameras
 
 NO_FACE = -1
@@ -149,3 +150,16 @@ def rasterize_atlas(uvs: np.ndarray, faces: np.ndarray, size: int) -> tuple[np.n
     face_ids = face_map.ravel()[texels]
     centers = np.stack([texels % size, texels // size], 1) + 0.5
     return texels, face_ids, corner_weights(xy, ones, faces, face_ids, centers)
+
+
+def surface_points(atlas: AtlasMesh, face_ids: np.ndarray, corner: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Positions and unit normals [T, 3] float32 at barycentric weights `corner` [T, 3] of faces `face_ids`
+    [T]."""
+    points = np.zeros((len(face_ids), 3), dtype=np.float32)
+    normals = np.zeros((len(face_ids), 3), dtype=np.float32)
+    for k in range(3):
+        ids = atlas.faces[face_ids, k]
+        points += corner[:, k, None] * atlas.vertices[ids]
+        normals += corner[:, k, None] * atlas.normals[ids]
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    return points, normals

@@ -1,0 +1,223 @@
+"""What decimation took away, kept as textures: the full mesh's normals, and how much of the sky a point sees."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from stages.artifacts import AtlasMesh
+from stages.meshing.cleaning import MAX_RAYS, raycaster, vertex_normals
+from stages.meshing.padding import pad_charts
+from stages.meshing.rasterizing import rasterize_atlas, surface_points
+from stages.meshing.tangents import to_tangent_space, vertex_tangents
+
+# The full mesh is looked for within this part of the longest edge of the face: decimation moves a surface by far less.
+REACH = 0.5
+# A ray starts this part of its reach on the other side of the face, or it would miss a surface that lies in it.
+BACK = 0.02
+# Normals leaning more than this (cosine) from the face's are of another part of the surface.
+MIN_COSINE = 0.1
+# An occlusion ray starts this far off the face, in median edge lengths, or the face itself would hide the sky.
+LIFT = 0.01
+# Occlusion changes slowly: one sample stands for this many texels in each direction.
+COARSENESS = 4
+# As `baking.PADDING_REACH`.
+PADDING_REACH = 16
+FLAT = (128, 128, 255)
+Listener = Callable[[float, float], None]
+
+
+# ---------------------------------------------------------------- normals
+def bake_normals(
+    atlas: AtlasMesh, vertices: np.ndarray, faces: np.ndarray, size: int, listener: Listener | None = None
+) -> tuple[np.ndarray, float]:
+    """The normals of a full mesh as a tangent-space normal map of the light one.
+
+    From each texel a ray goes along the interpolated normal both ways; the nearer hit that faces the same way gives
+    the full mesh's normal, which is interpolated there, too. Where there is none the map is flat.
+
+    Args:
+        atlas: the light mesh.
+        vertices, faces: [V, 3], [F, 3], the full one in the same frame.
+        size: side of the map in texels.
+        listener: told (done, total).
+
+    Returns:
+        [size, size, 3] uint8, row 0 at v = 1: x, y (up) and z of the frame `tangents.vertex_tangents` from -1..1;
+        the share of the charts' texels that met the full mesh.
+    """
+    tell = listener or (lambda done, total: None)
+    texels, face_ids, corner = rasterize_atlas(atlas.uvs, atlas.faces, size)
+    tangents = vertex_tangents(atlas.vertices, atlas.normals, atlas.uvs, atlas.faces)
+    corners = atlas.vertices[atlas.faces]
+    reach = REACH * np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(1)
+    scene, full_normals = raycaster(vertices, faces), vertex_normals(vertices, faces).astype(np.float32)
+    image = np.empty((size * size, 3), dtype=np.uint8)
+    image[:] = FLAT
+    known = np.zeros(size * size, dtype=bool)
+    known[texels] = True
+    met = 0
+    for begin in range(0, len(texels), MAX_RAYS // 2):
+        part = slice(begin, begin + MAX_RAYS // 2)
+        ids, weights = face_ids[part], corner[part]
+        points, normals = surface_points(atlas, ids, weights)
+        found, normals_there = _normals_near(scene, full_normals, faces, points, normals, reach[ids])
+        frame = np.einsum("tk,tkc->tc", weights[found], tangents[atlas.faces[ids[found]]])
+        image[texels[part][found]] = encode(to_tangent_space(normals_there[found], normals[found], frame))
+        met += int(np.count_nonzero(found))
+        tell(begin + len(ids), len(texels))
+    filled, _ = pad_charts(image.reshape(size, size, 3), known.reshape(size, size), PADDING_REACH)
+    return filled, met / max(len(texels), 1)
+
+
+def _normals_near(
+    scene: object, full_normals: np.ndarray, faces: np.ndarray, points: np.ndarray, normals: np.ndarray,
+    reach: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """Whether the full mesh is within `reach` [T] along the normals both ways [T] bool, and its normals [T, 3]."""
+    import open3d as o3d
+
+    nearest = np.full(len(points), np.inf, dtype=np.float32)
+    answer = np.zeros((len(points), 3), dtype=np.float32)
+    back = (BACK * reach)[:, None]
+    for side in (1.0, -1.0):
+        direction = (side * normals).astype(np.float32)
+        rays = np.concatenate([points - back * direction, direction], axis=1).astype(np.float32)
+        hit = scene.cast_rays(o3d.core.Tensor(rays))  # type: ignore[attr-defined]
+        distance = np.abs(hit["t_hit"].numpy() - back[:, 0])
+        rows = np.flatnonzero(distance < np.minimum(reach, nearest))
+        u, v = hit["primitive_uvs"].numpy()[rows].T
+        corners = full_normals[faces[hit["primitive_ids"].numpy()[rows]]]
+        there = np.einsum("kt,tkc->tc", np.stack([1 - u - v, u, v]), corners)
+        there /= np.maximum(np.linalg.norm(there, axis=1, keepdims=True), 1e-12)
+        alike = (there * normals[rows]).sum(1) > MIN_COSINE
+        nearest[rows[alike]], answer[rows[alike]] = distance[rows[alike]], there[alike]
+    return np.isfinite(nearest), answer
+
+
+def encode(normals: np.ndarray) -> np.ndarray:
+    """Colours [P, 3] uint8 of unit normals [P, 3]: 255 (n + 1) / 2, to which glTF's reading is the inverse."""
+    return np.clip(127.5 * (normals + 1) + 0.5, 0, 255).astype(np.uint8)
+
+
+# ---------------------------------------------------------------- occlusion
+def bake_occlusion(
+    atlas: AtlasMesh, size: int, rays: int = 64, reach: float = 0.5, listener: Listener | None = None
+) -> np.ndarray:
+    """How open each texel is to light from all around: 255 to the whole hemisphere, 0 to none of it.
+
+    Cast for one texel in `COARSENESS` squared and carried to those between (`spread_samples`).
+
+    Args:
+        atlas: the mesh, which hides itself.
+        size: side of the map in texels.
+        rays: from each sample.
+        reach: what lies further off, in scene units, hides nothing.
+        listener: told (done, total).
+
+    Returns:
+        [size, size] uint8, row 0 at v = 1.
+    """
+    texels, face_ids, corner = rasterize_atlas(atlas.uvs, atlas.faces, size)
+    points, normals = surface_points(atlas, face_ids, corner)
+    chosen, cell_of = _one_a_cell(texels, size)
+    openness = sky_seen(atlas.vertices, atlas.faces, points[chosen], normals[chosen], rays, reach, listener)
+    grey = spread_samples(openness, points[chosen], cell_of, texels, points, size)
+    image = np.full((size * size, 3), 255, dtype=np.uint8)
+    image[texels] = np.clip(255 * grey + 0.5, 0, 255).astype(np.uint8)[:, None]
+    known = np.zeros(size * size, dtype=bool)
+    known[texels] = True
+    return pad_charts(image.reshape(size, size, 3), known.reshape(size, size), PADDING_REACH)[0][..., 0].copy()
+
+
+def sky_seen(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    points: np.ndarray,
+    normals: np.ndarray,
+    rays: int,
+    reach: float,
+    listener: Listener | None = None,
+) -> np.ndarray:
+    """Share [P] of rays from points on a mesh that meet nothing within `reach`.
+
+    Directions have the density cos(angle to the normal) / pi, so the share is the cosine-weighted one of the
+    hemisphere: 1/pi of the integral of V(w) (n . w) dw. They are evenly spread (a Fibonacci spiral on the disk below
+    the hemisphere) and turned by another angle at each point, so that no pattern shows.
+    """
+    import open3d as o3d
+
+    tell = listener or (lambda done, total: None)
+    scene = raycaster(vertices, faces)
+    edges = vertices[faces] - vertices[np.roll(faces, 1, axis=1)]
+    lift = LIFT * float(np.median(np.linalg.norm(edges, axis=2)))
+    starts = points + lift * normals
+    side = np.cross(normals, np.eye(3)[np.abs(normals).argmin(1)])
+    side /= np.linalg.norm(side, axis=1, keepdims=True)
+    ahead = np.cross(normals, side)
+    turns = np.random.default_rng(0).random(len(points)) * 2 * np.pi
+    order = np.arange(rays) + 0.5
+    radius, angle = np.sqrt(order / rays), np.pi * (1 + np.sqrt(5)) * order
+    free = np.zeros(len(points))
+    for begin in range(0, len(points), max(MAX_RAYS // rays, 1)):
+        part = slice(begin, begin + max(MAX_RAYS // rays, 1))
+        turned = angle + turns[part, None]
+        x, y = radius * np.cos(turned), radius * np.sin(turned)
+        z = np.sqrt(1 - radius**2)
+        directions = (
+            x[..., None] * side[part, None] + y[..., None] * ahead[part, None] + z[:, None] * normals[part, None]
+        )
+        bundle = np.concatenate([np.broadcast_to(starts[part, None], directions.shape), directions], axis=2)
+        hidden = scene.test_occlusions(o3d.core.Tensor(bundle.astype(np.float32)), tnear=0.0, tfar=reach).numpy()
+        free[part] = 1 - hidden.mean(1)
+        tell(begin + len(hidden), len(points))
+    return free
+
+
+def _one_a_cell(texels: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
+    """Rows [S] of `texels`, the middlemost of each square of `COARSENESS` texels that has any; and the number of each
+    square's [cells, cells] int32, -1 where it has none."""
+    y, x = texels // size, texels % size
+    cells = -(-size // COARSENESS)
+    cell = (y // COARSENESS) * cells + x // COARSENESS
+    middle = (COARSENESS - 1) / 2
+    off_center = (y % COARSENESS - middle) ** 2 + (x % COARSENESS - middle) ** 2
+    order = np.lexsort((off_center, cell))
+    occupied, first = np.unique(cell[order], return_index=True)
+    number = np.full(cells * cells, -1, dtype=np.int32)
+    number[occupied] = np.arange(len(occupied))
+    return order[first], number.reshape(cells, cells)
+
+
+def spread_samples(
+    values: np.ndarray, positions: np.ndarray, cell_of: np.ndarray, texels: np.ndarray, points: np.ndarray, size: int
+) -> np.ndarray:
+    """Values [T] at texels from samples on a coarser grid: bilinear weights times closeness on the surface.
+
+    Charts that are neighbours on the texture only are far apart in space, so nothing bleeds from one to another (joint
+    bilateral upsampling, Kopf et al. 2007, with the position as guide).
+
+    Args:
+        values, positions: [S], [S, 3] of the samples.
+        cell_of: [cells, cells] sample of each square of `COARSENESS` texels, or -1.
+        texels: [T] row-major indices.
+        points: [T, 3] of the texels.
+        size: side of the texture.
+    """
+    cells = len(cell_of)
+    y, x = (texels // size + 0.5) / COARSENESS - 0.5, (texels % size + 0.5) / COARSENESS - 0.5
+    y0, x0 = np.floor(y).astype(np.int64), np.floor(x).astype(np.int64)
+    own = cell_of[(texels // size) // COARSENESS, (texels % size) // COARSENESS]
+    # A square's side on the surface, from the texels' distances to the sample of their own square.
+    spacing = 2 * float(np.sqrt(np.mean((points - positions[own]) ** 2) * 3)) + 1e-12
+    total, weights = np.zeros(len(texels)), np.zeros(len(texels))
+    for dy in (0, 1):
+        for dx in (0, 1):
+            sample = cell_of[np.clip(y0 + dy, 0, cells - 1), np.clip(x0 + dx, 0, cells - 1)]
+            bilinear = np.abs(1 - dy - (y - y0)) * np.abs(1 - dx - (x - x0))
+            apart = ((points - positions[sample]) ** 2).sum(1) / spacing**2
+            weight = np.where(sample >= 0, (bilinear + 1e-6) * np.exp(-np.minimum(apart, 30.0)), 0.0)
+            total += weight * values[sample]
+            weights += weight
+    return np.where(weights > 1e-12, total / np.maximum(weights, 1e-12), values[own])
