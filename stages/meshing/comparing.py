@@ -8,7 +8,7 @@ import numpy as np
 
 from stages.geometry.similarity import Similarity
 from stages.meshing.cleaning import raycaster
-from stages.meshing.evaluation import sample_surface
+from stages.meshing.evaluation import f_score, sample_surface
 
 SAMPLES = 200_000
 # Parts of the larger mesh's largest extent at which the F-score is taken.
@@ -70,10 +70,7 @@ def compare_surfaces(
     to_b = distances_to(sample_surface(*a, samples), b)
     to_a = distances_to(sample_surface(*b, samples), a)
     extent = max(float(np.ptp(vertices[np.unique(faces)], axis=0).max()) for vertices, faces in (a, b))
-    f_scores = {}
-    for threshold in THRESHOLDS:
-        shares = [float((distances < threshold * extent).mean()) for distances in (to_b, to_a)]
-        f_scores[threshold] = 200 * shares[0] * shares[1] / max(sum(shares), 1e-9)
+    f_scores = {threshold: f_score(to_b, to_a, threshold * extent) for threshold in THRESHOLDS}
     return Comparison(Distances.of(to_b), Distances.of(to_a), extent, f_scores)
 
 

@@ -145,7 +145,7 @@ def score_surface(vertices: np.ndarray, faces: np.ndarray, known: KnownSurface, 
     scene = raycaster(known.vertices, known.faces)
     to_known = scene.compute_distance(o3d.core.Tensor(predicted.astype(np.float32))).numpy() / extent
     to_predicted = cKDTree(predicted).query(seen, workers=-1)[0] / extent
-    f_scores = [_f_score(to_known, to_predicted, threshold) for threshold in SCORE_THRESHOLDS]
+    f_scores = [f_score(to_known, to_predicted, threshold) for threshold in SCORE_THRESHOLDS]
     return SurfaceScore(
         accuracy=100 * float(to_known.mean()),
         completeness=100 * float(to_predicted.mean()),
@@ -157,6 +157,10 @@ def score_surface(vertices: np.ndarray, faces: np.ndarray, known: KnownSurface, 
     )
 
 
-def _f_score(to_known: np.ndarray, to_predicted: np.ndarray, threshold: float) -> float:
-    precision, recall = (to_known < threshold).mean(), (to_predicted < threshold).mean()
+def f_score(one_way: np.ndarray, other_way: np.ndarray, threshold: float) -> float:
+    """Harmonic mean of the shares of distances nearer than the threshold, percent, of both ways between two surfaces.
+
+    Where one of them is the truth: of precision and recall (Knapitsch et al. 2017).
+    """
+    precision, recall = (one_way < threshold).mean(), (other_way < threshold).mean()
     return float(200 * precision * recall / max(precision + recall, 1e-9))
