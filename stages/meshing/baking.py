@@ -44,8 +44,6 @@ CONSISTENCY_LEVELS = 12.0
 SMOOTHNESS = 0.7
 # See `observing.blend_texels`.
 GHOST_LEVELS = 25.0
-# Texels around charts that repeat the nearest colour; beyond, the fill is smooth.
-PADDING_REACH = 16
 # Texels handed to a thread at a time.
 _CHUNK = 250_000
 # Faces whose labels are priced at a time.
@@ -139,9 +137,7 @@ def bake_texture(
     provenance = np.full(texture_size * texture_size, Provenance.OUTSIDE, dtype=np.uint8)
     provenance[texels] = np.where(seen, Provenance.PHOTO, Provenance.FIELD)
     square = (texture_size, texture_size)
-    filled, padded = pad_charts(
-        image.reshape(*square, 3), (provenance != Provenance.OUTSIDE).reshape(square), PADDING_REACH
-    )
+    filled, padded = pad_charts(image.reshape(*square, 3), (provenance != Provenance.OUTSIDE).reshape(square))
     provenance = provenance.reshape(square)
     provenance[padded] = Provenance.PADDING
     tell(2 * num_views, 2 * num_views, "done")

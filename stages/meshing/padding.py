@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+# Texels around charts that repeat the nearest colour; beyond, the fill is smooth.
+PADDING_REACH = 16
 
-def pad_charts(image: np.ndarray, known: np.ndarray, reach: int) -> tuple[np.ndarray, np.ndarray]:
+
+def pad_charts(image: np.ndarray, known: np.ndarray, reach: int = PADDING_REACH) -> tuple[np.ndarray, np.ndarray]:
     """Fill the unknown texels: nearest known colour within `reach` texels, smooth push-pull beyond.
 
     Args:

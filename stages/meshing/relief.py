@@ -22,8 +22,6 @@ MIN_COSINE = 0.1
 LIFT = 0.01
 # Occlusion changes slowly: one sample stands for this many texels in each direction.
 COARSENESS = 4
-# As `baking.PADDING_REACH`.
-PADDING_REACH = 16
 FLAT = (128, 128, 255)
 Listener = Callable[[float, float], None]
 
@@ -67,7 +65,7 @@ def bake_normals(
         image[texels[part][found]] = encode(to_tangent_space(normals_there[found], normals[found], frame))
         met += int(np.count_nonzero(found))
         tell(begin + len(ids), len(texels))
-    filled, _ = pad_charts(image.reshape(size, size, 3), known.reshape(size, size), PADDING_REACH)
+    filled, _ = pad_charts(image.reshape(size, size, 3), known.reshape(size, size))
     return filled, met / max(len(texels), 1)
 
 
@@ -128,7 +126,7 @@ def bake_occlusion(
     image[texels] = np.clip(255 * grey + 0.5, 0, 255).astype(np.uint8)[:, None]
     known = np.zeros(size * size, dtype=bool)
     known[texels] = True
-    return pad_charts(image.reshape(size, size, 3), known.reshape(size, size), PADDING_REACH)[0][..., 0].copy()
+    return pad_charts(image.reshape(size, size, 3), known.reshape(size, size))[0][..., 0].copy()
 
 
 def sky_seen(
