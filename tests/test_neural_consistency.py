@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from rigs import NORTH, capture, look_at
 from test_neural_terms import gradients_of, rough_trainer
 
 from stages.geometry.cameras import PinholeCameras
@@ -17,17 +18,9 @@ UP = torch.tensor([[0.0, 0, 1]])
 
 def cameras_over_a_table(width: int = 96, height: int = 80) -> PinholeCameras:
     """Four cameras, up to 30 degrees aside, that look down at the origin of the table z = 0."""
-    poses = []
-    for x, y in ((0.0, 0.0), (0.8, 0.1), (-0.7, 0.5), (0.1, -1.2)):
-        center = np.array([x, y, 2.0])
-        forward = -center / np.linalg.norm(center)
-        right = np.cross(forward, [0, 1, 0])
-        right /= np.linalg.norm(right)
-        rotation = np.stack([right, np.cross(forward, right), forward])
-        poses.append(np.concatenate([rotation, -rotation @ center[:, None]], 1))
-    K = np.array([[120.0, 0, width / 2], [0, 120, height / 2], [0, 0, 1]])
-    names = tuple(f"{i}.png" for i in range(4))
-    return PinholeCameras(names, np.tile([width, height], (4, 1)), np.tile(K, (4, 1, 1)), np.stack(poses))
+    centers = ((0.0, 0.0, 2.0), (0.8, 0.1, 2.0), (-0.7, 0.5, 2.0), (0.1, -1.2, 2.0))
+    poses = [look_at(np.array(center), np.zeros(3), NORTH) for center in centers]
+    return capture(poses, size=(width, height), focal=120.0)
 
 
 def pattern(places: np.ndarray) -> np.ndarray:
