@@ -196,7 +196,11 @@ class TrainParams(Section):
     steps: int = Field(8000, ge=1, description="optimiser steps (ignored where `minutes` is set)")
     minutes: float | None = Field(None, gt=0, description="wall-clock budget in minutes instead of steps")
     seed: int = Field(0, ge=0, description="random seed")
-    holdout: int = Field(0, ge=0, description="leave every n-th photo out and report the PSNR on those; 0: none")
+    holdout: int = Field(
+        0,
+        ge=0,
+        description="keep every n-th photo back from training and texture, and report the PSNR on those; 0: none",
+    )
     rays: int = Field(512, ge=1, description="rays per step")
     samples: int = Field(16, ge=2, description="samples per ray inside the region of interest")
     precision: Literal["auto", "float32", "mixed"] = Field(

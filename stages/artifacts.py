@@ -6,6 +6,7 @@ Nobody else spells a path. Each function takes the folder of the stage that owns
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -269,6 +270,7 @@ def _similarity(data: dict[str, Any]) -> Similarity:
 # ---------------------------------------------------------------- train: field.pt, metrics.jsonl, previews/
 FIELD = "field.pt"
 METRICS = "metrics.jsonl"
+HELD_OUT = "held_out.json"
 PREVIEWS = "previews"
 CHECKPOINT = "checkpoint.pt"  # in the stage's scratch folder
 
@@ -276,6 +278,17 @@ CHECKPOINT = "checkpoint.pt"  # in the stage's scratch folder
 def field_path(folder: Path) -> Path:
     """The trained field, see `stages.neural.field.TrainedField`."""
     return folder / FIELD
+
+
+def save_held_out(folder: Path, names: Sequence[str]) -> None:
+    """Names of the photos that neither training nor texture use."""
+    write_json(folder / HELD_OUT, list(names))
+
+
+def load_held_out(folder: Path) -> tuple[str, ...]:
+    """Names of the photos that `train.holdout` keeps back from training and texture; none where it is off."""
+    path = folder / HELD_OUT
+    return tuple(read_json(path)) if path.exists() else ()
 
 
 def metrics_path(folder: Path) -> Path:

@@ -21,6 +21,8 @@ def run(context: StageContext) -> dict[str, Any]:
 
     undistorted = context.inputs["undistort"]
     cameras = artifacts.load_scene(undistorted).cameras
+    held_out = artifacts.load_held_out(context.inputs["train"])
+    cameras = cameras.select([i for i, name in enumerate(cameras.names) if name not in held_out])
     atlas = artifacts.load_atlas(context.inputs["atlas"])
     field = load_field(artifacts.field_path(context.inputs["train"]), context.device)
     params = context.params
@@ -74,7 +76,7 @@ def load_photo(undistorted: Path, cameras: PinholeCameras, index: int) -> tuple[
 
 BAKE = Stage(
     name="bake",
-    version=3,
+    version=4,
     needs=("undistort", "train", "cleanup", "atlas"),
     params="bake",
     run=run,

@@ -76,6 +76,7 @@ def run(context: StageContext) -> dict[str, Any]:
     seconds = spent + time.monotonic() - started
     summary: dict[str, Any] = _last_numbers(artifacts.metrics_path(context.out))
     if params.holdout:
+        artifacts.save_held_out(context.out, [scene.cameras.names[i] for i in held_out.nonzero().flatten().tolist()])
         nothing = torch.zeros(0, 3, device=trainer.device)
         psnr = held_out_psnr(photos, lambda batch: trainer.render(batch, 1.0, nothing, None).colors)
         summary |= {"held_out": int(held_out.sum()), "held_out_psnr": psnr and round(psnr, 4)}
@@ -230,7 +231,7 @@ def _last_numbers(metrics: Path) -> dict[str, float]:
 
 TRAIN = Stage(
     name="train",
-    version=2,
+    version=3,
     needs=("undistort",),
     params="train",
     run=run,

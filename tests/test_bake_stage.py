@@ -135,3 +135,16 @@ def test_an_image_of_the_wrong_size_is_explained(context):
     write_png(artifacts.image_path(context.inputs["undistort"], "one.png"), np.zeros((10, 10, 3), np.uint8))
     with pytest.raises(ReconstructionError, match=r"photo one\.png: expected shape \(40, 48, 3\)"):
         BAKE.run(context)
+
+
+def test_photos_that_were_held_out_are_not_in_the_texture(context):
+    import cv2
+
+    path = artifacts.image_path(context.inputs["undistort"], "sub/two.png")
+    write_png(path, np.broadcast_to(255 - SKY, (40, 48, 3)).copy())
+    artifacts.save_held_out(context.inputs["train"], ["sub/two.png"])
+    numbers = BAKE.run(context)
+    color = cv2.imread(str(artifacts.base_color_path(context.out)))[..., ::-1]
+    kinds = cv2.imread(str(artifacts.provenance_path(context.out)), cv2.IMREAD_GRAYSCALE)
+    assert np.abs(color[kinds == Provenance.PHOTO].astype(int) - SKY).max() <= 1
+    assert numbers["mean_views"] == 1

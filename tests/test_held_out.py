@@ -10,7 +10,7 @@ import torch
 from sphere_scene import render, ring_of_cameras, sphere_scene, write_undistorted
 
 from configs.params import TrainParams
-from stages import train
+from stages import artifacts, train
 from stages.engine.stage import StageContext
 from stages.errors import ConfigError
 from stages.neural.held_out import held_out_psnr, left_out, photo_psnr
@@ -121,6 +121,7 @@ def test_the_stage_reports_the_photos_left_out_and_trains_on_the_others(tmp_path
     assert drawn == {0, 1, 3, 4, 5, 7}
     assert (numbers["held_out"], numbers["photos"]) == (2, 8)
     assert 5 < numbers["held_out_psnr"] < 40
+    assert len(artifacts.load_held_out(tmp_path / "out")) == 2
 
 
 def test_judging_leaves_the_random_state_alone():

@@ -7,6 +7,7 @@ region of interest is the unit sphere.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -34,6 +35,12 @@ class PinholeCameras:
 
     def __len__(self) -> int:
         return len(self.names)
+
+    def select(self, indices: Sequence[int] | np.ndarray) -> PinholeCameras:
+        """These cameras alone, in this order."""
+        chosen = np.asarray(indices, dtype=np.int64)
+        names = tuple(self.names[i] for i in chosen)
+        return PinholeCameras(names, self.sizes[chosen], self.intrinsics[chosen], self.cam_from_scene[chosen])
 
     @property
     def centers(self) -> np.ndarray:
