@@ -248,8 +248,10 @@
 
   fit();
   home();
-  // report.html#show=seen opens with that surface
-  show(new URLSearchParams(location.hash.slice(1)).get("show") || "texture");
+  // report.html#show=seen&pick=camera-3 opens with that surface and that camera
+  const asked = new URLSearchParams(location.hash.slice(1));
+  show(asked.get("show") || "texture");
+  choose(asked.get("pick") || "");
   const image = new Image();
   image.onload = () => {
     texture.image = image;
