@@ -15,8 +15,7 @@ from stages.artifacts import AtlasMesh, VertexQuality
 from stages.geometry.cameras import PinholeCameras
 from stages.meshing.baking import Provenance
 from stages.meshing.observing import sample_points
-from stages.meshing.rasterizing import rasterize_atlas
-from stages.meshing.views import prepare_view
+from stages.meshing.rasterizing import depth_map, rasterize_atlas
 
 # Keeps the colour covariance invertible where photos are nearly grey: one 8-bit level, squared.
 _COLOR_VARIANCE_FLOOR = 1.0
@@ -39,9 +38,6 @@ def measure_quality(
         provenance: [S, S] uint8 of `baking.Provenance`.
         gains: [N, 3] factors that make the photos agree.
         listener: told (photos done, photos).
-
-    Raises:
-        ValueError: a photo is not of its camera's size.
     """
     count, num_photos = len(atlas.vertices), len(cameras)
     seen = np.zeros((num_photos, count), dtype=np.bool_)
@@ -51,10 +47,14 @@ def measure_quality(
     moments = np.zeros((4, 4))  # of (1, r, g, b)
     weights, sampled = np.zeros(count, dtype=np.float32), np.zeros((count, 3), dtype=np.float32)
     for index in range(num_photos):
-        view = prepare_view(cameras, index, *load_photo(index), atlas.vertices, atlas.faces)
+        photo, mask = load_photo(index)
+        _, inverse_depth = depth_map(cameras, index, atlas.vertices, atlas.faces)
+        on_object = inverse_depth > 0 if mask is None else (inverse_depth > 0) & mask
+        K, center = cameras.intrinsics[index], cameras.centers[index]
+        matrix, focal = K @ cameras.cam_from_scene[index], float(np.sqrt(K[0, 0] * K[1, 1]))
         sample_points(
-            atlas.vertices, atlas.normals, view.matrix, view.center, view.focal,
-            view.inverse_depth, view.confidence, view.photo, weights, sampled,
+            atlas.vertices, atlas.normals, matrix, center, focal,
+            inverse_depth, on_object.astype(np.float32), np.ascontiguousarray(photo), weights, sampled,
         )  # fmt: skip
         hit = np.flatnonzero(weights > 0)
         seen[index, hit] = True
@@ -62,11 +62,11 @@ def measure_quality(
         colors[index, hit] = np.round(even)
         ones = np.concatenate([np.ones((len(even), 1)), even], 1)
         moments += ones.T @ ones
-        to_camera = view.center - atlas.vertices[hit]
+        to_camera = center - atlas.vertices[hit]
         cos = (atlas.normals[hit] * to_camera).sum(1) / np.linalg.norm(to_camera, axis=1)
-        depth = atlas.vertices[hit] @ view.matrix[2, :3] + view.matrix[2, 3]
+        depth = atlas.vertices[hit] @ matrix[2, :3] + matrix[2, 3]
         facing[hit] = np.maximum(facing[hit], cos)
-        photo_density[hit] = np.maximum(photo_density[hit], view.focal * cos / depth)
+        photo_density[hit] = np.maximum(photo_density[hit], focal * cos / depth)
         if listener:
             listener(index + 1, num_photos)
     return VertexQuality(
