@@ -34,8 +34,9 @@ MIN_NEED, MIN_GAIN = 0.004, 0.03
 # Needs are sampled at this many points, and places tried in this many directions.
 POINTS, DIRECTIONS = 3000, 400
 MIN_APART_DEG = 20.0
-# A place is at least this far above the ground, in radii of the region.
+# A place is at least this far above the ground, in radii of the region; surface this far under it needs no photo.
 ABOVE_GROUND = 0.05
+UNDER_GROUND = 0.02
 # A place is at least this far from the object's middle, in its bounding radii.
 CLEARANCE = 1.3
 # Without a ground, places are at most this much lower than the lowest photo, seen from the object.
@@ -69,12 +70,14 @@ class Advice:
 
     Attributes:
         views: best place first; none where all is well seen.
-        weak: part (0..1) of the surface's area that is in need.
+        weak: part (0..1) of the surface's area above the ground that is in need.
+        shown: part (0..1) of that need which the places show together.
         hidden: part (0..1) of that need which no place sees: the underside, deep hollows.
     """
 
     views: tuple[NextView, ...]
     weak: float
+    shown: float
     hidden: float
 
 
@@ -96,10 +99,12 @@ def suggest_views(
         scene: its cameras, up, ground and kind.
     """
     areas = _vertex_areas(vertices, faces)
+    if scene.ground is not None:  # nobody looks up through the table
+        areas = np.where(scene.ground.heights(vertices) < -UNDER_GROUND, 0, areas)
     weighed = areas * needs
     weak = float(areas[needs > 0.5].sum() / max(areas.sum(), 1e-20))
     if not len(scene.cameras) or weighed.sum() <= MIN_NEED * areas.sum():
-        return Advice((), weak, 0.0)
+        return Advice((), weak, 0.0, 0.0)
     # each point stands for the same need
     chosen = np.random.default_rng(0).choice(len(vertices), POINTS, p=weighed / weighed.sum())
     points, outward = vertices[chosen].astype(np.float64), normals[chosen].astype(np.float64)
@@ -109,7 +114,7 @@ def suggest_views(
     places = _clear_of_the_ground(*places, scene)
     helps = _help(points, outward, *places, rays)
     hidden = float(1 - (helps > 0).any(0).mean())
-    extent = _extent(vertices, scene.up) if around else None
+    extent = _extent(vertices, scene) if around else None
     left = np.ones(POINTS)
     views: list[NextView] = []
     while len(views) < MOST and len(helps):
@@ -122,7 +127,7 @@ def suggest_views(
         left *= 1 - (1 - LEFT_OVER) * helps[best]
         apart = _angles(places[0] - target, position - target) > MIN_APART_DEG
         places, helps = (places[0][apart], places[1][apart]), helps[apart]
-    return Advice(tuple(views), weak, hidden)
+    return Advice(tuple(views), weak, float((left < 1).mean()), hidden)
 
 
 # ---------------------------------------------------------------- places
@@ -218,7 +223,7 @@ def describe_place(
             where = way[0].upper() + way[1:]
     higher = rise - float(rises[compared].mean())
     if abs(higher) < SAME_HEIGHT_DEG:
-        where += ", at the same angle up" if rise > LEVEL_DEG else ", at the same height"
+        where += ", at the same height"
     else:
         where += f", about {_degrees(higher)} degrees {'higher' if higher > 0 else 'lower'}"
     looks = "level" if abs(rise) < LEVEL_DEG else f"{'down' if rise > 0 else 'up'} by about {_degrees(rise)} degrees"
@@ -269,9 +274,10 @@ def _angles(directions: np.ndarray, other: np.ndarray) -> np.ndarray:
     return np.degrees(np.arccos(np.clip(cos, -1, 1)))
 
 
-def _extent(vertices: np.ndarray, up: np.ndarray) -> tuple[float, float]:
-    heights = vertices @ up
-    return float(heights.min()), float(heights.max())
+def _extent(vertices: np.ndarray, scene: PosedScene) -> tuple[float, float]:
+    """Coordinates along up of the object's foot (the ground, where it is known) and top."""
+    heights = vertices @ scene.up
+    return float(heights.min() if scene.ground is None else scene.ground.offset), float(heights.max())
 
 
 def _vertex_areas(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
