@@ -48,7 +48,7 @@
   const texture = new THREE.Texture();
   texture.colorSpace = THREE.SRGBColorSpace;
   texture.flipY = false;
-  texture.anisotropy = renderer.capabilities.getMaxAnisotropy();
+  texture.anisotropy = Math.min(4, renderer.capabilities.getMaxAnisotropy());
   const side = THREE.DoubleSide;
   const materials = {
     texture: new THREE.MeshBasicMaterial({ map: texture, side }),
@@ -130,7 +130,7 @@
     redraw();
   };
 
-  let waiting = false;
+  let waiting = true; // until the texture is there
   function redraw() {
     if (!waiting) requestAnimationFrame(draw);
     waiting = true;
@@ -253,11 +253,11 @@
   show(asked.get("show") || "texture");
   choose(asked.get("pick") || "");
   const image = new Image();
-  image.onload = () => {
+  image.src = data.texture;
+  image.decode().then(() => {
     texture.image = image;
     texture.needsUpdate = true;
     draw();
     document.documentElement.dataset.viewer = "ready";
-  };
-  image.src = data.texture;
+  });
 })();
