@@ -54,13 +54,28 @@ def test_the_model_is_drawn_and_a_measure_changes_its_colours(full):  # noqa: F8
     assert ((red < 80) & (green < 40) & (blue > 40)).sum() > 50  # violet: the tip was seen
 
 
-def test_the_page_knows_when_it_is_ready_and_offers_every_camera(full):  # noqa: F811
-    page(full)
-    html = browse(full.scratch, artifacts.report_path(full.out).as_uri(), "--dump-dom").stdout
+PRESS = """<script>
+setTimeout(() => {
+  document.querySelector('[data-show="camera-0"]').click();
+  const kind = document.getElementById("photo-kind");
+  kind.value = "out";
+  kind.dispatchEvent(new Event("change"));
+}, 2000);
+</script></body>"""
+
+
+def test_a_photo_is_shown_in_the_view_and_photos_are_filtered(full):  # noqa: F811
+    report = artifacts.report_path(full.out)
+    report.write_text(page(full).replace("</body>", PRESS))
+    html = browse(full.scratch, report.as_uri(), "--dump-dom").stdout
     assert 'data-viewer="ready"' in html.split(">")[1]
     options = re.findall(r'<option value="((?:camera|next)-\d+)">', html)
     assert options[0] == "camera-0"
     assert "next-0" in options
+    assert re.search(r'<b id="card-name">a\.png</b>', html)
+    assert "kept back from training and texture" in html
+    states = re.findall(r'<figure [^>]*data-state="(\w+)"[^>]*?( hidden="")?>', html)
+    assert [state for state, hidden in states if not hidden] == ["out"]
 
 
 def test_without_webgl_the_page_says_so_and_keeps_its_pictures(full):  # noqa: F811
