@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Callable, Sequence
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -531,15 +531,12 @@ def view(
     from hineus_cli.viewing import serving, watch
 
     watched = watch(workspace, context.obj.pipeline)
-    with serving(watched, port) as url:
+    with suppress(KeyboardInterrupt), serving(watched, port) as url:
         typer.echo(url)
         people().print("Ctrl-C ends it.")
         if not no_browser:
             webbrowser.open(url)
-        try:
-            threading.Event().wait()
-        except KeyboardInterrupt:
-            return
+        threading.Event().wait()
 
 
 # ---------------------------------------------------------------- poses for other programs

@@ -84,4 +84,4 @@ def test_without_webgl_the_page_says_so_and_keeps_its_pictures(full):  # noqa: F
     assert 'data-viewer="none"' in html
     assert re.search(r'<p class="soft" id="view-missing">', html)
     assert re.search(r'<div id="view" hidden="">', html)
-    assert html.count('alt="View ') == 8
+    assert html.count('alt="The model, view ') == 8

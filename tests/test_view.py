@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import signal
 import socket
+import subprocess
+import sys
 import urllib.error
 import urllib.request
 from dataclasses import replace
@@ -99,6 +102,16 @@ def test_where_there_is_nothing_to_see_it_says_what_to_do(workspace, tmp_path):
     result = CliRunner().invoke(build_app(TOY), ["view", str(workspace.root), "--no-browser"])
     assert result.exit_code == 5
     assert "no report yet" in result.stderr
+
+
+def test_the_command_prints_its_address_and_ends_with_ctrl_c(workspace):
+    write_report(workspace)
+    command = [sys.executable, "-m", "hineus_cli", "view", str(workspace.root), "--no-browser"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as process:
+        assert process.stdout is not None
+        assert get(process.stdout.readline().strip()) == "<p>the report</p>"
+        process.send_signal(signal.SIGINT)
+        assert process.wait(timeout=20) == 0
 
 
 def test_a_port_that_is_taken_is_refused(workspace):
