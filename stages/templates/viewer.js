@@ -122,10 +122,15 @@
   const controls = new THREE.OrbitControls(eye, canvas);
   controls.minDistance = radius * 0.1;
   controls.maxDistance = radius * 30;
+  // From the side that most photos are on; where they are all around, from any.
+  const ahead = data.cameras
+    .reduce((sum, { apex }) => sum.add(new THREE.Vector3(...apex).sub(middle).setY(0).normalize()), new THREE.Vector3())
+    .divideScalar(data.cameras.length || 1);
+  const start = ahead.length() > 0.5 ? ahead.setLength(0.94).setY(0.34) : new THREE.Vector3(0.53, 0.34, 0.78);
   const home = () => {
     const narrow = Math.max(1, canvas.clientHeight / Math.max(canvas.clientWidth, 1));
     controls.target.copy(middle);
-    eye.position.set(0.53, 0.34, 0.78).multiplyScalar(radius * 2.6 * narrow).add(middle);
+    eye.position.copy(start).multiplyScalar(radius * 2.6 * narrow).add(middle);
     controls.update();
     redraw();
   };
