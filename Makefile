@@ -1,13 +1,14 @@
 # make demo   photos -> textured model of a made-up object, with its score; result in demo/
 # make test   all tests
 # make lint   formatting, lint, types, who-may-import-whom
+# make vendor the report's copy of three.js, from npm
 # Each makes .venv first where needed.
 
 PYTHON ?=
 export PYTHON
 BIN := .venv/bin
 
-.PHONY: help venv demo test lint format docs clean
+.PHONY: help venv demo test lint format docs vendor clean
 
 help:
 	@sed -n 's/^# //p' Makefile
@@ -36,6 +37,15 @@ docs: venv
 	$(BIN)/python -m benchmarks.run_sets --table-only
 	$(BIN)/python -m benchmarks.ablate --table-only
 	$(BIN)/python -m benchmarks.hard_variants --table-only
+
+# Bundled in a temporary folder: nothing of npm stays in the tree.
+VENDOR := stages/templates/vendor
+vendor:
+	folder=$$(mktemp -d) && cp $(VENDOR)/three.entry.js $$folder/ && \
+	npm install --prefix $$folder --no-save three@0.187.0 esbuild@0.28.2 && \
+	$$folder/node_modules/.bin/esbuild $$folder/three.entry.js --bundle --minify --format=iife --global-name=THREE \
+	  --target=es2020 --outfile=$(VENDOR)/three.min.js && \
+	cp $$folder/node_modules/three/LICENSE $(VENDOR)/LICENSE && rm -r $$folder
 
 clean:
 	rm -rf .venv demo build dist *.egg-info

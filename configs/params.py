@@ -187,7 +187,7 @@ class ExportParams(Section):
 class ReportParams(Section):
     """Everything to one HTML page."""
 
-    thumbnails: int = Field(60, ge=0, description="at most this many photo thumbnails")
+    thumbnails: int = Field(300, ge=0, description="at most this many photos have a thumbnail")
 
 
 class TrainParams(Section):

@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Callable, Sequence
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -63,6 +63,16 @@ Device = Annotated[str, typer.Option(help="auto, cpu or cuda.")]
 Workers = Annotated[int | None, typer.Option(min=1, help="CPU threads; default: all.", show_default=False)]
 Time = Annotated[
     str | None, typer.Option(help="Training budget, like 5m or 90s: sets train.minutes.", show_default=False)
+]
+HoldOut = Annotated[
+    float | None,
+    typer.Option(
+        "--hold-out",
+        metavar="PERCENT",
+        help="Keep this part of the photos back from training and texture, and compare the result with them; 5 is "
+        "every 20th: sets train.holdout.",
+        show_default=False,
+    ),
 ]
 NoGround = Annotated[bool, typer.Option("--no-ground", help="Cut off the ground or table: sets cleanup.remove_ground.")]
 Deterministic = Annotated[
@@ -155,6 +165,7 @@ def run(
     device: Device = "auto",
     workers: Workers = None,
     time: Time = None,
+    hold_out: HoldOut = None,
     no_ground: NoGround = False,
     deterministic: Deterministic = False,
     as_json: Json = False,
@@ -179,6 +190,7 @@ def run(
         device=device,
         workers=workers,
         time=time,
+        hold_out=hold_out,
         no_ground=no_ground,
     )
     _run(context.obj, request, as_json, verbose)
@@ -207,6 +219,7 @@ def stage_command(stage: Stage) -> Callable[..., None]:
         device: Device = "auto",
         workers: Workers = None,
         time: Time = None,
+        hold_out: HoldOut = None,
         no_ground: NoGround = False,
         deterministic: Deterministic = False,
         as_json: Json = False,
@@ -229,6 +242,7 @@ def stage_command(stage: Stage) -> Callable[..., None]:
             device=device,
             workers=workers,
             time=time,
+            hold_out=hold_out,
             no_ground=no_ground,
         )
         _run(context.obj, request, as_json, verbose)
@@ -503,6 +517,28 @@ def compare(
         console.print(line, markup=False, soft_wrap=True)
 
 
+def view(
+    context: typer.Context,
+    workspace: Annotated[Path, typer.Argument(help="The workspace's folder.")] = Path("."),
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port of the local server; 0: a free one.")] = 0,
+    no_browser: Annotated[bool, typer.Option("--no-browser", help="Print the address only.")] = False,
+) -> None:
+    """Show the report of a workspace in the browser, or a run as it goes and the report once it is there."""
+    import threading
+    import webbrowser
+
+    from hineus_cli.console import people
+    from hineus_cli.viewing import serving, watch
+
+    watched = watch(workspace, context.obj.pipeline)
+    with suppress(KeyboardInterrupt), serving(watched, port) as url:
+        typer.echo(url)
+        people().print("Ctrl-C ends it.")
+        if not no_browser:
+            webbrowser.open(url)
+        threading.Event().wait()
+
+
 # ---------------------------------------------------------------- poses for other programs
 OutFolder = Annotated[Path, typer.Argument(help="New or empty folder to write.", show_default=False)]
 OfWorkspace = Annotated[Path, typer.Argument(help="The workspace's folder.", show_default=False)]
@@ -565,7 +601,7 @@ def build_app(pipeline: Sequence[Stage] = PIPELINE) -> typer.Typer:
     ) -> None:
         """Photos in, textured 3D asset out. Start with `hineus doctor`, then `hineus run PHOTOS`."""
 
-    for command in (run, check, status, compare, doctor, presets, demo):
+    for command in (run, check, status, view, compare, doctor, presets, demo):
         app.command()(command)
     app.command("config")(show_config)
     app.command("export-colmap")(export_colmap)

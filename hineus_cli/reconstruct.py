@@ -41,6 +41,7 @@ class Request:
         device: "auto", "cpu" or "cuda".
         workers: CPU threads; default all that this process may use.
         time: training budget, for example "5m".
+        hold_out: percent of the photos to keep back from training and texture.
         no_ground: cut off the ground; "not said" leaves the settings as they are.
     """
 
@@ -59,6 +60,7 @@ class Request:
     device: str = "auto"
     workers: int | None = None
     time: str | None = None
+    hold_out: float | None = None
     no_ground: bool = False
 
 
@@ -211,6 +213,8 @@ def choose_config(request: Request, workspace: Workspace) -> tuple[str | None, C
     sets = list(request.sets)
     if request.time is not None:
         sets.append(f"train.minutes={minutes(request.time)}")
+    if request.hold_out is not None:
+        sets.append(f"train.holdout={every_nth(request.hold_out)}")
     if request.no_ground:
         sets.append("cleanup.remove_ground=true")
     kept = request.preset is None and request.config is None and workspace.config_path.exists()
@@ -286,6 +290,22 @@ def minutes(text: str) -> float:
     if not 0 < total < float("inf"):
         raise refusal
     return total
+
+
+def every_nth(percent: float) -> int:
+    """Which photos are kept back, for `train.holdout`: 5 percent is every 20th; 0 is none.
+
+    Raises:
+        ConfigError: it is neither 0 nor from 1 to 50.
+    """
+    if percent == 0:
+        return 0
+    if not 1 <= percent <= 50:
+        raise ConfigError(
+            f"--hold-out {percent:g}: the part of the photos must be from 1 to 50 percent, or 0 for none.",
+            "Try `--hold-out 5`, which is every 20th photo.",
+        )
+    return round(100 / percent)
 
 
 def _existing(path: Path) -> Path | None:

@@ -362,12 +362,44 @@ def load_atlas(folder: Path) -> AtlasMesh:
         return AtlasMesh(data["vertices"], data["normals"], data["uvs"], data["faces"], int(data["texture_size"]))
 
 
-# ---------------------------------------------------------------- bake: base_color.png, provenance.png, and as set:
+# ------------------------------------------ bake: base_color.png, provenance.png, vertex_quality.npz, and as set:
 # normal_map.png, occlusion.png
 BASE_COLOR = "base_color.png"
 PROVENANCE = "provenance.png"
 NORMAL_MAP = "normal_map.png"
 OCCLUSION = "occlusion.png"
+QUALITY = "vertex_quality.npz"
+
+
+@dataclass(frozen=True)
+class VertexQuality:
+    """How well each vertex of the atlas is known, see `stages.meshing.quality`.
+
+    Attributes:
+        seen_by: [V] uint16 photos that see it.
+        facing: [V] float32 cosine between the normal and the direction to the photo that sees it most squarely; 0
+            where none does.
+        ambiguity: [V] float32 the paper's lambda: how far the photos disagree on its colour.
+        photo_density: [V] float32 pixels per scene unit of the photo that shows it largest; 0 where none does.
+        texel_density: [V] float32 texels per scene unit.
+        invented: [V] float32 part of the texels around it that no photo saw.
+    """
+
+    seen_by: np.ndarray
+    facing: np.ndarray
+    ambiguity: np.ndarray
+    photo_density: np.ndarray
+    texel_density: np.ndarray
+    invented: np.ndarray
+
+
+def save_quality(folder: Path, quality: VertexQuality) -> None:
+    np.savez(folder / QUALITY, **asdict(quality))
+
+
+def load_quality(folder: Path) -> VertexQuality:
+    with np.load(folder / QUALITY) as data:
+        return VertexQuality(**data)
 
 
 def base_color_path(folder: Path) -> Path:

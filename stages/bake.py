@@ -16,6 +16,7 @@ from stages.geometry.cameras import PinholeCameras
 def run(context: StageContext) -> dict[str, Any]:
     """Bake the textures. Returns `stages.meshing.baking.Baked.numbers`, and how much of the normal map is known."""
     from stages.meshing.baking import bake_texture
+    from stages.meshing.quality import measure_quality
     from stages.meshing.relief import bake_normals, bake_occlusion
     from stages.neural.field import load_field
 
@@ -47,6 +48,15 @@ def run(context: StageContext) -> dict[str, Any]:
         ) from error
     artifacts.write_png(artifacts.base_color_path(context.out), baked.base_color)
     artifacts.write_png(artifacts.provenance_path(context.out), baked.provenance)
+    quality = measure_quality(
+        atlas,
+        cameras,
+        lambda index: load_photo(undistorted, cameras, index),
+        baked.provenance,
+        baked.gains,
+        lambda done, total: context.progress(done, total, "judging vertices"),
+    )
+    artifacts.save_quality(context.out, quality)
     numbers = dict(baked.numbers)
     if params.normal_map:
         full = artifacts.load_mesh(context.inputs["cleanup"], artifacts.FULL_MESH)
@@ -76,7 +86,7 @@ def load_photo(undistorted: Path, cameras: PinholeCameras, index: int) -> tuple[
 
 BAKE = Stage(
     name="bake",
-    version=4,
+    version=5,
     needs=("undistort", "train", "cleanup", "atlas"),
     params="bake",
     run=run,

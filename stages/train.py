@@ -53,7 +53,8 @@ def run(context: StageContext) -> dict[str, Any]:
         _start_from_shape(trainer, scene.cameras)
     started = saved = time.monotonic()
     previewed = _progress(trainer.step_index, spent, params)
-    with metrics.open("a", encoding="utf-8") as lines:
+    # a line at a time, so that `hineus view` can draw them as they come
+    with metrics.open("a", encoding="utf-8", buffering=1) as lines:
         while (progress := _progress(trainer.step_index, spent + time.monotonic() - started, params)) < 1:
             numbers = trainer.step(progress)
             if trainer.step_index % LOG_EVERY == 0:
@@ -63,7 +64,6 @@ def run(context: StageContext) -> dict[str, Any]:
                 _check(numbers_out, trainer.step_index)
             now = time.monotonic()
             if now - saved > CHECKPOINT_EVERY:
-                lines.flush()
                 _save(trainer, checkpoint, spent + now - started)
                 saved = now
             if progress - previewed >= params.preview_every:
@@ -149,7 +149,7 @@ def _check_hold_out(num_photos: int, num_held_out: int, every: int) -> None:
     left = num_photos - num_held_out
     if every and (left < MIN_TRAINING or num_held_out == 0):
         found = f"leaves {left} of {num_photos} photos to train on (needed: {MIN_TRAINING} to {num_photos - 1})"
-        raise ConfigError(f"`train.holdout` = {every} {found}.", "Try `--set train.holdout=8`, or 0 for none.")
+        raise ConfigError(f"`train.holdout` = {every} {found}.", "Try `--hold-out 12`, or 0 for none.")
 
 
 def _progress(step: int, seconds: float, params: Any) -> float:

@@ -104,6 +104,16 @@ def test_maps_of_normals_and_occlusion_are_made_as_set(context):
     assert not artifacts.occlusion_path(context.out).exists()
 
 
+def test_the_quality_of_each_vertex_is_kept(context):
+    BAKE.run(context)
+    quality = artifacts.load_quality(context.out)
+    assert quality.seen_by.shape == (8,)
+    assert (quality.invented[4:] == 1).all()  # the back
+    assert (quality.seen_by[4:] == 0).all()
+    assert quality.invented[:4].max() < 0.5
+    np.testing.assert_allclose(quality.texel_density, np.sqrt(64**2 * 0.4 * 0.8), rtol=1e-5)
+
+
 def test_a_mask_hides_what_lies_outside_it(context):
     for name in ("one.png", "sub/two.png"):
         path = artifacts.mask_path(context.inputs["undistort"], name)

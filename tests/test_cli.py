@@ -149,6 +149,20 @@ def test_time_sets_the_training_budget(folder: Path) -> None:
     assert "minutes: 1.5" in (folder / "photos_hineus" / "config.yaml").read_text()
 
 
+def test_hold_out_keeps_back_a_part_of_the_photos_and_is_remembered(folder: Path) -> None:
+    config = folder / "photos_hineus" / "config.yaml"
+    hineus("run", "photos", "--hold-out", "5")
+    assert "holdout: 20\n" in config.read_text()
+    hineus("run", "photos")
+    assert "holdout: 20\n" in config.read_text()
+    hineus("run", "photos", "--hold-out", "0")
+    assert "holdout: 0\n" in config.read_text()
+
+
+def test_parts_to_keep_back_become_every_nth_photo() -> None:
+    assert [reconstruct.every_nth(percent) for percent in (0, 1, 5, 12.5, 30, 50)] == [0, 100, 20, 8, 3, 2]
+
+
 def test_no_ground_sets_the_cut_and_is_remembered(folder: Path) -> None:
     config = folder / "photos_hineus" / "config.yaml"
     hineus("run", "photos")
@@ -187,6 +201,9 @@ def test_wrong_times_are_refused(text: str) -> None:
         (["run", "photos", "--set", "sfm.seed=-1"], 2, ["`sfm.seed` = -1", "must be >= 0"]),
         (["run", "photos", "--preset", "tinny"], 2, ["no preset 'tinny'", "--preset tiny"]),
         (["run", "photos", "--until", "sfmm"], 2, ["There is no stage 'sfmm'", "Did you mean `--until sfm`?"]),
+        (["run", "photos", "--hold-out", "80"], 2, ["from 1 to 50 percent", "--hold-out 5"]),
+        (["run", "photos", "--hold-out", "-5"], 2, ["from 1 to 50 percent"]),
+        (["run", "photos", "--hold-out", "nan"], 2, ["from 1 to 50 percent"]),
         (["run", "photos", "--time", "soon"], 2, ["--time soon is no length of time"]),
         (["run", "photos", "--device", "tpu"], 2, ["There is no device 'tpu'"]),
         (["run", "photos", "--device", "cuda"], 6, ["No CUDA device can be used here.", "hineus doctor"]),

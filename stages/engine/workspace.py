@@ -21,7 +21,7 @@ import os
 import shutil
 import socket
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from importlib import metadata
 from pathlib import Path
@@ -103,6 +103,10 @@ class Workspace:
     def work_folder(self, stage: str) -> Path:
         return self.root / ".work" / stage
 
+    def scratch_folder(self, stage: str) -> Path:
+        """What the stage keeps over a kill, such as checkpoints; may not exist."""
+        return self.work_folder(stage) / "scratch"
+
     @property
     def config_path(self) -> Path:
         return self.root / "config.yaml"
@@ -136,7 +140,11 @@ class Workspace:
         try:
             self._take(descriptor)
             self._lock_depth = 1
-            yield
+            try:
+                yield
+            finally:
+                with suppress(OSError):  # nobody holds it any more: see `in_use`
+                    os.ftruncate(descriptor, 0)
         finally:
             self._lock_depth = 0
             os.close(descriptor)
@@ -154,6 +162,18 @@ class Workspace:
         with storage_errors(self.root, "opening the workspace"):
             os.ftruncate(descriptor, 0)
             os.pwrite(descriptor, json.dumps(holder).encode(), 0)
+
+    def in_use(self) -> bool:
+        """Whether a process on this machine that took the lock is still there. Takes no lock, so it disturbs none."""
+        try:
+            data = json.loads((self.root / ".lock").read_bytes())
+            return data["host"] == socket.gethostname() and _is_running(int(data["pid"]))
+        except (OSError, ValueError, KeyError, TypeError):
+            return False
+
+    def is_writing(self, stage: str) -> bool:
+        """Whether the stage's outputs are being written, or were when the process was killed."""
+        return (self.work_folder(stage) / "out").is_dir()
 
     # ------------------------------------------------------------ record and settings
     def remember(self, sources: Mapping[str, Path | None], preset: str | None, config: Mapping[str, Any]) -> None:
@@ -195,7 +215,7 @@ class Workspace:
     def begin(self, stage: str, fingerprint: str) -> tuple[Path, Path]:
         """An empty `out` folder, and the scratch folder, emptied unless it is of this fingerprint."""
         work = self.work_folder(stage)
-        out, scratch, owner = work / "out", work / "scratch", work / "scratch.json"
+        out, scratch, owner = work / "out", self.scratch_folder(stage), work / "scratch.json"
         with storage_errors(self.root, f"starting '{stage}'"):
             _remove(out)
             if _scratch_owner(owner) != fingerprint:
@@ -223,7 +243,7 @@ class Workspace:
             _write(out / MANIFEST, text)
             _replace(out, self.stage_folder(stage), old)
             _remove(old)
-            _remove(work / "scratch")
+            _remove(self.scratch_folder(stage))
 
 
 # ---------------------------------------------------------------- errors of the storage below

@@ -1,164 +1,268 @@
-// A small viewer of one textured mesh: drag to turn, wheel or pinch to zoom, shift-drag or right-drag to move,
-// double-click to go back. Positions and UVs come quantised to 16 bits, normals to 8; Y is up.
+// The page's 3D view, on three.js (global THREE): the mesh with its texture or a measure per vertex in colours, the
+// cameras as pyramids, sparse points, ground, region, and the next photos to take. Drawn when something changes only.
 (function () {
   "use strict";
   const canvas = document.getElementById("viewer");
-  const note = document.getElementById("viewer-note");
-  const source = document.getElementById("mesh-data");
+  const source = document.getElementById("view-data");
   if (!canvas || !source) return;
-  const gl = canvas.getContext("webgl2", { antialias: true });
-  if (!gl) {
-    note.textContent = "This browser has no WebGL 2: see the pictures below.";
+  const element = (id) => document.getElementById(id);
+  const data = JSON.parse(source.textContent);
+  const style = getComputedStyle(document.documentElement);
+  const paint = (name) => new THREE.Color(style.getPropertyValue(name).trim());
+
+  let renderer;
+  try {
+    renderer = new THREE.WebGLRenderer({ canvas, antialias: true, alpha: true });
+  } catch {
+    document.documentElement.dataset.viewer = "none";
+    element("view-missing").hidden = false;
+    element("view").hidden = true;
     return;
   }
-  const mesh = JSON.parse(source.textContent);
+  renderer.setPixelRatio(Math.min(window.devicePixelRatio || 1, 2));
+  element("view-controls").hidden = false;
 
+  // ---------------------------------------------------------------- unpacking
   const bytes = (text) => Uint8Array.from(atob(text), (c) => c.charCodeAt(0)).buffer;
-  const shader = (kind, text) => {
-    const made = gl.createShader(kind);
-    gl.shaderSource(made, text);
-    gl.compileShader(made);
-    if (!gl.getShaderParameter(made, gl.COMPILE_STATUS)) throw new Error(gl.getShaderInfoLog(made));
-    return made;
+  const positions = (packed) => {
+    const fixed = new Uint16Array(bytes(packed.positions));
+    return Float32Array.from(fixed, (v, i) => packed.low[i % 3] + (v / 65535) * packed.size[i % 3]);
   };
-  const program = gl.createProgram();
-  gl.attachShader(program, shader(gl.VERTEX_SHADER, `#version 300 es
-    in vec3 position; in vec2 uv; in vec3 normal;
-    uniform mat4 view, projection; uniform vec3 low, size;
-    out vec2 at; out vec3 facing; out vec3 toEye;
-    void main() {
-      vec4 p = view * vec4(low + position * size, 1.0);
-      gl_Position = projection * p;
-      at = uv; facing = mat3(view) * normal; toEye = -p.xyz;
-    }`));
-  gl.attachShader(program, shader(gl.FRAGMENT_SHADER, `#version 300 es
-    precision highp float;
-    in vec2 at; in vec3 facing; in vec3 toEye;
-    uniform sampler2D colors; uniform int mode;
-    out vec4 pixel;
-    void main() {
-      vec3 base = mode == 1 ? vec3(0.75) : texture(colors, at).rgb;
-      float light = mode == 0 ? 1.0 : 0.3 + 0.7 * abs(dot(normalize(facing), normalize(toEye)));
-      pixel = vec4(base * light, 1.0);
-    }`));
-  gl.linkProgram(program);
-  gl.useProgram(program);
-
-  const attribute = (name, data, size, type, normalised) => {
-    const at = gl.getAttribLocation(program, name);
-    if (at < 0) return;
-    gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
-    gl.bufferData(gl.ARRAY_BUFFER, data, gl.STATIC_DRAW);
-    gl.enableVertexAttribArray(at);
-    gl.vertexAttribPointer(at, size, type, normalised, 0, 0);
+  const lines = (numbers, color) => {
+    const geometry = new THREE.BufferGeometry();
+    geometry.setAttribute("position", new THREE.BufferAttribute(new Float32Array(numbers), 3));
+    return new THREE.LineSegments(geometry, new THREE.LineBasicMaterial({ color }));
   };
-  attribute("position", bytes(mesh.positions), 3, gl.UNSIGNED_SHORT, true);
-  attribute("uv", bytes(mesh.uvs), 2, gl.UNSIGNED_SHORT, true);
-  attribute("normal", bytes(mesh.normals), 3, gl.BYTE, true);
-  gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
-  gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, bytes(mesh.faces), gl.STATIC_DRAW);
-  const uniform = (name) => gl.getUniformLocation(program, name);
-  gl.uniform3fv(uniform("low"), mesh.low);
-  gl.uniform3fv(uniform("size"), mesh.size);
 
-  const center = mesh.low.map((v, i) => v + mesh.size[i] / 2);
-  const radius = Math.hypot(...mesh.size) / 2 || 1;
-  const start = () => ({ yaw: 0.6, pitch: 0.35, distance: radius * 3.2, pan: [0, 0] });
-  let eye = start();
-  let mode = 0;
-  let waiting = false;
+  // ---------------------------------------------------------------- the mesh and its measures
+  const scene = new THREE.Scene();
+  const geometry = new THREE.BufferGeometry();
+  geometry.setAttribute("position", new THREE.BufferAttribute(positions(data), 3));
+  geometry.setAttribute("uv", new THREE.BufferAttribute(new Uint16Array(bytes(data.uvs)), 2, true));
+  geometry.setAttribute("normal", new THREE.BufferAttribute(new Int8Array(bytes(data.normals)), 3, true));
+  const Index = data.face_bits === 16 ? Uint16Array : Uint32Array;
+  geometry.setIndex(new THREE.BufferAttribute(new Index(bytes(data.faces)), 1));
+  const count = geometry.getAttribute("position").count;
+  const colors = new THREE.BufferAttribute(new Float32Array(3 * count), 3);
+  geometry.setAttribute("color", colors);
+  const texture = new THREE.Texture();
+  texture.colorSpace = THREE.SRGBColorSpace;
+  texture.flipY = false;
+  texture.anisotropy = Math.min(4, renderer.capabilities.getMaxAnisotropy());
+  const side = THREE.DoubleSide;
+  const materials = {
+    texture: new THREE.MeshBasicMaterial({ map: texture, side }),
+    shaded: new THREE.MeshLambertMaterial({ map: texture, side }),
+    shape: new THREE.MeshLambertMaterial({ color: "#c8c8c8", side }),
+    measure: new THREE.MeshLambertMaterial({ vertexColors: true, side }),
+  };
+  const mesh = new THREE.Mesh(geometry, materials.texture);
+  scene.add(mesh);
 
-  function draw() {
-    waiting = false;
-    const dpr = Math.min(window.devicePixelRatio || 1, 2);
-    const width = Math.max(1, Math.round(canvas.clientWidth * dpr));
-    const height = Math.max(1, Math.round(canvas.clientHeight * dpr));
-    if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
-    gl.viewport(0, 0, width, height);
-    gl.enable(gl.DEPTH_TEST);
-    gl.clearColor(0, 0, 0, 0);
-    gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
-    const near = Math.max(eye.distance - radius * 1.5, radius * 0.01);
-    const far = eye.distance + radius * 3;
-    const f = 2.6 * Math.min(1, width / height);
-    gl.uniformMatrix4fv(uniform("projection"), false, [
-      (f * height) / width, 0, 0, 0, 0, f, 0, 0,
-      0, 0, (far + near) / (near - far), -1, 0, 0, (2 * far * near) / (near - far), 0,
-    ]);
-    const [cy, sy, cp, sp] = [Math.cos(eye.yaw), Math.sin(eye.yaw), Math.cos(eye.pitch), Math.sin(eye.pitch)];
-    const rows = [[cy, 0, -sy], [-sy * sp, cp, -cy * sp], [sy * cp, sp, cy * cp]];
-    const move = rows.map((r) => -(r[0] * center[0] + r[1] * center[1] + r[2] * center[2]));
-    gl.uniformMatrix4fv(uniform("view"), false, [
-      rows[0][0], rows[1][0], rows[2][0], 0, rows[0][1], rows[1][1], rows[2][1], 0,
-      rows[0][2], rows[1][2], rows[2][2], 0,
-      move[0] + eye.pan[0], move[1] + eye.pan[1], move[2] - eye.distance, 1,
-    ]);
-    gl.uniform1i(uniform("mode"), mode);
-    gl.drawElements(gl.TRIANGLES, mesh.count, gl.UNSIGNED_INT, 0);
+  // Viridis (Smith and van der Walt, 2015): even steps to the eye, and to those who confuse red and green.
+  const ramp = ["#440154", "#414487", "#2a788e", "#22a884", "#7ad151", "#fde725"].map((c) => new THREE.Color(c));
+  const unknown = new THREE.Color("#9a9a9a");
+  const palette = Array.from({ length: 256 }, (_, i) => {
+    if (i === 255) return unknown;
+    const place = (i / 254) * (ramp.length - 1);
+    const below = Math.min(Math.floor(place), ramp.length - 2);
+    return ramp[below].clone().lerp(ramp[below + 1], place - below);
+  });
+  const show = (what) => {
+    const overlay = data.overlays.find((each) => each.key === what);
+    mesh.material = overlay ? materials.measure : materials[what] || materials.texture;
+    const legend = element("view-legend");
+    legend.hidden = !overlay;
+    if (overlay) {
+      new Uint8Array(bytes(overlay.values)).forEach((v, i) => palette[v].toArray(colors.array, 3 * i));
+      colors.needsUpdate = true;
+      element("legend-label").textContent = overlay.label;
+      element("legend-low").textContent = String(overlay.low);
+      element("legend-high").textContent = overlay.high + (overlay.key === "invented" ? "" : " and more");
+      element("legend-missing").hidden = !overlay.missing;
+      element("legend-missing-label").textContent = overlay.missing;
+    }
+    element("surface").value = overlay || materials[what] ? what : "texture";
+    redraw();
+  };
+
+  // ---------------------------------------------------------------- what stands around it
+  const pyramid = ({ apex, corners }) => {
+    const c = [0, 3, 6, 9].map((i) => corners.slice(i, i + 3));
+    return [0, 1, 2, 3].flatMap((i) => [...apex, ...c[i], ...c[i], ...c[(i + 1) % 4]]);
+  };
+  const used = data.cameras.filter((camera) => !camera.held_out);
+  const layers = {
+    cameras: lines(used.flatMap(pyramid), paint("--camera")),
+    held: lines(data.cameras.filter((camera) => camera.held_out).flatMap(pyramid), paint("--held")),
+    next: lines(data.next.flatMap(pyramid), paint("--next")),
+    region: lines(data.region, paint("--region")),
+    ground: lines(data.ground || [], paint("--ground")),
+    points: new THREE.Points(),
+  };
+  if (data.points) {
+    const cloud = new THREE.BufferGeometry();
+    cloud.setAttribute("position", new THREE.BufferAttribute(positions(data.points), 3));
+    const material = new THREE.PointsMaterial({ color: paint("--point"), size: 2, sizeAttenuation: false });
+    layers.points = new THREE.Points(cloud, material);
   }
-  const redraw = () => {
+  scene.add(...Object.values(layers));
+  const chosen = lines(new Array(48).fill(0), paint("--ink"));
+  chosen.visible = false;
+  chosen.frustumCulled = false;
+  scene.add(chosen);
+
+  // ---------------------------------------------------------------- the eye
+  const middle = new THREE.Vector3(...data.low.map((v, i) => v + data.size[i] / 2));
+  const radius = Math.hypot(...data.size) / 2 || 1;
+  const eye = new THREE.PerspectiveCamera(40, 1, radius * 0.01, radius * 100);
+  const lamp = new THREE.DirectionalLight("#fff", 0.65 * Math.PI);
+  eye.add(lamp);
+  scene.add(eye, new THREE.AmbientLight("#fff", 0.35 * Math.PI));
+  const controls = new THREE.OrbitControls(eye, canvas);
+  controls.minDistance = radius * 0.1;
+  controls.maxDistance = radius * 30;
+  // From the side that most photos are on; where they are all around, from any.
+  const ahead = data.cameras
+    .reduce((sum, { apex }) => sum.add(new THREE.Vector3(...apex).sub(middle).setY(0).normalize()), new THREE.Vector3())
+    .divideScalar(data.cameras.length || 1);
+  const start = ahead.length() > 0.5 ? ahead.setLength(0.94).setY(0.34) : new THREE.Vector3(0.53, 0.34, 0.78);
+  const home = () => {
+    const narrow = Math.max(1, canvas.clientHeight / Math.max(canvas.clientWidth, 1));
+    controls.target.copy(middle);
+    eye.position.copy(start).multiplyScalar(radius * 2.6 * narrow).add(middle);
+    controls.update();
+    redraw();
+  };
+
+  let waiting = true; // until the texture is there
+  function redraw() {
     if (!waiting) requestAnimationFrame(draw);
     waiting = true;
+  }
+  function draw() {
+    waiting = false;
+    renderer.render(scene, eye);
+  }
+  const fit = () => {
+    const [width, height] = [canvas.clientWidth, canvas.clientHeight];
+    if (!width || !height) return;
+    renderer.setSize(width, height, false);
+    eye.aspect = width / height;
+    eye.updateProjectionMatrix();
+    redraw();
   };
 
-  const pointers = new Map();
-  canvas.addEventListener("pointerdown", (e) => {
-    pointers.set(e.pointerId, e);
-    canvas.setPointerCapture(e.pointerId);
-  });
-  const lift = (e) => pointers.delete(e.pointerId);
-  canvas.addEventListener("pointerup", lift);
-  canvas.addEventListener("pointercancel", lift);
-  canvas.addEventListener("pointermove", (e) => {
-    const last = pointers.get(e.pointerId);
-    if (!last) return;
-    const [dx, dy] = [e.clientX - last.clientX, e.clientY - last.clientY];
-    if (pointers.size === 2) {
-      const other = [...pointers.values()].find((p) => p.pointerId !== e.pointerId);
-      const span = (p) => Math.hypot(p.clientX - other.clientX, p.clientY - other.clientY) || 1;
-      zoom(span(last) / span(e));
-    } else if (e.shiftKey || e.buttons & 2) {
-      const step = (eye.distance * 0.8) / canvas.clientHeight;
-      eye.pan = [eye.pan[0] + dx * step, eye.pan[1] - dy * step];
-    } else {
-      eye.yaw -= dx * 0.008;
-      eye.pitch = Math.max(-1.55, Math.min(1.55, eye.pitch + dy * 0.008));
+  // ---------------------------------------------------------------- choosing a camera
+  const markers = [
+    ...data.cameras.map((camera, i) => ({ ...camera, key: `camera-${i}`, layer: camera.held_out ? "held" : "cameras" })),
+    ...data.next.map((view, i) => ({ ...view, key: `next-${i}`, layer: "next", name: `Next photo ${i + 1}` })),
+  ];
+  let current = null;
+  const describe = (marker) => {
+    if (marker.sentence) return marker.sentence;
+    const fit = marker.error === null ? "" : `reprojection error ${marker.error.toFixed(2)} px, ${marker.points} points`;
+    return [marker.held_out ? "kept back from training and texture" : "used", fit].filter(Boolean).join("; ");
+  };
+  const choose = (key) => {
+    current = markers.find((marker) => marker.key === key) || null;
+    element("view-card").hidden = !current;
+    element("pick").value = current ? key : "";
+    chosen.visible = Boolean(current);
+    if (current) {
+      chosen.geometry.getAttribute("position").set(pyramid(current));
+      chosen.geometry.getAttribute("position").needsUpdate = true;
+      element("card-name").textContent = current.name;
+      element("card-text").textContent = describe(current);
+      const picture = document.querySelector(`[data-key="${key}"] img`);
+      element("card-picture").hidden = !picture;
+      if (picture) element("card-picture").src = picture.src;
     }
-    pointers.set(e.pointerId, e);
-    redraw();
-  });
-  const zoom = (factor) => {
-    eye.distance = Math.max(radius * 0.3, Math.min(radius * 20, eye.distance * factor));
     redraw();
   };
-  canvas.addEventListener("wheel", (e) => {
-    e.preventDefault();
-    zoom(Math.exp(e.deltaY * 0.001));
-  }, { passive: false });
-  canvas.addEventListener("contextmenu", (e) => e.preventDefault());
-  canvas.addEventListener("dblclick", () => {
-    eye = start();
+  const lookFrom = (marker) => {
+    const apex = new THREE.Vector3(...marker.apex);
+    const end = new THREE.Vector3();
+    for (let i = 0; i < 12; i++) end.setComponent(i % 3, end.getComponent(i % 3) + marker.corners[i] / 4);
+    const ahead = end.sub(apex).normalize();
+    eye.position.copy(apex);
+    controls.target.copy(apex).addScaledVector(ahead, Math.max(middle.clone().sub(apex).dot(ahead), radius * 0.2));
+    controls.update();
     redraw();
-  });
-  document.querySelectorAll("[data-mode]").forEach((button) => {
-    button.addEventListener("click", () => {
-      mode = Number(button.dataset.mode);
-      document.querySelectorAll("[data-mode]").forEach((b) => b.setAttribute("aria-pressed", String(b === button)));
+  };
+  const nearest = (event) => {
+    const box = canvas.getBoundingClientRect();
+    let [best, found] = [18, null];
+    for (const marker of markers) {
+      if (!layers[marker.layer].visible) continue;
+      const place = new THREE.Vector3(...marker.apex).project(eye);
+      if (place.z > 1) continue;
+      const x = box.left + ((place.x + 1) / 2) * box.width - event.clientX;
+      const y = box.top + ((1 - place.y) / 2) * box.height - event.clientY;
+      if (Math.hypot(x, y) < best) [best, found] = [Math.hypot(x, y), marker];
+    }
+    return found;
+  };
+
+  // ---------------------------------------------------------------- controls
+  for (const marker of markers) element("pick").add(new Option(marker.name, marker.key));
+  element("pick").addEventListener("change", (e) => choose(e.target.value));
+  element("card-close").addEventListener("click", () => choose(""));
+  element("card-look").addEventListener("click", () => lookFrom(current));
+  element("surface").addEventListener("change", (e) => show(e.target.value));
+  element("view-home").addEventListener("click", home);
+  document.querySelectorAll("[data-layer]").forEach((box) => {
+    const sync = () => {
+      layers[box.dataset.layer].visible = box.checked;
+      if (box.dataset.layer === "cameras") layers.held.visible = box.checked;
       redraw();
+    };
+    box.addEventListener("change", sync);
+    sync();
+  });
+  document.querySelectorAll("[data-show]").forEach((button) => {
+    button.hidden = false;
+    button.addEventListener("click", () => {
+      choose(button.dataset.show);
+      if (current.layer === "next") lookFrom(current);
+      canvas.scrollIntoView({ block: "center" });
     });
   });
-  window.addEventListener("resize", redraw);
+  let pressed = null;
+  canvas.addEventListener("pointerdown", (e) => (pressed = e));
+  canvas.addEventListener("pointerup", (e) => {
+    const still = pressed && Math.hypot(e.clientX - pressed.clientX, e.clientY - pressed.clientY) < 5;
+    const marker = still && nearest(e);
+    if (marker) choose(marker.key);
+  });
+  canvas.addEventListener("dblclick", home);
+  canvas.addEventListener("keydown", (e) => {
+    const turn = { ArrowLeft: [-0.1, 0], ArrowRight: [0.1, 0], ArrowUp: [0, -0.1], ArrowDown: [0, 0.1] }[e.key];
+    const zoom = { "+": 0.9, "=": 0.9, "-": 1 / 0.9 }[e.key];
+    if (!turn && !zoom && e.key !== "Home" && e.key !== "0") return;
+    e.preventDefault();
+    if (!turn && !zoom) return home();
+    const place = new THREE.Spherical().setFromVector3(eye.position.clone().sub(controls.target));
+    if (turn) [place.theta, place.phi] = [place.theta + turn[0], place.phi + turn[1]];
+    if (zoom) place.radius *= zoom;
+    eye.position.setFromSpherical(place.makeSafe()).add(controls.target);
+    controls.update();
+  });
+  controls.addEventListener("change", redraw);
+  new ResizeObserver(fit).observe(canvas);
 
+  fit();
+  home();
+  // report.html#show=seen&pick=camera-3 opens with that surface and that camera
+  const asked = new URLSearchParams(location.hash.slice(1));
+  show(asked.get("show") || "texture");
+  choose(asked.get("pick") || "");
   const image = new Image();
-  image.onload = () => {
-    gl.bindTexture(gl.TEXTURE_2D, gl.createTexture());
-    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGB, gl.RGB, gl.UNSIGNED_BYTE, image);
-    gl.generateMipmap(gl.TEXTURE_2D);
-    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.LINEAR_MIPMAP_LINEAR);
-    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_S, gl.CLAMP_TO_EDGE);
-    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_T, gl.CLAMP_TO_EDGE);
+  image.src = data.texture;
+  image.decode().then(() => {
+    texture.image = image;
+    texture.needsUpdate = true;
+    draw();
     document.documentElement.dataset.viewer = "ready";
-    redraw();
-  };
-  image.src = mesh.texture;
+  });
 })();

@@ -1,0 +1,1 @@
+"""The parts of the report: artifacts in, what its template needs out."""

@@ -1,0 +1,133 @@
+"""What became of each photo: placed, left out or held back, its fit to the sparse points, its thumbnail."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+from stages import artifacts
+from stages.artifacts import ImageRecord
+from stages.posing.photo_fits import PhotoFit, photo_fits
+from stages.reporting.pictures import jpeg_uri, read_rgb, shrink
+
+THUMBNAIL_SIDE = 200
+
+
+@dataclass(frozen=True)
+class PhotoResult:
+    """One photo that was taken in.
+
+    Attributes:
+        record: what ingest knows of it.
+        reason: why it has no pose, empty where it has one.
+        fit: to the sparse points, where it has a pose and the model can be read.
+        camera: its number among the scene's cameras, or None.
+        held_out: whether it was kept back from training and texture.
+    """
+
+    record: ImageRecord
+    reason: str
+    fit: PhotoFit | None
+    camera: int | None
+    held_out: bool
+
+    @property
+    def state(self) -> str:
+        """In one word, as the page filters by it."""
+        return "out" if self.reason else "held" if self.held_out else "used"
+
+
+def photo_results(ingest: Path, sfm: Path, cameras: Sequence[str], held_out: Sequence[str]) -> list[PhotoResult]:
+    """All photos, by name; none where ingest left no list.
+
+    Args:
+        ingest, sfm: folders of those stages.
+        cameras: names of the scene's cameras: the photos' with `.png`.
+        held_out: those of them that were kept back.
+    """
+    try:
+        records = artifacts.load_image_set(ingest).images
+    except (OSError, ValueError, KeyError, TypeError):
+        return []
+    reasons = {item["name"]: item.get("reason", "") or "no pose" for item in registration(sfm).get("unregistered", [])}
+    try:
+        fits = photo_fits(artifacts.model_path(sfm))
+    except ValueError:
+        fits = {}
+    numbers = {name: number for number, name in enumerate(cameras)}
+    results = []
+    for record in sorted(records, key=lambda record: record.name):
+        short = PurePosixPath(record.name).with_suffix(".png").as_posix()
+        camera = next((numbers[name] for name in (f"{record.name}.png", short) if name in numbers), None)
+        kept_back = camera is not None and cameras[camera] in held_out
+        reason = reasons.get(record.name, "")
+        results.append(PhotoResult(record, reason, fits.get(record.name), None if reason else camera, kept_back))
+    return results
+
+
+def registration(sfm: Path) -> dict[str, Any]:
+    try:
+        return artifacts.load_registration(sfm)
+    except (OSError, ValueError):
+        return {}
+
+
+def describe_photos(results: Sequence[PhotoResult], ingest: Path, sfm: Path, most: int) -> dict[str, Any]:
+    """The page's photos, those left out first; at most `most` have a picture. And the files never used."""
+    if not results:
+        return {}
+    ordered = sorted(results, key=lambda result: result.state != "out")
+    photos = [
+        {
+            "name": result.record.name,
+            "image": _thumbnail(ingest, result.record) if number < most else "",
+            "state": result.state,
+            "reason": result.reason,
+            "error": result.fit.error_px if result.fit else None,
+            "points": result.fit.points if result.fit else None,
+            "camera": result.camera,
+        }
+        for number, result in enumerate(ordered)
+    ]
+    placed = sum(result.state != "out" for result in results)
+    summary = f"{placed} of {len(results)} photos were placed."
+    if held := sum(result.held_out for result in results):
+        summary += f" {held} were kept back from training and texture."
+    attempts = [f"{step['rung']} {step['registered']}" for step in registration(sfm).get("ladder", [])]
+    if len(attempts) > 1:
+        summary += f" Attempts, with the photos each placed: {', '.join(attempts)}."
+    if len(results) > most:
+        summary += f" The first {most} have a picture."
+    skipped = artifacts.load_image_set(ingest).skipped
+    return {
+        "photos": photos,
+        "photo_summary": summary,
+        "skipped": [{"source": item.source, "reason": item.reason} for item in skipped],
+    }
+
+
+def camera_captions(results: Sequence[PhotoResult], cameras: Sequence[str]) -> list[dict[str, Any]]:
+    """For each of the scene's cameras what the 3D view says of it."""
+    by_camera = {result.camera: result for result in results}
+    captions = []
+    for number, name in enumerate(cameras):
+        result = by_camera.get(number)
+        fit = result.fit if result else None
+        captions.append(
+            {
+                "name": result.record.name if result else name,
+                "held_out": result is not None and result.held_out,
+                "error": fit.error_px and round(fit.error_px, 3) if fit else None,
+                "points": fit.points if fit else None,
+            }
+        )
+    return captions
+
+
+def _thumbnail(ingest: Path, record: ImageRecord) -> str:
+    try:
+        return jpeg_uri(shrink(read_rgb(artifacts.image_path(ingest, record.name)), THUMBNAIL_SIDE), 75)
+    except (OSError, ValueError):
+        return ""

@@ -1,0 +1,185 @@
+"""What the page's 3D view gets: mesh, measures per vertex, cameras, sparse points, ground, region, next photos.
+
+Everything is turned +Y up. Arrays are packed as base64, positions and UVs in 16 bits, normals and measures in 8.
+"""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from stages.artifacts import AtlasMesh, VertexQuality
+from stages.geometry.cameras import PosedScene
+from stages.geometry.orientation import y_up_rotation
+from stages.meshing.next_views import NextView
+from stages.reporting.pictures import jpeg_uri, shrink
+
+# Meshes with more faces than this would make the page too heavy: it then has pictures only.
+MAX_FACES = 400_000
+TEXTURE_SIDE = 2048
+MAX_POINTS = 20_000
+# Measures are packed as 0..254; this says that a vertex has none.
+NO_VALUE = 255
+# Sparse points beyond this many radii of the region are left out.
+POINTS_REACH = 4.0
+# The image plane of a drawn camera is this part of the cameras' median distance away, and less than this many radii.
+FRUSTUM, MAX_FRUSTUM = 0.05, 0.12
+# Aspect (width / height) and half height at depth 1 of a camera that is only suggested.
+_NEXT_SHAPE = (1.5, 0.4)
+
+
+def pack_mesh(atlas: AtlasMesh, texture: np.ndarray, up: np.ndarray) -> dict[str, Any]:
+    """Positions, UVs (origin at the top), normals, faces (16 bits where they suffice) and the texture."""
+    turn = y_up_rotation(up)
+    uvs = np.clip(np.stack([atlas.uvs[:, 0], 1 - atlas.uvs[:, 1]], 1), 0, 1)
+    normals = np.round(np.nan_to_num(atlas.normals @ turn.T).clip(-1, 1) * 127).astype(np.int8)
+    small = len(atlas.vertices) <= 1 << 16
+    return {
+        **_pack_positions(atlas.vertices @ turn.T),
+        "uvs": _encode(np.round(uvs * 65535).astype("<u2")),
+        "normals": _encode(normals),
+        "faces": _encode(atlas.faces.astype("<u2" if small else "<u4")),
+        "face_bits": 16 if small else 32,
+        "texture": jpeg_uri(shrink(texture, TEXTURE_SIDE), 88),
+    }
+
+
+def pack_overlays(quality: VertexQuality) -> list[dict[str, Any]]:
+    """Measures per vertex as bytes between a low and a high end, each with its words for the legend."""
+    seen = quality.seen_by > 0
+    per_pixel = np.where(seen, quality.texel_density / np.maximum(quality.photo_density, 1e-9), np.nan)
+    several = np.where(quality.seen_by > 1, quality.ambiguity, np.nan)
+    return [
+        _overlay("seen", "Photos that saw it", quality.seen_by, 0, max(8.0, _top(quality.seen_by)), ""),
+        _overlay("ambiguity", "Ambiguity: how far photos disagree on its colour (λ)", several, 0,
+                 max(1.0, _top(several)), "fewer than two photos"),
+        _overlay("density", "Texels for each pixel of the closest photo", per_pixel, 0, max(2.0, _top(per_pixel)),
+                 "no photo"),
+        _overlay("invented", "Part of its texture that no photo saw", quality.invented, 0, 1, ""),
+    ]  # fmt: skip
+
+
+def pack_scene(
+    scene: PosedScene, captions: Sequence[dict[str, Any]], next_views: Sequence[NextView], atlas: AtlasMesh
+) -> dict[str, Any]:
+    """Cameras and suggested ones as pyramids, sparse points, a grid on the ground, the region's outline.
+
+    Args:
+        captions: for each camera of the scene what the view says of it: "name", "held_out", "error", "points".
+    """
+    turn, cameras = y_up_rotation(scene.up), scene.cameras
+    distance = float(np.median(np.linalg.norm(cameras.centers, axis=1))) if len(cameras) else 1.0
+    depth = min(FRUSTUM * distance, MAX_FRUSTUM)
+    points = scene.points[np.linalg.norm(scene.points, axis=1) < POINTS_REACH]
+    thinned = points[:: max(1, -(-len(points) // MAX_POINTS))]
+    aspect, half = _NEXT_SHAPE
+    return {
+        "cameras": [
+            {"apex": _plain(turn @ center), "corners": _plain((center + depth * ends) @ turn.T), **caption}
+            for center, ends, caption in zip(cameras.centers, _corner_rays(scene), captions, strict=True)
+        ],
+        "next": [
+            {
+                "apex": _plain(turn @ view.position),
+                "corners": _plain((view.position + 1.5 * depth * _rays_to(view, scene.up, aspect, half)) @ turn.T),
+                "sentence": view.sentence,
+            }
+            for view in next_views
+        ],
+        "points": _pack_positions(thinned @ turn.T) if len(thinned) else None,
+        "ground": _plain(_ground_grid(scene, atlas) @ turn.T) if scene.ground is not None else None,
+        "region": _plain(region_lines(scene) @ turn.T),
+    }
+
+
+def region_lines(scene: PosedScene) -> np.ndarray:
+    """Line segments [2 L, 3]: the box where there is one, else three great circles of the unit sphere."""
+    if scene.box is not None:
+        corners = scene.world_from_scene.inverse().apply(
+            np.stack([scene.box[[i & 1, i >> 1 & 1, i >> 2 & 1], [0, 1, 2]] for i in range(8)])
+        )
+        edges = [(i, i | bit) for i in range(8) for bit in (1, 2, 4) if not i & bit]
+        return corners[np.array(edges).ravel()]
+    angles = np.linspace(0, 2 * np.pi, 65)
+    circle = np.stack([np.cos(angles), np.sin(angles), np.zeros(65)], 1)
+    segments = np.stack([circle[:-1], circle[1:]], 1).reshape(-1, 3)
+    return np.concatenate([np.roll(segments, axis, axis=1) for axis in range(3)])
+
+
+def _ground_grid(scene: PosedScene, atlas: AtlasMesh, cells: int = 12, reach: float = 1.2) -> np.ndarray:
+    """Line segments [2 L, 3] of a square grid on the ground below the mesh."""
+    assert scene.ground is not None
+    normal = scene.ground.normal
+    side = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
+    side /= np.linalg.norm(side)
+    ahead = np.cross(normal, side)
+    middle = (atlas.vertices.min(0) + atlas.vertices.max(0)) / 2
+    middle = middle - scene.ground.heights(middle[None])[0] * normal
+    lines = []
+    for t in np.linspace(-reach, reach, cells + 1):
+        lines += [
+            t * side - reach * ahead,
+            t * side + reach * ahead,
+            t * ahead - reach * side,
+            t * ahead + reach * side,
+        ]
+    return middle + np.array(lines)
+
+
+def _corner_rays(scene: PosedScene) -> np.ndarray:
+    """Scene-frame offsets [N, 4, 3] from each camera's centre to its image corners at depth 1."""
+    cameras = scene.cameras
+    width, height = cameras.sizes[:, 0], cameras.sizes[:, 1]
+    zero = np.zeros(len(cameras))
+    x, y = np.stack([zero, width, width, zero], 1), np.stack([zero, zero, height, height], 1)
+    K = cameras.intrinsics
+    rays = np.stack(
+        [(x - K[:, :1, 2]) / K[:, :1, 0], (y - K[:, 1:2, 2]) / K[:, 1:2, 1], np.ones_like(x)], 2
+    )  # fmt: skip
+    return rays @ cameras.cam_from_scene[:, :, :3]
+
+
+def _rays_to(view: NextView, up: np.ndarray, aspect: float, half: float) -> np.ndarray:
+    """Offsets [4, 3] to the image corners at depth 1 of a level camera that looks at the target."""
+    ahead = (view.target - view.position) / np.linalg.norm(view.target - view.position)
+    right = np.cross(ahead, up)
+    if np.linalg.norm(right) < 1e-6:
+        right = np.cross(ahead, np.eye(3)[np.argmin(np.abs(ahead))])
+    right /= np.linalg.norm(right)
+    down = np.cross(ahead, right)
+    signs = ((-1, -1), (1, -1), (1, 1), (-1, 1))
+    return np.stack([ahead + half * (aspect * x * right + y * down) for x, y in signs])
+
+
+def _overlay(key: str, label: str, values: np.ndarray, low: float, high: float, missing: str) -> dict[str, Any]:
+    scaled = np.clip((np.asarray(values, dtype=np.float64) - low) / (high - low), 0, 1) * (NO_VALUE - 1)
+    packed = np.where(np.isnan(scaled), NO_VALUE, np.round(scaled)).astype(np.uint8)
+    return {"key": key, "label": label, "low": low, "high": high, "missing": missing, "values": _encode(packed)}
+
+
+def _top(values: np.ndarray) -> float:
+    """The 98th percentile of what is known, rounded up to two digits."""
+    known = values[np.isfinite(values)]
+    top = float(np.percentile(known, 98)) if len(known) else 1.0
+    digits = 10.0 ** (np.floor(np.log10(top)) - 1) if top > 0 else 1.0
+    return float(f"{np.ceil(top / digits) * digits:.3g}")
+
+
+def _pack_positions(points: np.ndarray) -> dict[str, Any]:
+    """Points [P, 3] in 16 bits between their lowest and highest corner."""
+    low = points.min(0)
+    size = np.maximum(points.max(0) - low, 1e-9)
+    packed = np.round((points - low) / size * 65535).astype("<u2")
+    return {"positions": _encode(packed), "low": low.tolist(), "size": size.tolist()}
+
+
+def _plain(array: np.ndarray) -> list[float]:
+    """All numbers in one list, five digits each."""
+    return [float(f"{value:.5g}") for value in np.asarray(array).ravel()]
+
+
+def _encode(array: np.ndarray) -> str:
+    return base64.b64encode(np.ascontiguousarray(array).tobytes()).decode()
