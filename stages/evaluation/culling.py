@@ -8,6 +8,10 @@ import numpy as np
 
 from stages.evaluation.surfaces import Surface
 from stages.geometry.cameras import PinholeCameras
+from stages.meshing.cleaning import outside_hull, raycaster
+
+# The way from a point to a camera starts this part of it off the point, whose own surface would hide it.
+CLEAR = 1e-3
 
 
 def seen(points: np.ndarray, cameras: PinholeCameras, occluder: Surface | None = None) -> np.ndarray:
@@ -16,7 +20,22 @@ def seen(points: np.ndarray, cameras: PinholeCameras, occluder: Surface | None =
     Args:
         occluder: a mesh that hides what lies behind it; None: nothing hides anything.
     """
-    raise NotImplementedError
+    import open3d as o3d
+
+    found = np.zeros(len(points), dtype=bool)
+    middle = points.mean(0)  # single precision in the ray caster
+    scene = occluder and raycaster(occluder.points - middle, occluder.faces)
+    for i, center in enumerate(cameras.centers):
+        open_points = np.flatnonzero(~found)
+        pixels, depth = cameras.project(i, points[open_points])
+        open_points = open_points[(depth > 0) & (pixels >= 0).all(1) & (pixels < cameras.sizes[i]).all(1)]
+        if scene is not None and len(open_points):
+            # Not normalised: the camera is at distance 1, whatever lies before it hides the point.
+            ways = np.concatenate([points[open_points] - middle, center - points[open_points]], 1).astype(np.float32)
+            hidden = scene.test_occlusions(o3d.core.Tensor(ways), tnear=CLEAR, tfar=1 - CLEAR).numpy()
+            open_points = open_points[~hidden]
+        found[open_points] = True
+    return found
 
 
 def inside_masks(
@@ -28,7 +47,11 @@ def inside_masks(
         masks: camera and [H, W] bool.
         grow: pixels by which masks are widened first.
     """
-    raise NotImplementedError
+    import cv2
+
+    brush = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * grow + 1, 2 * grow + 1))
+    widened = ((i, cv2.dilate(mask.astype(np.uint8), brush) > 0) for i, mask in masks)
+    return ~outside_hull(points, cameras, widened, max_part=0.0, min_views=1)
 
 
 def inside_box(points: np.ndarray, box: np.ndarray) -> np.ndarray:
