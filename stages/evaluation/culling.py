@@ -6,7 +6,6 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from stages.evaluation.surfaces import Surface
 from stages.geometry.cameras import PinholeCameras
 from stages.meshing.cleaning import outside_hull, raycaster
 
@@ -14,17 +13,19 @@ from stages.meshing.cleaning import outside_hull, raycaster
 CLEAR = 1e-3
 
 
-def seen(points: np.ndarray, cameras: PinholeCameras, occluder: Surface | None = None) -> np.ndarray:
+def seen(
+    points: np.ndarray, cameras: PinholeCameras, occluder: tuple[np.ndarray, np.ndarray] | None = None
+) -> np.ndarray:
     """Which of points [P, 3] some camera sees, [P] bool: in its image, in front of it, with nothing in between.
 
     Args:
-        occluder: a mesh that hides what lies behind it; None: nothing hides anything.
+        occluder: vertices [V, 3] and faces [F, 3] of a mesh that hides what lies behind it; None: nothing does.
     """
     import open3d as o3d
 
     found = np.zeros(len(points), dtype=bool)
     middle = points.mean(0)  # single precision in the ray caster
-    scene = occluder and raycaster(occluder.points - middle, occluder.faces)
+    scene = None if occluder is None else raycaster(occluder[0] - middle, occluder[1])
     for i, center in enumerate(cameras.centers):
         open_points = np.flatnonzero(~found)
         pixels, depth = cameras.project(i, points[open_points])

@@ -116,7 +116,7 @@ def lattice(vertices: np.ndarray, faces: np.ndarray, spacing: float) -> np.ndarr
     for (first, second), rows in zip(kinds, by_kind, strict=True):
         if not first or not second:
             continue
-        along = np.stack(np.mgrid[: first + 1, : second + 1], -1).reshape(-1, 2) + 0.5
+        along = np.indices((first + 1, second + 1)).reshape(2, -1).T + 0.5
         along /= first, second
         along = along[along.sum(1) < 1]
         found.append((corners[rows, None, 0] + along @ sides[rows]).reshape(-1, 3))
