@@ -212,6 +212,20 @@ def test_icp_takes_a_cloud_without_normals_for_the_truth():
     np.testing.assert_allclose(found.apply(moved.points), bar().points, atol=0.02)
 
 
+def test_a_step_undoes_a_small_motion_and_leaves_what_planes_cannot_tell():
+    rng = np.random.default_rng(0)
+    points = rng.normal(size=(200, 3))
+    normals = np.eye(3)[rng.integers(0, 3, 200)]
+    shift = np.array([0.1, -0.2, 0.3])
+    step = alignment.plane_step(points, np.tile(shift, (200, 1)), normals)
+    np.testing.assert_allclose(step.apply(points), points + shift, atol=1e-9)
+    grown = alignment.plane_step(points, 0.02 * points, normals, scaled=True)
+    np.testing.assert_allclose(grown.apply(points), 1.02 * points, atol=1e-9)
+    upward = np.tile([0.0, 0, 1], (200, 1))  # one plane says nothing of motion within it
+    step = alignment.plane_step(points, np.tile([0.0, 0, 0.3], (200, 1)), upward)
+    np.testing.assert_allclose(step.translation, [0, 0, 0.3], atol=1e-9)
+
+
 def test_cameras_align_by_their_names():
     rng = np.random.default_rng(0)
     centers = {f"{i}": rng.normal(size=3) for i in range(6)}
