@@ -113,21 +113,28 @@ def _aligned(
     if options.matrix is not None:
         matrix = read_matrix(options.matrix)
         done.append(f"alignment: by the matrix of {options.matrix}")
-    own = options.cameras or (predicted if predicted.is_dir() else None)
-    if cameras is not None and own is not None:
-        known = workspace_cameras(own) if own == predicted else read_cameras(own)
+    known = None if cameras is None else _own_cameras(predicted, options.cameras)
+    if cameras is not None and known is not None:
         centers = {name: matrix[:3, :3] @ center + matrix[:3, 3] for name, center in known.centers.items()}
         motion, paired = by_cameras(centers, cameras.centers)
         matrix = motion.matrix() @ matrix
         done.append(f"alignment: similarity by {paired} camera centres of {known.origin} and {cameras.origin}")
     ours = ours.moved(matrix)
     if options.icp is not None:
-        motion = by_icp(ours, true, scaled=options.icp == "similarity")
+        counted = _selection(ours, true, options, cameras)
+        motion = by_icp(ours, true, options.icp == "similarity", counted)
         ours, matrix = ours.moved(motion.matrix()), motion.matrix() @ matrix
-        done.append(f"alignment: {options.icp} point-to-plane ICP onto the truth, on the nearest 90 % of pairs")
+        done.append(f"alignment: {options.icp} point-to-plane ICP of what counts, on the nearest 90 % of pairs")
     if not done:
         done.append("alignment: none, taken to be in one frame")
     return ours, matrix
+
+
+def _own_cameras(predicted: Path, given: Path | None) -> Cameras | None:
+    """Cameras in the prediction's frame: those that were given, or a workspace's own."""
+    if given is not None:
+        return read_cameras(given)
+    return workspace_cameras(predicted) if predicted.is_dir() else None
 
 
 def _selection(surface: Surface, true: Surface, options: MeshOptions, cameras: Cameras | None) -> Keep | None:
@@ -170,17 +177,15 @@ def _said(options: MeshOptions, cameras: Cameras | None, sampling: Sampling, our
     """A sentence for each thing that was done to get the numbers."""
     said = []
     for name, surface in (("prediction", ours), ("truth", true)):
-        kind = "cloud of points" if surface.faces is None else "mesh"
-        if surface.faces is None:
-            how = "as it is" if sampling.spacing is None else f"thinned to one a cube of {sampling.spacing:g}"
-            how += f", {sampling.count} drawn of more" if sampling.spacing is None else ""
+        if surface.faces is not None:
+            size, how = f"mesh of {len(surface.faces)} faces", f"{sampling.count} points, uniform by area"
+            if sampling.spacing is not None:
+                how = f"one point a square of {sampling.spacing:g}, uniform by area"
         else:
-            how = (
-                f"{sampling.count} points, uniform by area"
-                if sampling.spacing is None
-                else f"one point a square of {sampling.spacing:g}, uniform by area"
-            )
-        said.append(f"{name}: {kind} of {len(surface.points)} points, {how}, seed {sampling.seed}")
+            size, how = f"cloud of {len(surface.points)} points", f"at most {sampling.count} of them"
+            if sampling.spacing is not None:
+                how = f"one a cube of {sampling.spacing:g}"
+        said.append(f"{name}: {size}, {how}, seed {sampling.seed}")
     box = _box(true, options)
     if box is not None:
         corners = " to ".join(" ".join(f"{value:.6g}" for value in corner) for corner in box)
@@ -227,7 +232,7 @@ def evaluate_dtu(predicted: Path, data: Path, scan: int, seed: int = 0) -> dict[
             "protocol: DTU, as in DTUeval-python",
             "alignment: none, the frame of the data set's cameras",
             f"sampling: a point each {DENSITY:g} mm, thinned to that in random order, seed {seed}",
-            f"cut: observed cells of ObsMask, {PATCH:g} mm around its box, scan above the ground plane",
+            f"cut: {PATCH:g} mm below to {2 * PATCH:g} mm above ObsMask's box, observed cells; scan above the ground",
             f"distances of {MAX_DISTANCE:g} mm and more are left out of both means",
         ],
     }
@@ -301,11 +306,9 @@ def evaluate_tanks(
             f"The scene {truth.name} is none of {', '.join(TAU)}: its tau is not known.", "Say it: `--tau 0.005`."
         )
     start, how = np.eye(4), "none, taken to be in the scan's frame"
-    own = cameras or (predicted if predicted.is_dir() else None)
     if matrix is not None:
         start, how = read_matrix(matrix), f"by the matrix of {matrix}"
-    elif own is not None and truth.centers is not None:
-        known = workspace_cameras(own) if own == predicted else read_cameras(own)
+    elif truth.centers is not None and (known := _own_cameras(predicted, cameras)) is not None:
         start, paired = _by_numbers(known, truth.centers, data)
         how = f"similarity by {paired} camera centres of {known.origin} and of the scene's trajectory"
     try:

@@ -205,6 +205,16 @@ def test_icp_finds_the_way_back_and_the_scale_where_it_may(scale, scaled):
     assert found.scale == pytest.approx(1 / scale, abs=5e-3)
 
 
+def test_icp_looks_at_what_counts_only():
+    moved = bar().moved(motion(4, (0.03, 0.02, 0.01)))
+    aside = np.full((100, 3), 9.0)  # stands for a large thing that the truth lacks
+    both = Surface(np.concatenate([moved.points, aside, aside + np.array([0, 3, 0])]))
+    found = alignment.by_icp(both, bar(), keep=lambda points: points[:, 2] < 5)
+    np.testing.assert_allclose(found.apply(moved.points), bar().points, atol=5e-3)
+    everything = alignment.by_icp(both, bar())
+    assert np.abs(everything.apply(moved.points) - bar().points).max() > 0.1
+
+
 def test_icp_takes_a_cloud_without_normals_for_the_truth():
     truth = Surface(draw_points(bar(), Sampling(20_000)).points)
     moved = bar().moved(motion(4, (0.03, 0.02, 0.01)))

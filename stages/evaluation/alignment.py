@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from stages.evaluation.surfaces import Sampling, Surface, Target, draw_points
+from stages.evaluation.surfaces import Keep, Sampling, Surface, Target, draw_points
 from stages.geometry.similarity import Similarity, align_points
 
 # ICP: points of each round, rounds, and the part of the pairs that is kept (the nearest; the rest is other surface).
@@ -30,10 +30,13 @@ def by_cameras(centers: Mapping[str, np.ndarray], true_centers: Mapping[str, np.
     ), len(shared)
 
 
-def by_icp(predicted: Surface, truth: Surface, scaled: bool = False) -> Similarity:
+def by_icp(predicted: Surface, truth: Surface, scaled: bool = False, keep: Keep | None = None) -> Similarity:
     """The rigid motion (`scaled`: similarity) that takes a surface nearest to the truth, from where it is.
 
     See `icp`. A cloud without normals gets those of planes through 20 neighbours.
+
+    Args:
+        keep: which points of the prediction are moved, as of `draw_points`.
     """
     target = Target(truth if truth.faces is not None or truth.normals is not None else _with_normals(truth))
 
@@ -42,7 +45,7 @@ def by_icp(predicted: Surface, truth: Surface, scaled: bool = False) -> Similari
         assert found.normals is not None
         return found.points, found.normals
 
-    return icp(draw_points(predicted, Sampling(ICP_SAMPLES)).points, nearest, scaled)
+    return icp(draw_points(predicted, Sampling(ICP_SAMPLES), keep).points, nearest, scaled)
 
 
 def icp(
