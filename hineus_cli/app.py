@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer.core import TyperGroup
 
+from hineus_cli.evaluate_app import evaluate_app
 from stages.engine.stage import Stage
 from stages.errors import HineusError, InputError, SystemRequirementError
 from stages.pipeline import PIPELINE
@@ -603,6 +604,7 @@ def build_app(pipeline: Sequence[Stage] = PIPELINE) -> typer.Typer:
 
     for command in (run, check, status, view, compare, doctor, presets, demo):
         app.command()(command)
+    app.add_typer(evaluate_app, name="evaluate")
     app.command("config")(show_config)
     app.command("export-colmap")(export_colmap)
     app.command("export-transforms")(export_transforms)
