@@ -1,0 +1,124 @@
+"""Other methods on the same photos and poses: built-in ones, and any command that writes a mesh.
+
+A command gets `{photos}` (undistorted), `{model}` (a COLMAP model of pinhole cameras with points), `{masks}` (a folder,
+which may be missing) and must write its mesh, in the frame of the model, to `{out}`, a PLY. Each runs in a process and a
+folder of its own, and is timed.
+"""
+
+from __future__ import annotations
+
+import difflib
+import logging
+import shlex
+import shutil
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from hineus_cli.machine import machine
+from stages import artifacts
+from stages.engine.resources import ResourceMeter
+from stages.errors import ConfigError, ReconstructionError
+from stages.posing.exporting import SPARSE
+
+log = logging.getLogger(__name__)
+
+BUILT_IN = {
+    "poisson": "screened Poisson through the sparse points (Open3D)",
+    "pymeshlab-poisson": "screened Poisson through the sparse points (pymeshlab)",
+    "ball-pivoting": "ball pivoting of the sparse points (pymeshlab)",
+    "colmap-dense": "COLMAP's patch-match stereo, fusion and Poisson; needs pycolmap with CUDA",
+}
+PROGRAM = Path(__file__).with_name("builtin_peers.py")
+PLACEHOLDERS = ("photos", "model", "masks", "out")
+MESH, LOG = "mesh.ply", "output.log"
+TOLD = 400  # characters of a failed command's output that are repeated
+
+
+@dataclass(frozen=True)
+class Peer:
+    """A method to compare with.
+
+    Attributes:
+        name: in tables and files.
+        words: of its command, with placeholders.
+    """
+
+    name: str
+    words: tuple[str, ...]
+
+
+def parse_peer(text: str) -> Peer:
+    """A built-in peer's name, or NAME=COMMAND.
+
+    Raises:
+        ConfigError: it is neither, or the command never says where to write.
+    """
+    name, equals, command = (part.strip() for part in text.partition("="))
+    if not equals:
+        if name not in BUILT_IN:
+            near = difflib.get_close_matches(name, BUILT_IN, 1)
+            guess = f"Did you mean `--peer {near[0]}`? " if near else ""
+            raise ConfigError(
+                f"There is no built-in peer '{name}'.",
+                f"{guess}Those are {', '.join(BUILT_IN)}; others: `--peer 'NAME=COMMAND {{photos}} {{model}} {{out}}'`.",
+            )
+        # isolated: the folder of the file would hide modules of the same names
+        return Peer(name, (sys.executable, "-I", str(PROGRAM), name, "{photos}", "{model}", "{out}"))
+    try:
+        words = tuple(shlex.split(command))
+    except ValueError as error:
+        raise ConfigError(f"--peer {text}: {error}.", "Quote the command for the shell.") from error
+    if not name.replace("-", "_").isidentifier() or "{out}" not in command:
+        raise ConfigError(
+            f"--peer {text} is not of the form NAME=COMMAND, with a plain name and {{out}} in the command.",
+            "For example `--peer 'openmvs=./openmvs.sh {photos} {model} {out}'`.",
+        )
+    return Peer(name, words)
+
+
+def run_peer(peer: Peer, given: Path, folder: Path) -> dict[str, Any]:
+    """Run a peer on `given`, what `export-colmap` writes; its mesh is `folder/mesh.ply`.
+
+    Returns:
+        Wall and CPU seconds, peak memory in bytes, the machine, and of commands that were given, the command.
+
+    Raises:
+        ReconstructionError: it failed, or wrote no mesh; its last words are included.
+    """
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    places = {
+        "photos": given / artifacts.IMAGES,
+        "model": given / SPARSE,
+        "masks": given / artifacts.MASKS,
+        "out": folder / MESH,
+    }
+    words = [_filled(word, places) for word in peer.words]
+    with (folder / LOG).open("wb") as output, ResourceMeter() as meter:
+        try:
+            # its own folder is where it may leave other files
+            code = subprocess.run(words, cwd=folder, stdout=output, stderr=subprocess.STDOUT, check=False).returncode
+        except OSError as error:
+            raise ReconstructionError(
+                f"Peer {peer.name} could not be started: {words[0]}: {error.strerror}.", "Name the program's full path."
+            ) from error
+    if code != 0 or not (folder / MESH).is_file():
+        said = " ".join((folder / LOG).read_text(encoding="utf-8", errors="replace").split())[-TOLD:]
+        what = f"ended with {code}" if code else f"wrote no {MESH}"
+        raise ReconstructionError(f"Peer {peer.name} {what}: {said or 'it said nothing'}", f"See {folder / LOG}.")
+    return {
+        "wall_s": round(meter.wall_s, 2),
+        "cpu_s": round(meter.cpu_s, 2),
+        "peak_rss": int(meter.peak_rss),
+        "machine": machine(),
+        "command": None if peer.name in BUILT_IN else shlex.join(peer.words),
+    }
+
+
+def _filled(word: str, places: dict[str, Path]) -> str:
+    for name in PLACEHOLDERS:
+        word = word.replace(f"{{{name}}}", str(places[name]))
+    return word
