@@ -100,6 +100,13 @@ def sample_surface(vertices: np.ndarray, faces: np.ndarray, count: int, seed: in
     Raises:
         ValueError: the mesh has no area.
     """
+    return sample_faces(vertices, faces, count, seed)[0]
+
+
+def sample_faces(
+    vertices: np.ndarray, faces: np.ndarray, count: int, seed: int = 0
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """As `sample_surface`, and the face [count] of each point."""
     corners = vertices[faces].astype(np.float64)
     edge_b, edge_c = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     area = np.linalg.norm(np.cross(edge_b, edge_c), axis=1)
@@ -110,7 +117,7 @@ def sample_surface(vertices: np.ndarray, faces: np.ndarray, count: int, seed: in
     u, v = rng.random((2, count, 1))
     flip = u + v > 1
     u, v = np.where(flip, 1 - u, u), np.where(flip, 1 - v, v)
-    return corners[chosen, 0] + u * edge_b[chosen] + v * edge_c[chosen]
+    return corners[chosen, 0] + u * edge_b[chosen] + v * edge_c[chosen], chosen
 
 
 def score_surface(vertices: np.ndarray, faces: np.ndarray, known: KnownSurface, samples: int = SAMPLES) -> SurfaceScore:
