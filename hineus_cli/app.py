@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer.core import TyperGroup
 
+from hineus_cli.bench_app import bench
 from stages.engine.stage import Stage
 from stages.errors import HineusError, InputError, SystemRequirementError
 from stages.pipeline import PIPELINE
@@ -565,7 +566,7 @@ def build_app(pipeline: Sequence[Stage] = PIPELINE) -> typer.Typer:
     ) -> None:
         """Photos in, textured 3D asset out. Start with `hineus doctor`, then `hineus run PHOTOS`."""
 
-    for command in (run, check, status, compare, doctor, presets, demo):
+    for command in (run, check, status, compare, bench, doctor, presets, demo):
         app.command()(command)
     app.command("config")(show_config)
     app.command("export-colmap")(export_colmap)

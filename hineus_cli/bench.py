@@ -1,10 +1,10 @@
 """`hineus bench`: run a suite's scenes, each in a workspace of its own, score them, and keep one JSON a run.
 
-    OUT/SUITE/SCENE/PRESET-seed0/         the workspace; the engine resumes it
-    OUT/SUITE/SCENE/PRESET-seed0.json     settings, seed, machine, time, memory, scores
-    OUT/SUITE/SCENE/PRESET-seed0.ply      the mesh that was scored, in the frame of the poses
-    OUT/SUITE/SCENE/peers/                what peers started from, and a folder each
-    OUT/SUITE/SCENE/PRESET-peer-NAME.json
+OUT/SUITE/SCENE/PRESET-seed0/         the workspace; the engine resumes it
+OUT/SUITE/SCENE/PRESET-seed0.json     settings, seed, machine, time, memory, scores
+OUT/SUITE/SCENE/PRESET-seed0.ply      the mesh that was scored, in the frame of the poses
+OUT/SUITE/SCENE/peers/                what peers started from, and a folder each
+OUT/SUITE/SCENE/PRESET-peer-NAME.json
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from __future__ import annotations
 import json
 import logging
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from glob import escape
 from pathlib import Path
@@ -111,14 +111,15 @@ def _run(
         if seed:
             _share_poses(folder / f"{preset}-seed0", place)
         done = reconstruct(_ask(request, scene, preset, place, seed), pipeline, listener)
-        made_from = {"scoring": SCORING, **_fingerprints(done.workspace, pipeline)}
+        fresh = {outcome.name for outcome in done.outcomes}
+        made_from = {"scoring": SCORING, **_fingerprints(done.workspace, fresh)}
         known = _load(file)
         if known and known.get("made_from") == made_from and known.get("lacking") == result["lacking"]:
             return known
         result |= _costs(done)
         result["settings"] = _differing(done.config.model_dump(mode="json"))
-        mesh = result_mesh(done.workspace, place.with_name(f"{place.name}.ply"))
-        result |= score_result(scene, done.workspace, mesh, done.device)
+        mesh = result_mesh(done.workspace, fresh, place.with_name(f"{place.name}.ply"))
+        result["scores"] = score_result(scene, done.workspace, mesh, fresh, done.device)
         result["made_from"] = made_from
     except HineusError as error:
         return _failed(result, error)
@@ -191,8 +192,8 @@ def _differing(settings: dict[str, Any]) -> dict[str, Any]:
     return found
 
 
-def _fingerprints(workspace: Workspace, pipeline: Sequence[Stage]) -> dict[str, str]:
-    manifests = {stage.name: workspace.published(stage.name) for stage in pipeline}
+def _fingerprints(workspace: Workspace, stages: Iterable[str]) -> dict[str, str]:
+    manifests = {name: workspace.published(name) for name in sorted(stages)}
     return {name: manifest.identity.fingerprint for name, manifest in manifests.items() if manifest}
 
 
@@ -217,7 +218,7 @@ def _run_peer(request: BenchRequest, scene: SuiteScene, preset: str, folder: Pat
         result["photos"] = export_poses(workspace.root, given, write_colmap)["images"]
         result |= run_peer(peer, given, folder / "peers" / f"{preset}-{peer.name}")
         mesh = posed_mesh(workspace, folder / "peers" / f"{preset}-{peer.name}" / MESH, file.with_suffix(".ply"))
-        result |= score_result(scene, workspace, mesh, None)
+        result["scores"] = score_result(scene, workspace, mesh, set(), "cpu")
         result["made_from"] = made_from
     except HineusError as error:
         return _failed(result, error)
@@ -232,6 +233,7 @@ def _heading(request: BenchRequest, scene: SuiteScene, method: str, preset: str)
         "scene": scene.name,
         "method": method,
         "preset": preset,
+        "asked": dict(text.partition("=")[::2] for text in request.sets) if method == OURS else {},
         "masks": scene.masks is not None,
         "known_poses": scene.poses is not None,
         "lacking": list(scene.lacking),

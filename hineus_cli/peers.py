@@ -1,8 +1,8 @@
 """Other methods on the same photos and poses: built-in ones, and any command that writes a mesh.
 
 A command gets `{photos}` (undistorted), `{model}` (a COLMAP model of pinhole cameras with points), `{masks}` (a folder,
-which may be missing) and must write its mesh, in the frame of the model, to `{out}`, a PLY. Each runs in a process and a
-folder of its own, and is timed.
+which may be missing) and must write its mesh, in the frame of the model, to `{out}`, a PLY. Each runs in a process and
+a folder of its own, and is timed.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ def parse_peer(text: str) -> Peer:
             guess = f"Did you mean `--peer {near[0]}`? " if near else ""
             raise ConfigError(
                 f"There is no built-in peer '{name}'.",
-                f"{guess}Those are {', '.join(BUILT_IN)}; others: `--peer 'NAME=COMMAND {{photos}} {{model}} {{out}}'`.",
+                f"{guess}Those are {', '.join(BUILT_IN)}; others by command: `--peer 'NAME=COMMAND {{out}}'`.",
             )
         # isolated: the folder of the file would hide modules of the same names
         return Peer(name, (sys.executable, "-I", str(PROGRAM), name, "{photos}", "{model}", "{out}"))

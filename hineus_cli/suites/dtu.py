@@ -40,7 +40,7 @@ def _scene(place: Path, number: int, wanted: Wanted) -> SuiteScene:
         masks=masks if wanted.masks and masks.is_dir() else None,
         left_out=views.names if views else (),
         views=views,
-        truth=data and Truth("dtu", data, number),
+        truth=None if data is None else Truth("dtu", data, number),
         lacking=tuple(lacking),
     )
 

@@ -19,7 +19,8 @@ def find_scenes(folder: Path, wanted: Wanted) -> list[SuiteScene]:
 
 
 def _scene(place: Path) -> SuiteScene:
-    views, lacking = None, ()
+    views: TestViews | None = None
+    lacking: tuple[str, ...] = ()
     if (place / TEST).is_file() and (place / "test").is_dir():
         names = [name for name in photo_names(place / "test") if not any(extra in name for extra in EXTRAS)]
         views = TestViews(place / "test", tuple(names), place / TEST, background="white")

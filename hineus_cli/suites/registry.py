@@ -19,7 +19,8 @@ class Suite:
     Attributes:
         name: on the command line. title: for people.
         find: scenes in a folder.
-        score: the key of the result that the suite's papers compare. unit: of it. decimals: they print.
+        score: place in a result's scores of the one that the suite's papers compare. score_name: in words. unit: of it.
+        decimals: they print.
         layout: what a scene's folder holds, in words.
     """
 
@@ -27,34 +28,49 @@ class Suite:
     title: str
     find: Callable[[Path, Wanted], list[SuiteScene]]
     score: str
+    score_name: str
     unit: str
     decimals: int
     layout: str
 
 
+PSNR = "views.mean.field.whole.psnr"
 SUITES = {
     suite.name: suite
     for suite in (
-        Suite("dtu", "DTU", dtu.find_scenes, "chamfer", "mm", 2, "dtu_scan24/{image,mask,cameras_sphere.npz}"),
         Suite(
-            "nerf-synthetic", "NeRF-synthetic", nerf_synthetic.find_scenes, "psnr", "dB", 2,
+            "dtu", "DTU", dtu.find_scenes,
+            "mesh.overall", "Chamfer distance", "mm", 2,
+            "dtu_scan24/{image,mask,cameras_sphere.npz}",
+        ),
+        Suite(
+            "nerf-synthetic", "NeRF-synthetic", nerf_synthetic.find_scenes,
+            PSNR, "PSNR", "dB", 2,
             "lego/{train,test,transforms_train.json,transforms_test.json}",
         ),
-        Suite("mipnerf360", "Mip-NeRF 360", mipnerf360.find_scenes, "psnr", "dB", 2, "garden/{images_4,sparse/0}"),
         Suite(
-            "glossy-synthetic", "GlossySynthetic", glossy.find_scenes, "chamfer", "", 4,
+            "mipnerf360", "Mip-NeRF 360", mipnerf360.find_scenes,
+            PSNR, "PSNR", "dB", 2,
+            "garden/{images_4,sparse/0}",
+        ),
+        Suite(
+            "glossy-synthetic", "GlossySynthetic", glossy.find_scenes,
+            "mesh.chamfer", "Chamfer distance", "", 4,
             "bell/{0.png,0-camera.pkl,0-depth.png}",
         ),
         Suite(
-            "blendedmvs", "BlendedMVS", blendedmvs.find_scenes, "chamfer", "% of the extent", 2,
+            "blendedmvs", "BlendedMVS", blendedmvs.find_scenes,
+            "mesh.chamfer_percent", "Chamfer distance", "% of the extent", 2,
             "ID/{blended_images,cams,rendered_depth_maps}, or SCENE/{image,mask,cameras_sphere.npz}",
         ),
         Suite(
-            "urbanscene3d", "UrbanScene3D", urbanscene3d.find_scenes, "psnr", "dB", 2,
+            "urbanscene3d", "UrbanScene3D", urbanscene3d.find_scenes,
+            PSNR, "PSNR", "dB", 2,
             "Residence/photos, or residence-pixsfm/{train,val}/{metadata,rgbs}",
         ),
         Suite(
-            "known", "known objects", known.find_scenes, "mean", "% of the extent", 2,
+            "known", "known objects", known.find_scenes,
+            "mesh.mean", "distance", "% of the extent", 2,
             "SET/{images,masks,transforms.json,gt_mesh.ply}",
         ),
     )

@@ -18,12 +18,13 @@ class Wanted:
     """How the user wants scenes to be read.
 
     Attributes:
-        masks: whether to use the masks that come with the photos; None: as the suite's papers do.
+        masks: whether to use the masks that come with the photos; most papers' figures are without. An alpha channel
+            is a mask in any case.
         hold_out: keep every n-th photo back where the suite has no test photos of its own; 0: none.
         truth: folder of the evaluation data, where it does not lie with the photos.
     """
 
-    masks: bool | None = None
+    masks: bool = False
     hold_out: int = 0
     truth: Path | None = None
 

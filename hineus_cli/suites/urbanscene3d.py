@@ -1,5 +1,5 @@
-"""UrbanScene3D: the photos of a real scene with GPS in EXIF (`Residence/photos/*.JPG`, or in the folder itself), or with
-the poses that Mega-NeRF's authors refined (`residence-pixsfm/` with `train/` and `val/`, `metadata/` and `rgbs/`).
+"""UrbanScene3D: the photos of a real scene with GPS in EXIF (`Residence/photos/*.JPG`, or in the folder itself), or
+with the poses that Mega-NeRF's authors refined (`residence-pixsfm/{train,val}/` with `metadata/` and `rgbs/`).
 
 Of the second form `val` is the test. Of the first, poses are found. Its evaluation program reads a format of its own,
 so no distance to its scans is measured here.

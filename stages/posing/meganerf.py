@@ -51,7 +51,9 @@ def _load(file: Path) -> dict[str, np.ndarray]:
         data = torch.load(file, map_location="cpu", weights_only=True)  # tensors and plain values only
         found = {key: np.asarray(data[key], dtype=np.float64) for key in ("W", "H", "intrinsics", "c2w")}
     except Exception as error:  # a damaged file raises nearly anything
-        raise InputError(f"The camera {file} cannot be read ({error}).", "It needs W, H, intrinsics and c2w.") from error
+        raise InputError(
+            f"The camera {file} cannot be read ({error}).", "It needs W, H, intrinsics and c2w."
+        ) from error
     if found["c2w"].shape != (3, 4) or found["intrinsics"].shape != (4,):
         raise InputError(
             f"The camera {file} holds c2w {found['c2w'].shape} and intrinsics {found['intrinsics'].shape}, "
