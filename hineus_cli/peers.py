@@ -8,22 +8,21 @@ a folder of its own, and is timed.
 from __future__ import annotations
 
 import difflib
-import logging
+import os
+import resource
 import shlex
 import shutil
 import subprocess
 import sys
+import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from hineus_cli.machine import machine
 from stages import artifacts
-from stages.engine.resources import ResourceMeter
 from stages.errors import ConfigError, ReconstructionError
 from stages.posing.exporting import SPARSE
-
-log = logging.getLogger(__name__)
 
 BUILT_IN = {
     "poisson": "screened Poisson through the sparse points (Open3D)",
@@ -83,11 +82,13 @@ def run_peer(peer: Peer, given: Path, folder: Path) -> dict[str, Any]:
     """Run a peer on `given`, what `export-colmap` writes; its mesh is `folder/mesh.ply`.
 
     Returns:
-        Wall and CPU seconds, peak memory in bytes, the machine, and of commands that were given, the command.
+        Wall and CPU seconds, peak memory in bytes (of its largest process), the machine, and the command, where it is
+        not built in.
 
     Raises:
         ReconstructionError: it failed, or wrote no mesh; its last words are included.
     """
+    given, folder = given.resolve(), folder.resolve()  # the command runs elsewhere
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     places = {
@@ -97,25 +98,42 @@ def run_peer(peer: Peer, given: Path, folder: Path) -> dict[str, Any]:
         "out": folder / MESH,
     }
     words = [_filled(word, places) for word in peer.words]
-    with (folder / LOG).open("wb") as output, ResourceMeter() as meter:
-        try:
-            # its own folder is where it may leave other files
-            code = subprocess.run(words, cwd=folder, stdout=output, stderr=subprocess.STDOUT, check=False).returncode
-        except OSError as error:
-            raise ReconstructionError(
-                f"Peer {peer.name} could not be started: {words[0]}: {error.strerror}.", "Name the program's full path."
-            ) from error
+    started = time.monotonic()
+    code, used = _call(words, folder, peer.name)
+    wall_s = time.monotonic() - started
     if code != 0 or not (folder / MESH).is_file():
         said = " ".join((folder / LOG).read_text(encoding="utf-8", errors="replace").split())[-TOLD:]
         what = f"ended with {code}" if code else f"wrote no {MESH}"
         raise ReconstructionError(f"Peer {peer.name} {what}: {said or 'it said nothing'}", f"See {folder / LOG}.")
     return {
-        "wall_s": round(meter.wall_s, 2),
-        "cpu_s": round(meter.cpu_s, 2),
-        "peak_rss": int(meter.peak_rss),
+        "wall_s": round(wall_s, 2),
+        "cpu_s": round(used.ru_utime + used.ru_stime, 2),
+        "peak_rss": used.ru_maxrss * (1 if sys.platform == "darwin" else 1024),
         "machine": machine(),
         "command": None if peer.name in BUILT_IN else shlex.join(peer.words),
     }
+
+
+def _call(words: list[str], folder: Path, name: str) -> tuple[int, resource.struct_rusage]:
+    """Exit code of a command, and what it and those of its children that it waited for used.
+
+    The command runs in `folder`, where it may leave other files; what it says goes to a file there.
+    """
+    with (folder / LOG).open("wb") as output:
+        try:
+            process = subprocess.Popen(words, cwd=folder, stdout=output, stderr=subprocess.STDOUT)
+        except OSError as error:
+            raise ReconstructionError(
+                f"Peer {name} could not be started: {words[0]}: {error.strerror}.", "Name the program's full path."
+            ) from error
+        try:
+            _, status, used = os.wait4(process.pid, 0)
+        except BaseException:  # it is not to outlive us
+            process.kill()
+            process.wait()
+            raise
+    process.returncode = os.waitstatus_to_exitcode(status)  # so that nobody waits for it again
+    return process.returncode, used
 
 
 def _filled(word: str, places: dict[str, Path]) -> str:

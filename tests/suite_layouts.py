@@ -13,7 +13,7 @@ from sphere_scene import RADIUS, render, ring_of_cameras
 
 from stages.geometry.cameras import PinholeCameras
 
-COUNT, WIDTH, HEIGHT = 8, 48, 40
+COUNT, WIDTH, HEIGHT = 8, 72, 64
 FOCAL = 60.0
 
 
