@@ -6,17 +6,37 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from stages.evaluation.surfaces import Surface
 from stages.geometry.cameras import PinholeCameras
+from stages.meshing.cleaning import outside_hull, raycaster
+
+# The way from a point to a camera starts this part of it off the point, whose own surface would hide it.
+CLEAR = 1e-3
 
 
-def seen(points: np.ndarray, cameras: PinholeCameras, occluder: Surface | None = None) -> np.ndarray:
+def seen(
+    points: np.ndarray, cameras: PinholeCameras, occluder: tuple[np.ndarray, np.ndarray] | None = None
+) -> np.ndarray:
     """Which of points [P, 3] some camera sees, [P] bool: in its image, in front of it, with nothing in between.
 
     Args:
-        occluder: a mesh that hides what lies behind it; None: nothing hides anything.
+        occluder: vertices [V, 3] and faces [F, 3] of a mesh that hides what lies behind it; None: nothing does.
     """
-    raise NotImplementedError
+    import open3d as o3d
+
+    found = np.zeros(len(points), dtype=bool)
+    middle = points.mean(0)  # single precision in the ray caster
+    scene = None if occluder is None else raycaster(occluder[0] - middle, occluder[1])
+    for i, center in enumerate(cameras.centers):
+        open_points = np.flatnonzero(~found)
+        pixels, depth = cameras.project(i, points[open_points])
+        open_points = open_points[(depth > 0) & (pixels >= 0).all(1) & (pixels < cameras.sizes[i]).all(1)]
+        if scene is not None and len(open_points):
+            # Not normalised: the camera is at distance 1, whatever lies before it hides the point.
+            ways = np.concatenate([points[open_points] - middle, center - points[open_points]], 1).astype(np.float32)
+            hidden = scene.test_occlusions(o3d.core.Tensor(ways), tnear=CLEAR, tfar=1 - CLEAR).numpy()
+            open_points = open_points[~hidden]
+        found[open_points] = True
+    return found
 
 
 def inside_masks(
@@ -28,7 +48,11 @@ def inside_masks(
         masks: camera and [H, W] bool.
         grow: pixels by which masks are widened first.
     """
-    raise NotImplementedError
+    import cv2
+
+    brush = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * grow + 1, 2 * grow + 1))
+    widened = ((i, cv2.dilate(mask.astype(np.uint8), brush) > 0) for i, mask in masks)
+    return ~outside_hull(points, cameras, widened, max_part=0.0, min_views=1)
 
 
 def inside_box(points: np.ndarray, box: np.ndarray) -> np.ndarray:

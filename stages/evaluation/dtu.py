@@ -9,7 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stages.evaluation.surfaces import Surface
+from stages.evaluation.surfaces import Surface, Target
+from stages.evaluation.thinning import thin
 
 DENSITY = 0.2  # mm between points at least
 PATCH = 60.0  # mm around the box of the observed part: beyond it nothing is looked at
@@ -66,4 +67,57 @@ def dtu_score(predicted: Surface, truth: DtuTruth, seed: int = 0) -> DtuScore:
     Raises:
         ValueError: no predicted point lies in observed cells, or no distance is below `MAX_DISTANCE`.
     """
-    raise NotImplementedError
+    points = predicted.points if predicted.faces is None else lattice(predicted.points, predicted.faces, DENSITY)
+    points = thin(np.random.default_rng(seed).permutation(points), DENSITY)
+    near = points[((points >= truth.box[0] - PATCH) & (points < truth.box[1] + 2 * PATCH)).all(1)]
+    measured = near[observed(near, truth)]
+    above = truth.points[truth.points @ truth.ground[:3] + truth.ground[3] > 0]
+    for name, found in (("predicted", measured), ("scanned", above)):
+        if not len(found):
+            raise ValueError(f"no {name} point lies in the observed part; is it in the scan's frame, in millimetres?")
+    to_truth = Target(Surface(truth.points)).nearest(measured).distances
+    to_predicted = Target(Surface(near)).nearest(above).distances
+    means = []
+    for name, distances in (("predicted", to_truth), ("scanned", to_predicted)):
+        if not (distances < MAX_DISTANCE).any():
+            raise ValueError(f"no {name} point is nearer than {MAX_DISTANCE:g} mm to the other surface")
+        means.append(float(distances[distances < MAX_DISTANCE].mean()))
+    return DtuScore(
+        accuracy=means[0],
+        completeness=means[1],
+        overall=0.5 * (means[0] + means[1]),
+        predicted_points=len(measured),
+        true_points=len(above),
+        predicted_far=100 * float((to_truth >= MAX_DISTANCE).mean()),
+        true_far=100 * float((to_predicted >= MAX_DISTANCE).mean()),
+    )
+
+
+def observed(points: np.ndarray, truth: DtuTruth) -> np.ndarray:
+    """Which of points [P, 3] lie in observed cells, [P] bool; a cell's index is that of its nearest corner."""
+    cells = np.around((points - truth.box[0]) / truth.resolution).astype(np.int64)
+    inside = ((cells >= 0) & (cells < truth.observed.shape)).all(1)
+    inside[inside] = truth.observed[tuple(cells[inside].T)]
+    return inside
+
+
+def lattice(vertices: np.ndarray, faces: np.ndarray, spacing: float) -> np.ndarray:
+    """The vertices [V, 3], and points on each triangle in a lattice along two of its sides, about `spacing` apart."""
+    corners = vertices[faces].astype(np.float64)
+    sides = corners[:, 1:] - corners[:, :1]
+    lengths = np.linalg.norm(sides, axis=2)
+    area = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
+    corners, sides, lengths, area = (each[area > 0] for each in (corners, sides, lengths, area))
+    # Slanted lattices are wider spaced along the sides, so that each point has a square of `spacing` to itself.
+    steps = np.floor(lengths / (spacing * np.sqrt(lengths.prod(1) / area))[:, None]).astype(np.int64)
+    found = [vertices.astype(np.float64)]
+    kinds, kind_of = np.unique(steps, axis=0, return_inverse=True)
+    by_kind = np.split(np.argsort(kind_of.ravel(), kind="stable"), np.cumsum(np.bincount(kind_of.ravel()))[:-1])
+    for (first, second), rows in zip(kinds, by_kind, strict=True):
+        if not first or not second:
+            continue
+        along = np.indices((first + 1, second + 1)).reshape(2, -1).T + 0.5
+        along /= first, second
+        along = along[along.sum(1) < 1]
+        found.append((corners[rows, None, 0] + along @ sides[rows]).reshape(-1, 3))
+    return np.concatenate(found)

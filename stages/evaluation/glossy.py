@@ -11,8 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stages.evaluation.surfaces import Surface
+from stages.evaluation.surfaces import Surface, Target
+from stages.evaluation.thinning import one_a_cube
 from stages.geometry.cameras import PinholeCameras
+from stages.meshing.rasterizing import depth_map
 
 VOXEL = 0.01
 
@@ -41,7 +43,15 @@ def visible_points(cameras: PinholeCameras, depths: Iterable[np.ndarray]) -> np.
     As NeRO does, pixel (x, y) stands for the place (x, y) and not for its centre (x + .5, y + .5): half a pixel off,
     the same for truth and prediction.
     """
-    raise NotImplementedError
+    found = []
+    for i, depth in enumerate(depths):
+        rows, columns = np.nonzero(np.isfinite(depth) & (depth > 0))
+        pixels = np.stack([columns, rows, np.ones(len(rows))], 1)
+        in_cam = depth[rows, columns, None] * (pixels @ np.linalg.inv(cameras.intrinsics[i]).T)
+        rotation, translation = cameras.cam_from_scene[i, :, :3], cameras.cam_from_scene[i, :, 3]
+        found.append((in_cam - translation) @ rotation)
+    points = np.concatenate(found)
+    return one_a_cube(points, VOXEL)
 
 
 def glossy_score(predicted: Surface, cameras: PinholeCameras, true_points: np.ndarray) -> GlossyScore:
@@ -53,4 +63,18 @@ def glossy_score(predicted: Surface, cameras: PinholeCameras, true_points: np.nd
     Raises:
         ValueError: it has no faces, or no camera sees it.
     """
-    raise NotImplementedError
+    if predicted.faces is None:
+        raise ValueError(f"a mesh is expected, got {len(predicted.points)} points and no faces")
+    vertices, faces = predicted.points, predicted.faces
+    points = visible_points(cameras, (drawn_depth(cameras, i, vertices, faces) for i in range(len(cameras))))
+    if not len(points):
+        raise ValueError(f"none of {len(cameras)} cameras sees the mesh; is it in their frame?")
+    accuracy = float(Target(Surface(true_points)).nearest(points).distances.mean())
+    completeness = float(Target(Surface(points)).nearest(true_points).distances.mean())
+    return GlossyScore(accuracy, completeness, 0.5 * (accuracy + completeness), len(points), len(true_points))
+
+
+def drawn_depth(cameras: PinholeCameras, index: int, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Depth [H, W] of a mesh along a camera's axis, infinite where there is none."""
+    _, inverse = depth_map(cameras, index, vertices, faces)
+    return np.divide(1.0, inverse, out=np.full(inverse.shape, np.inf), where=inverse > 0)

@@ -5,8 +5,11 @@ H x W pixels.
 
 from __future__ import annotations
 
+import importlib.util
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
 
 import numpy as np
 
@@ -49,4 +52,22 @@ def score_image(
 
 def find_lpips() -> tuple[Lpips | None, str]:
     """The function, or None, and where it comes from or why there is none. Nothing is ever downloaded."""
-    raise NotImplementedError
+    if importlib.util.find_spec("lpips") is None:
+        return None, "left out: the package lpips is not installed (`pip install lpips torchvision`)"
+    import lpips
+    import torch
+    import torchvision
+
+    # The backbone's file as torchvision names it; lpips brings its own few weights along.
+    url = torchvision.models.AlexNet_Weights.IMAGENET1K_V1.url
+    weights = Path(torch.hub.get_dir()) / "checkpoints" / Path(url).name
+    if not weights.exists():
+        return None, f"left out: {weights} is not there, and nothing is downloaded; put {url} there"
+    network = lpips.LPIPS(net="alex", verbose=False).eval()
+
+    @torch.no_grad()
+    def distance(image: np.ndarray, truth: np.ndarray) -> float:
+        both = [torch.from_numpy(each).permute(2, 0, 1)[None].float() / 127.5 - 1 for each in (image, truth)]
+        return float(network(*both))
+
+    return distance, f"lpips {metadata.version('lpips')}, AlexNet of {weights}"

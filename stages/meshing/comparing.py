@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -85,45 +86,61 @@ def distances_to(points: np.ndarray, mesh: tuple[np.ndarray, np.ndarray]) -> np.
 
 
 def align_by_icp(a: tuple[np.ndarray, np.ndarray], b: tuple[np.ndarray, np.ndarray]) -> Similarity:
-    """The rigid motion that takes mesh a nearest to mesh b, from where it is: trimmed point-to-plane ICP.
-
-    Chen and Medioni 1992, with the worst pairs of each round left out. It finds the nearest rest, so the meshes must
-    lie about right to begin with; the scale stays.
-    """
+    """The rigid motion that takes mesh a nearest to mesh b, from where it is, see `icp`."""
     import open3d as o3d
 
-    start = sample_surface(*a, ICP_SAMPLES)
     center = b[0].mean(0)
     scene = raycaster(b[0] - center, b[1])
+
+    def nearest(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        found = scene.compute_closest_points(o3d.core.Tensor((points - center).astype(np.float32)))
+        return found["points"].numpy() + center, found["primitive_normals"].numpy()
+
+    return icp(sample_surface(*a, ICP_SAMPLES), nearest)
+
+
+def icp(
+    start: np.ndarray, nearest: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]], scaled: bool = False
+) -> Similarity:
+    """The rigid motion (`scaled`: similarity) that takes points [P, 3] nearest to a surface, from where they are.
+
+    Trimmed point-to-plane ICP: Chen and Medioni 1992, with the worst pairs of each round left out. It finds the
+    nearest rest, so the two must lie about right to begin with.
+
+    Args:
+        nearest: points [P, 3] -> the nearest on the surface [P, 3] and its normals there [P, 3].
+    """
     extent = float(np.ptp(start, axis=0).max())
     motion = Similarity.identity()
     moved = start
     for _ in range(ICP_ROUNDS):
-        nearest = scene.compute_closest_points(o3d.core.Tensor((moved - center).astype(np.float32)))
-        offsets = nearest["points"].numpy() + center - moved
+        places, normals = nearest(moved)
+        offsets = places - moved
         apart = np.linalg.norm(offsets, axis=1)
         kept = apart <= np.quantile(apart, ICP_KEPT)
-        step = plane_step(moved[kept], offsets[kept], nearest["primitive_normals"].numpy()[kept])
-        motion = Similarity(1.0, step.rotation @ motion.rotation, step.rotation @ motion.translation + step.translation)
+        motion = plane_step(moved[kept], offsets[kept], normals[kept], scaled).compose(motion)
         before, moved = moved, motion.apply(start)
         if np.abs(moved - before).max() < ICP_STILL * extent:
             break
     return motion
 
 
-def plane_step(points: np.ndarray, offsets: np.ndarray, normals: np.ndarray) -> Similarity:
-    """The small rigid motion after which points [P, 3] lie best in planes, by linear least squares.
+def plane_step(points: np.ndarray, offsets: np.ndarray, normals: np.ndarray, scaled: bool = False) -> Similarity:
+    """The small rigid motion (`scaled`: similarity) after which points [P, 3] lie best in planes, by least squares.
 
-    The plane of each goes through point + offset [P, 3] at right angles to its normal [P, 3]; the turn is about the
-    points' middle. Motions that change nothing (of a sphere about its centre) are left out.
+    The plane of each goes through point + offset [P, 3] at right angles to its normal [P, 3]; turn and growth are
+    about the points' middle. Motions that change nothing (of a sphere about its centre) are left out.
     """
     from scipy.spatial.transform import Rotation
 
     middle = points.mean(0)
     rows = np.concatenate([np.cross(points - middle, normals), normals], axis=1)
+    if scaled:
+        rows = np.concatenate([rows, ((points - middle) * normals).sum(1, keepdims=True)], axis=1)
     solution = np.linalg.lstsq(rows, (offsets * normals).sum(1), rcond=1e-6)[0]
     rotation = Rotation.from_rotvec(solution[:3]).as_matrix()
-    return Similarity(1.0, rotation, solution[3:] + middle - rotation @ middle)
+    scale = 1.0 + float(solution[6]) if scaled else 1.0
+    return Similarity(scale, rotation, solution[3:6] + middle - scale * rotation @ middle)
 
 
 def distance_colors(distances: np.ndarray, largest: float) -> np.ndarray:

@@ -11,7 +11,7 @@ from functools import cached_property
 import torch
 
 from configs.params import TrainParams
-from stages.neural import reflection
+from stages.neural import reflection, schedules
 from stages.neural.acceleration import fixed_shapes
 from stages.neural.fields import BackgroundNetwork, Fields
 from stages.neural.photos import RayBatch
@@ -84,6 +84,22 @@ class Renderer:
 
     def __init__(self, fields: Fields, cache: SdfCache, params: TrainParams) -> None:
         self.fields, self.cache, self.params = fields, cache, params
+
+    def moment(self, progress: float) -> Moment:
+        """What the schedules say at progress in [0, 1].
+
+        A scheduled scale ends at half a voxel of the finest level, or at `scale_end`; a learned one starts at
+        `scale_start` and stays above a tenth of that voxel.
+        """
+        params, grid = self.params, self.fields.shape.sdf_grid
+        levels = schedules.active_levels(progress, params.levels, params.start_levels, params.coarse_until)
+        scale: torch.Tensor | float
+        if self.fields.log_scale is not None:
+            scale = torch.exp(self.fields.log_scale) + 0.1 * grid.voxel_size()
+        else:
+            end = max(params.scale_end, 0.5 * grid.voxel_size())
+            scale = schedules.exponential(progress / params.sharpen_until, params.scale_start, end)
+        return Moment(progress, scale, levels, grid.voxel_size(levels))
 
     def render(
         self, batch: RayBatch, moment: Moment, extra: torch.Tensor, generator: torch.Generator | None
@@ -203,14 +219,14 @@ class Renderer:
         """Background colour [R, 3] weighted by the transmittance [R] that the surface leaves."""
         shining = transmittance.detach() > _BACKGROUND_THRESHOLD
         if fixed_shapes(transmittance.device):
-            color = self._background_color(background, batch.origins, batch.directions, generator)
+            color = self.background_color(background, batch.origins, batch.directions, generator)
             return (transmittance * shining)[:, None] * color
         behind = torch.nonzero(shining).squeeze(1)
-        color = self._background_color(background, batch.origins[behind], batch.directions[behind], generator)
+        color = self.background_color(background, batch.origins[behind], batch.directions[behind], generator)
         nothing = torch.zeros(len(batch.leave), 3, device=transmittance.device)
         return nothing.index_add(0, behind, transmittance[behind, None] * color)
 
-    def _background_color(
+    def background_color(
         self,
         background: BackgroundNetwork,
         origins: torch.Tensor,

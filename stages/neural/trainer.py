@@ -111,20 +111,8 @@ class Trainer:
 
     # ------------------------------------------------------------------ schedules
     def moment(self, progress: float) -> Moment:
-        """What the schedules say at progress in [0, 1].
-
-        A scheduled scale ends at half a voxel of the finest level, or at `scale_end`; a learned one starts at
-        `scale_start` and stays above a tenth of that voxel.
-        """
-        params, grid = self.params, self.fields.shape.sdf_grid
-        levels = schedules.active_levels(progress, params.levels, params.start_levels, params.coarse_until)
-        scale: torch.Tensor | float
-        if self.fields.log_scale is not None:
-            scale = torch.exp(self.fields.log_scale) + 0.1 * grid.voxel_size()
-        else:
-            end = max(params.scale_end, 0.5 * grid.voxel_size())
-            scale = schedules.exponential(progress / params.sharpen_until, params.scale_start, end)
-        return Moment(progress, scale, levels, grid.voxel_size(levels))
+        """What the schedules say at progress in [0, 1], see `Renderer.moment`."""
+        return self.renderer.moment(progress)
 
     # ------------------------------------------------------------------ one step
     def step(self, progress: float) -> dict[str, torch.Tensor]:

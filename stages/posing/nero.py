@@ -76,13 +76,38 @@ def read_depth_mask(file: Path) -> np.ndarray:
     Raises:
         InputError: it is none.
     """
+    return np.isfinite(read_depth(file))
+
+
+def read_depth(file: Path) -> np.ndarray:
+    """[H, W] float64 depth along the axis of a 16-bit depth image, infinite off the object.
+
+    Raises:
+        InputError: it is none.
+    """
     import cv2
 
-    depth = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
-    if depth is None or depth.dtype != np.uint16:
-        found = "it cannot be read" if depth is None else f"it has {8 * depth.itemsize} bits"
+    stored = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+    if stored is None or stored.dtype != np.uint16:
+        found = "it cannot be read" if stored is None else f"it has {8 * stored.itemsize} bits"
         raise InputError(f"{file} is no 16-bit depth image: {found}.", "Leave depth out with `--no-masks`.")
-    return (depth if depth.ndim == 2 else depth[..., 0]) / 65535 * DEPTH_RANGE < DEPTH_OBJECT
+    depth = (stored if stored.ndim == 2 else stored[..., 0]) / 65535 * DEPTH_RANGE
+    return np.where(depth < DEPTH_OBJECT, depth, np.inf)
+
+
+def read_split(file: Path) -> list[str]:
+    """Stems of the test images of NeRO's `synthetic_split_128.pkl`: a pickled pair of lists, test and training.
+
+    Raises:
+        InputError: it cannot be read.
+    """
+    try:
+        with file.open("rb") as stream:
+            return [str(stem) for stem in _ArraysOnly(stream).load()[0]]
+    except Exception as error:  # a damaged pickle raises nearly anything
+        raise InputError(
+            f"The split {file} cannot be read ({error}).", "It needs NeRO's configs/synthetic_split_128.pkl."
+        ) from error
 
 
 def _load(file: Path) -> tuple[np.ndarray, np.ndarray]:
