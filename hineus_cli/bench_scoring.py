@@ -83,10 +83,15 @@ def score_surface(truth: Truth, mesh: Path, workspace: Workspace) -> dict[str, A
     if truth.protocol == "known":
         return dict(score_mesh(mesh, artifacts.model_path(workspace.stage_folder("sfm")), truth.folder))
     if truth.protocol == "dtu":
-        return evaluating.evaluate_dtu(mesh, truth.folder, truth.scan)
+        return _without_paths(evaluating.evaluate_dtu(mesh, truth.folder, truth.scan))
     if truth.protocol == "glossy":
-        return evaluating.evaluate_glossy(mesh, truth.folder)
+        return _without_paths(evaluating.evaluate_glossy(mesh, truth.folder))
     return _score_depth_maps(mesh, truth.folder)
+
+
+def _without_paths(found: dict[str, Any]) -> dict[str, Any]:
+    """A result says where it was measured elsewhere, and may be passed on."""
+    return {key: value for key, value in found.items() if key not in ("predicted", "truth")}
 
 
 def _score_depth_maps(mesh: Path, folder: Path) -> dict[str, Any]:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import logging
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -17,7 +19,12 @@ from stages.posing.reading import read_poses
 from stages.posing.triangulation import fitted_camera
 from stages.undistort import pinhole_camera, pinhole_photo
 
-WHITE = 255.0
+if TYPE_CHECKING:
+    from stages.neural.drawing import FieldDrawer
+
+log = logging.getLogger(__name__)
+
+WHITE = 255
 OPAQUE = 127  # alpha above this is the object, as ingest has it
 
 
@@ -76,4 +83,47 @@ def _read(file: Path, on_white: bool) -> tuple[np.ndarray, np.ndarray | None]:
 
 
 def score_test_views(photos: TestPhotos, workspace: Workspace, fresh: set[str], device: str) -> dict[str, Any]:
-    return {}
+    """Every test photo against drawings of the trained field and, where it is up to date, of the textured mesh.
+
+    Returns:
+        {"counted": photos, "mean": {"field": {"object": ..., "whole": ...}, "mesh": ...}, "photos": [...]}, the regions
+        and scores as `hineus_cli.evaluating.evaluate_views` has them.
+    """
+    from hineus_cli.evaluating import mean_scores
+    from stages.evaluation.images import find_lpips
+    from stages.evaluation.views import judge
+    from stages.meshing.view_scores import draw_view, silhouette
+    from stages.report import read_rgb
+
+    drawer = _field_drawer(workspace, device)
+    textured = "bake" in fresh
+    if textured:
+        atlas = artifacts.load_atlas(workspace.stage_folder("atlas"))
+        texture = read_rgb(artifacts.base_color_path(workspace.stage_folder("bake")))
+    lpips, _ = find_lpips()
+    judged = []
+    for index, name in enumerate(photos.cameras.names):
+        photo, mask = photos.load(index)
+        if textured:
+            drawing = draw_view(atlas, texture, photos.cameras, index)
+            covered = silhouette(atlas.vertices, atlas.faces, photos.cameras, index)
+        else:
+            drawing, covered = np.full_like(photo, WHITE), np.zeros(photo.shape[:2], bool)
+        found = judge(photo, mask, drawer.draw(photos.cameras, index), drawing, covered, lpips)
+        scores: dict[str, Any] = {"name": name, "field": asdict(found.field)}
+        judged.append({**scores, "mesh": asdict(found.mesh)} if textured else scores)
+        log.info("%s: %d of %d test photos", name, index + 1, len(photos.cameras))
+    kinds = ("field", "mesh") if textured else ("field",)
+    means = {kind: mean_scores([photo[kind] for photo in judged]) for kind in kinds}
+    return {"counted": len(judged), "mean": means, "photos": judged}
+
+
+def _field_drawer(workspace: Workspace, device: str) -> FieldDrawer:
+    from configs.params import TrainParams
+    from stages.neural.drawing import FieldDrawer
+    from stages.neural.field import load_field
+
+    manifest = workspace.published("train")
+    assert manifest is not None  # the run has just brought it up to date
+    field = load_field(artifacts.field_path(workspace.stage_folder("train")), device)
+    return FieldDrawer(field.fields, TrainParams(**manifest.identity.params), device)

@@ -409,7 +409,7 @@ def evaluate_views(workspace: Path, renders: Path | None = None, device: str = "
     return {
         "workspace": str(workspace),
         "photos": photos,
-        "mean": {what: _mean([photo[what] for photo in photos]) for what in ("field", "mesh")},
+        "mean": {what: mean_scores([photo[what] for photo in photos]) for what in ("field", "mesh")},
         "renders": None if renders is None else str(renders),
         "done": [
             f"photos: {len(held_out)} of {len(cameras)}, held back from training and texture by `train.holdout`",
@@ -452,7 +452,7 @@ def _trained(workspace: Path, device: str) -> tuple[dict[str, Path], FieldDrawer
     return folders, FieldDrawer(field.fields, params, device)
 
 
-def _mean(photos: list[dict[str, Any]]) -> dict[str, Any]:
+def mean_scores(photos: list[dict[str, Any]]) -> dict[str, Any]:
     """Of each number over the photos that have it, by region; None where none has."""
     means: dict[str, Any] = {}
     for region in ("object", "whole"):

@@ -10,7 +10,7 @@ from hineus_cli.suites.blendedmvs import DEPTHS
 from stages.errors import InputError
 from stages.posing import mvsnet
 
-STRIDE = 4  # of the pixels that are looked at: all of them would be tens of millions
+STRIDE = 2  # of the pixels that are looked at: all of them would be tens of millions
 SPACING = 0.002  # of the extent: near views are not to outvote far ones
 
 
