@@ -36,6 +36,7 @@ docs: venv
 	$(BIN)/python -m benchmarks.run_sets --table-only
 	$(BIN)/python -m benchmarks.ablate --table-only
 	$(BIN)/python -m benchmarks.hard_variants --table-only
+	$(BIN)/python -m benchmarks.suites --table-only
 
 clean:
 	rm -rf .venv demo build dist *.egg-info
