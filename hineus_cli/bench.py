@@ -89,9 +89,7 @@ def run_bench(
         for seed in range(request.seeds):
             log.info("%s %s, seed %d", request.suite.title, scene.name, seed)
             yield _run(request, pipeline, listener, scene, preset, folder, seed)
-        for peer in request.peers:
-            log.info("%s %s, peer %s", request.suite.title, scene.name, peer.name)
-            yield _run_peer(request, scene, preset, folder, peer)
+        yield from _run_peers(request, scene, preset, folder)
 
 
 # ---------------------------------------------------------------- ours
@@ -114,7 +112,7 @@ def _run(
         fresh = {outcome.name for outcome in done.outcomes}
         made_from = {"scoring": SCORING, **_fingerprints(done.workspace, fresh)}
         known = _load(file)
-        if known and known.get("made_from") == made_from and known.get("lacking") == result["lacking"]:
+        if known and _is_current(known, made_from, result):
             return known
         result |= _costs(done)
         result["settings"] = _differing(done.config.model_dump(mode="json"))
@@ -198,32 +196,32 @@ def _fingerprints(workspace: Workspace, stages: Iterable[str]) -> dict[str, str]
 
 
 # ---------------------------------------------------------------- peers
-def _run_peer(request: BenchRequest, scene: SuiteScene, preset: str, folder: Path, peer: Peer) -> dict[str, Any]:
-    """A peer on the photos and poses of the first seed."""
-    result = _heading(request, scene, peer.name, preset)
-    file = folder / f"{preset}-peer-{peer.name}.json"
-    try:
-        workspace = Workspace.open(folder / f"{preset}-seed0")
-        posed = workspace.published("undistort")
-        made_from = {
-            "scoring": SCORING,
-            "undistort": posed and posed.outputs_digest,
-            "command": list(peer.words[3:]),
-        }
-        known = _load(file)
-        if known and known.get("made_from") == made_from:
-            return known
-        given = folder / "peers" / f"{preset}-photos"
-        shutil.rmtree(given, ignore_errors=True)
-        result["photos"] = export_poses(workspace.root, given, write_colmap)["images"]
-        result |= run_peer(peer, given, folder / "peers" / f"{preset}-{peer.name}")
-        mesh = posed_mesh(workspace, folder / "peers" / f"{preset}-{peer.name}" / MESH, file.with_suffix(".ply"))
-        result["scores"] = score_result(scene, workspace, mesh, set(), "cpu")
-        result["made_from"] = made_from
-    except HineusError as error:
-        return _failed(result, error)
-    _save(file, result)
-    return result
+def _run_peers(request: BenchRequest, scene: SuiteScene, preset: str, folder: Path) -> Iterator[dict[str, Any]]:
+    """The peers on the photos and poses of the first seed, which are written out once."""
+    given = folder / "peers" / f"{preset}-photos"
+    shutil.rmtree(given, ignore_errors=True)
+    for peer in request.peers:
+        log.info("%s %s, peer %s", request.suite.title, scene.name, peer.name)
+        result = _heading(request, scene, peer.name, preset)
+        file = folder / f"{preset}-peer-{peer.name}.json"
+        try:
+            workspace = Workspace.open(folder / f"{preset}-seed0")
+            made_from = {"scoring": SCORING, "command": list(peer.given), **_fingerprints(workspace, POSED)}
+            known = _load(file)
+            if known and _is_current(known, made_from, result):
+                yield known
+                continue
+            if not given.exists():
+                export_poses(workspace.root, given, write_colmap)
+            result |= run_peer(peer, given, folder / "peers" / f"{preset}-{peer.name}")
+            mesh = posed_mesh(workspace, folder / "peers" / f"{preset}-{peer.name}" / MESH, file.with_suffix(".ply"))
+            result["scores"] = score_result(scene, workspace, mesh, set(), "cpu")
+            result["made_from"] = made_from
+        except HineusError as error:
+            yield _failed(result, error)
+            continue
+        _save(file, result)
+        yield result
 
 
 # ---------------------------------------------------------------- results
@@ -238,6 +236,11 @@ def _heading(request: BenchRequest, scene: SuiteScene, method: str, preset: str)
         "known_poses": scene.poses is not None,
         "lacking": list(scene.lacking),
     }
+
+
+def _is_current(known: dict[str, Any], made_from: dict[str, Any], heading: dict[str, Any]) -> bool:
+    """Whether a result that was kept is of the same run, and all that can be scored now was scored then."""
+    return known.get("made_from") == made_from and known.get("lacking") == heading["lacking"]
 
 
 def _failed(result: dict[str, Any], error: HineusError) -> dict[str, Any]:

@@ -74,6 +74,7 @@ def cost_table(results: Sequence[Result]) -> TextTable:
 VIEW_SCORES = (
     ("field, whole", "field.whole"),
     ("field, object", "field.object"),
+    ("mesh, whole", "mesh.whole"),
     ("mesh, object", "mesh.object"),
 )
 

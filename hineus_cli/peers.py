@@ -43,10 +43,12 @@ class Peer:
     Attributes:
         name: in tables and files.
         words: of its command, with placeholders.
+        given: the command as it was given; empty for those that are built in.
     """
 
     name: str
     words: tuple[str, ...]
+    given: tuple[str, ...] = ()
 
 
 def parse_peer(text: str) -> Peer:
@@ -75,15 +77,15 @@ def parse_peer(text: str) -> Peer:
             f"--peer {text} is not of the form NAME=COMMAND, with a plain name and {{out}} in the command.",
             "For example `--peer 'openmvs=./openmvs.sh {photos} {model} {out}'`.",
         )
-    return Peer(name, words)
+    return Peer(name, words, words)
 
 
 def run_peer(peer: Peer, given: Path, folder: Path) -> dict[str, Any]:
     """Run a peer on `given`, what `export-colmap` writes; its mesh is `folder/mesh.ply`.
 
     Returns:
-        Wall and CPU seconds, peak memory in bytes (of its largest process), the machine, and the command, where it is
-        not built in.
+        Wall and CPU seconds, peak memory in bytes (of its largest process), the machine, the command as it was given,
+        and the number of photos.
 
     Raises:
         ReconstructionError: it failed, or wrote no mesh; its last words are included.
@@ -110,7 +112,8 @@ def run_peer(peer: Peer, given: Path, folder: Path) -> dict[str, Any]:
         "cpu_s": round(used.ru_utime + used.ru_stime, 2),
         "peak_rss": used.ru_maxrss * (1 if sys.platform == "darwin" else 1024),
         "machine": machine(),
-        "command": None if peer.name in BUILT_IN else shlex.join(peer.words),
+        "command": shlex.join(peer.given),
+        "photos": sum(path.is_file() for path in places["photos"].rglob("*")),
     }
 
 
