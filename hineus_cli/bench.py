@@ -147,12 +147,15 @@ def _share_poses(first: Path, place: Path) -> None:
     """Start another seed from the poses of the first: only the training is to differ."""
     if place.exists() or not (first / "workspace.json").exists():
         return
+    partial = place.with_name(f"{place.name}.partial")
     with storage_errors(place, "copying the poses"):
+        shutil.rmtree(partial, ignore_errors=True)
         for name in POSED:
             if (first / name).is_dir():
-                shutil.copytree(first / name, place / name)
+                shutil.copytree(first / name, partial / name)
         for name in ("workspace.json", "config.yaml"):
-            shutil.copyfile(first / name, place / name)
+            shutil.copyfile(first / name, partial / name)
+        partial.rename(place)
 
 
 def _costs(done: Reconstruction) -> dict[str, Any]:
@@ -199,7 +202,7 @@ def _fingerprints(workspace: Workspace, stages: Iterable[str]) -> dict[str, str]
 def _run_peers(request: BenchRequest, scene: SuiteScene, preset: str, folder: Path) -> Iterator[dict[str, Any]]:
     """The peers on the photos and poses of the first seed, which are written out once."""
     given = folder / "peers" / f"{preset}-photos"
-    shutil.rmtree(given, ignore_errors=True)
+    shutil.rmtree(given, ignore_errors=True)  # those of an earlier call may be of other poses
     for peer in request.peers:
         log.info("%s %s, peer %s", request.suite.title, scene.name, peer.name)
         result = _heading(request, scene, peer.name, preset)

@@ -85,13 +85,13 @@ def score_surface(truth: Truth, mesh: Path, workspace: Workspace) -> dict[str, A
     if truth.protocol == "dtu":
         return _without_paths(evaluating.evaluate_dtu(mesh, truth.folder, truth.scan))
     if truth.protocol == "glossy":
-        return _without_paths(evaluating.evaluate_glossy(mesh, truth.folder))
+        return _without_paths(evaluating.evaluate_glossy(mesh, truth.folder, truth.split))
     return _score_depth_maps(mesh, truth.folder)
 
 
 def _without_paths(found: dict[str, Any]) -> dict[str, Any]:
-    """A result says where it was measured elsewhere, and may be passed on."""
-    return {key: value for key, value in found.items() if key not in ("predicted", "truth")}
+    """Only what was measured: results are passed on, and folders here mean nothing elsewhere."""
+    return {key: value for key, value in found.items() if key not in ("predicted", "truth", "done")}
 
 
 def _score_depth_maps(mesh: Path, folder: Path) -> dict[str, Any]:

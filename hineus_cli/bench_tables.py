@@ -40,11 +40,12 @@ def score_table(suite: Suite, results: Sequence[Result]) -> TextTable:
     scenes = [*(name for name in known if name in names), *sorted(names - set(known), key=_natural)]
     rows = [*(_paper_rows(paper, scenes, suite.decimals) if paper else ())]
     for label, runs in _by_method(results).items():
-        means = [_mean([_at(run, f"scores.{suite.score}") for run in runs if run["scene"] == name]) for name in scenes]
-        rows.append((label, *(_number(mean, suite.decimals) for mean in means), _average(means, suite.decimals)))
+        scores = [[_at(run, f"scores.{suite.score}") for run in runs if run["scene"] == name] for name in scenes]
+        average = _average([_mean(own) for own in scores], suite.decimals)
+        rows.append((label, *(_spread(own, suite.decimals) for own in scores), average))
     note = ""
     if paper:
-        note = f"Rows without a preset are the paper's ({paper.label}); averages are of the scenes shown."
+        note = f"Rows that are neither ours nor a peer's are the paper's ({paper.label}), over the scenes shown."
         if not set(scenes) & set(paper.scenes):
             note = f"None of these scenes is in the paper's table ({paper.label})."
     unit = f", {suite.unit}" if suite.unit else ""
@@ -98,7 +99,7 @@ def views_table(results: Sequence[Result]) -> TextTable:
 def label_of(result: Result) -> str:
     """A run's method, with what its settings are."""
     if result["method"] != OURS:
-        return str(result["method"])
+        return f"peer: {result['method']}"
     own = [f"{key}={value}" for key, value in (result.get("asked") or {}).items()]
     return ", ".join([f"ours ({result['preset']}{', masks' if result['masks'] else ''})", *own])
 
@@ -137,6 +138,13 @@ def _mean(values: Sequence[float | None]) -> float | None:
     """Mean of what is known; None where nothing is."""
     known = [value for value in values if value is not None]
     return sum(known) / len(known) if known else None
+
+
+def _spread(values: Sequence[float | None], decimals: int) -> str:
+    """The mean over seeds and, of several, the lowest and the highest."""
+    known = [value for value in values if value is not None]
+    span = f" ({min(known):.{decimals}f} to {max(known):.{decimals}f})" if len(known) > 1 else ""
+    return f"{_number(_mean(values), decimals)}{span}"
 
 
 def _average(values: Sequence[float | None], decimals: int) -> str:

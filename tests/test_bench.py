@@ -5,13 +5,15 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import trimesh
 from PIL import Image
-from sphere_scene import RADIUS, render
+from sphere_scene import RADIUS, render, ring_of_cameras, sphere_scene
 from suite_layouts import COUNT, LAYOUTS, cameras, write_suite
 from typer.testing import CliRunner, Result
 
@@ -19,8 +21,10 @@ from hineus_cli import bench as bench_module
 from hineus_cli import bench_views, reconstruct
 from hineus_cli.app import build_app
 from hineus_cli.bench import load_results
+from hineus_cli.bench_scoring import posed_mesh, result_mesh
 from hineus_cli.bench_tables import score_table, tables_of
 from hineus_cli.bench_views import TestPhotos
+from hineus_cli.comparison import read_mesh
 from hineus_cli.peers import parse_peer, run_peer
 from hineus_cli.suites.registry import SUITES, find_scenes
 from hineus_cli.suites.scene import Wanted
@@ -29,6 +33,8 @@ from stages.engine.stage import Stage, StageContext
 from stages.engine.workspace import Workspace
 from stages.errors import ConfigError, InputError, ReconstructionError
 from stages.geometry.cameras import PinholeCameras
+from stages.geometry.place import Place
+from stages.geometry.similarity import Similarity
 from stages.ingest import INGEST
 from stages.neural.drawing import FieldDrawing
 from stages.sfm import SFM
@@ -37,8 +43,6 @@ from stages.undistort import UNDISTORT
 
 def clean_ball(context: StageContext) -> dict[str, Any]:
     """The cleanup stage's stand-in: the true ball, in the scene frame."""
-    import trimesh
-
     scene = artifacts.load_scene(context.inputs["undistort"])
     ball = trimesh.creation.icosphere(4, RADIUS)
     vertices = scene.world_from_scene.inverse().apply(np.asarray(ball.vertices))
@@ -180,6 +184,25 @@ def test_a_scene_that_fails_does_not_stop_the_others(data: Path):
     assert "cannot be read" in answer["results"][0]["error"]["message"]
     assert "error" not in answer["results"][1]
     assert [kept["scene"] for kept in load_results(Path("bench"))] == ["bell"]
+
+
+def test_a_mesh_is_scored_in_the_frame_of_its_poses_whatever_gps_made_of_the_world(tmp_path: Path):
+    moved = Place(Similarity(2.0, np.eye(3), np.array([10.0, 0, 0])), metric=True, scale_from="GPS")
+    scene = replace(sphere_scene(ring_of_cameras()), place=moved)
+    workspace = Workspace.open(tmp_path / "workspace", create=True)
+    for name in ("undistort", "cleanup"):
+        workspace.stage_folder(name).mkdir(parents=True)
+    artifacts.save_scene(workspace.stage_folder("undistort"), scene)
+    corners = np.eye(3)
+    artifacts.save_mesh(workspace.stage_folder("cleanup"), corners, np.array([[0, 1, 2]]))
+    world = scene.world_from_scene.apply(corners)
+    ours = result_mesh(workspace, {"cleanup"}, tmp_path / "ours.ply")
+    assert ours is not None
+    np.testing.assert_allclose(read_mesh(ours)[0], (world - [10, 0, 0]) / 2, atol=1e-5)
+    trimesh.Trimesh(world, [[0, 1, 2]], process=False).export(tmp_path / "theirs.ply")
+    theirs = posed_mesh(workspace, tmp_path / "theirs.ply", tmp_path / "moved.ply")
+    np.testing.assert_allclose(read_mesh(theirs)[0], (world - [10, 0, 0]) / 2, atol=1e-5)
+    assert result_mesh(workspace, {"undistort"}, tmp_path / "none.ply") is None
 
 
 def test_results_do_not_go_among_the_data(data: Path):
@@ -326,9 +349,9 @@ def test_our_scores_stand_beside_the_paper_s_over_the_same_scenes():
     assert table.header == ("method", "24", "37", "average")
     rows = {row[0]: row[1:] for row in table.rows}
     assert rows["NeuS"] == ("1.00", "1.37", "1.19")
-    assert rows["ours (cpu)"] == ("0.60", "1.00", "0.80")
-    assert rows["mvs"] == ("-", "9.00", "-")
-    assert [row[0] for row in table.rows][-2:] == ["mvs", "ours (cpu)"]
+    assert rows["ours (cpu)"] == ("0.60 (0.50 to 0.70)", "1.00", "0.80")
+    assert rows["peer: mvs"] == ("-", "9.00", "-")
+    assert [row[0] for row in table.rows][-2:] == ["peer: mvs", "ours (cpu)"]
 
 
 def test_an_average_that_the_paper_prints_otherwise_is_said_where_all_its_scenes_are_shown():

@@ -133,6 +133,16 @@ def test_glossy_scene_without_depth_has_no_truth(tmp_path: Path):
     assert "lacks depth images" in scene.lacking[0]
 
 
+def test_nero_s_test_views_are_used_where_its_split_is_there(tmp_path: Path):
+    write_suite("glossy-synthetic", tmp_path)
+    assert the_scene("glossy-synthetic", tmp_path).lacking[0].startswith("distance over all views")
+    (tmp_path / "code").mkdir()
+    (tmp_path / "code" / "synthetic_split_128.pkl").touch()
+    scene = the_scene("glossy-synthetic", tmp_path, truth=tmp_path / "code")
+    assert scene.truth is not None
+    assert (scene.truth.split, scene.lacking) == (tmp_path / "code" / "synthetic_split_128.pkl", ())
+
+
 def test_what_is_not_there_is_said(tmp_path: Path):
     with pytest.raises(InputError, match="There is no suite 'dtuu'") as caught:
         find_suite("dtuu")

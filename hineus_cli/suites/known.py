@@ -22,12 +22,11 @@ def find_scenes(folder: Path, wanted: Wanted) -> list[SuiteScene]:
 
 def _scene(place: Path, wanted: Wanted) -> SuiteScene:
     photos, masks = place / IMAGES, place / MASKS
-    poses = place / TRUTH_CAMERAS if wanted.hold_out else None
-    views = every_nth(photos, photo_names(photos), poses, wanted.hold_out)
+    views = every_nth(photos, photo_names(photos), place / TRUTH_CAMERAS, wanted.hold_out)
     return SuiteScene(
         name=place.name,
         photos=photos,
-        poses=poses,
+        poses=None if views is None else views.poses,
         masks=masks if wanted.masks and masks.is_dir() else None,
         left_out=views.names if views else (),
         views=views,

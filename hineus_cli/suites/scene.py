@@ -7,10 +7,6 @@ from pathlib import Path
 from typing import Literal
 
 from stages.capture.photos import PHOTO_SUFFIXES
-from stages.errors import InputError
-
-# The photo that is kept back of each n, counted from the first, as Mip-NeRF 360 and LLFF do.
-FIRST_OF_EACH = 0
 
 
 @dataclass(frozen=True)
@@ -55,11 +51,13 @@ class Truth:
         protocol: by which a suite's papers score, see `hineus_cli.bench_scoring`.
         folder: that the protocol reads.
         scan: the number DTU gives the scene.
+        split: NeRO's file that names the test views; None: all are.
     """
 
     protocol: Literal["known", "dtu", "glossy", "depth maps"]
     folder: Path
     scan: int = 0
+    split: Path | None = None
 
 
 @dataclass(frozen=True)
@@ -93,20 +91,9 @@ def photo_names(folder: Path) -> list[str]:
     )
 
 
-def every_nth(folder: Path, names: list[str], poses: Path | None, every: int) -> TestViews | None:
-    """Every n-th photo from the first as test views; None where `every` is 0.
-
-    Raises:
-        InputError: there are no poses, so that nothing would say where those photos were taken from.
-    """
-    if not every:
-        return None
-    if poses is None:
-        raise InputError(
-            f"Photos of {folder} cannot be kept back: a suite without poses says not where they were taken from.",
-            "Leave `--hold-out` out.",
-        )
-    return TestViews(folder, tuple(names[FIRST_OF_EACH::every]), poses)
+def every_nth(folder: Path, names: list[str], poses: Path, every: int) -> TestViews | None:
+    """Every n-th photo from the first, as Mip-NeRF 360 and LLFF do, as test views; None where `every` is 0."""
+    return TestViews(folder, tuple(names[::every]), poses) if every else None
 
 
 def folders_with(folder: Path, *needed: str) -> list[Path]:
