@@ -33,8 +33,7 @@ def page() -> str:
 
 def _commands() -> Iterator[str]:
     yield "## Commands\n"
-    group: Any = typer.main.get_command(app)
-    for name, command in group.commands.items():
+    for name, command in all_commands().items():
         yield f"### hineus {name}\n"
         yield f"{inspect.cleandoc(command.help or '')}\n"
         if not command.params:
@@ -44,6 +43,16 @@ def _commands() -> Iterator[str]:
         for parameter in command.params:
             yield _row(_spelling(parameter), parameter.help or "", _default(parameter))
         yield ""
+
+
+def all_commands() -> dict[str, Any]:
+    """Each command by its name; those of a group, "evaluate mesh", after it."""
+    found: dict[str, Any] = {}
+    group: Any = typer.main.get_command(app)
+    for name, command in group.commands.items():
+        found[name] = command
+        found |= {f"{name} {part}": each for part, each in getattr(command, "commands", {}).items()}
+    return found
 
 
 def _spelling(parameter: Any) -> str:

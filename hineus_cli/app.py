@@ -17,6 +17,7 @@ import typer
 from typer.core import TyperGroup
 
 from hineus_cli.bench_app import bench
+from hineus_cli.evaluate_app import evaluate_app
 from stages.engine.stage import Stage
 from stages.errors import HineusError, InputError, SystemRequirementError
 from stages.pipeline import PIPELINE
@@ -568,6 +569,7 @@ def build_app(pipeline: Sequence[Stage] = PIPELINE) -> typer.Typer:
 
     for command in (run, check, status, compare, bench, doctor, presets, demo):
         app.command()(command)
+    app.add_typer(evaluate_app, name="evaluate")
     app.command("config")(show_config)
     app.command("export-colmap")(export_colmap)
     app.command("export-transforms")(export_transforms)

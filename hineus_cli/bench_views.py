@@ -87,9 +87,9 @@ def score_test_views(photos: TestPhotos, workspace: Workspace, fresh: set[str], 
 
     Returns:
         {"counted": photos, "mean": {"field": {"object": ..., "whole": ...}, "mesh": ...}, "photos": [...]}, the regions
-        and scores as `hineus_cli.evaluating.evaluate_views` has them.
+        and scores as `hineus_cli.evaluating_views.evaluate_views` has them.
     """
-    from hineus_cli.evaluating import mean_scores
+    from hineus_cli.evaluating_views import mean_scores
     from stages.evaluation.images import find_lpips
     from stages.evaluation.views import judge
     from stages.meshing.view_scores import draw_view, silhouette

@@ -1,4 +1,4 @@
-"""Compare two meshes or workspaces: reads and writes the files, leaves the measuring to `meshing.comparing`."""
+"""Compare two meshes or workspaces: reads and writes the files, leaves the measuring to `stages.evaluation`."""
 
 from __future__ import annotations
 
@@ -10,14 +10,16 @@ import numpy as np
 
 from stages import artifacts
 from stages.errors import InputError
-from stages.meshing.comparing import align_by_icp, compare_surfaces, distance_colors, distances_to
+from stages.evaluation.alignment import by_icp
+from stages.evaluation.coloring import distance_colors
+from stages.evaluation.surfaces import DEFAULT_THRESHOLDS, Surface, Target, measure
 from stages.meshing.writing import ply_bytes
 
 Mesh = tuple[np.ndarray, np.ndarray]
 
 
 def compare(first: Path, second: Path, icp: bool, distance_map: Path | None) -> dict[str, Any]:
-    """Distances of two meshes both ways, see `stages.meshing.comparing.Comparison`.
+    """Distances of two meshes both ways, see `stages.evaluation.surfaces.OneWay`.
 
     Args:
         first, second: mesh files or workspaces.
@@ -25,34 +27,35 @@ def compare(first: Path, second: Path, icp: bool, distance_map: Path | None) -> 
         distance_map: PLY to write: the first mesh, coloured by its distance to the second.
 
     Returns:
-        JSON-able numbers, the meshes' paths, and how they were aligned.
+        JSON-able numbers, the meshes' paths, and how they were aligned. F-scores at parts of the larger extent.
 
     Raises:
         InputError: a mesh cannot be read, or the distance map not written.
     """
     paths = [mesh_path(place) for place in (first, second)]
-    a, b = (read_mesh(path) for path in paths)
+    a, b = (Surface(*read_mesh(path)) for path in paths)
     alignment: dict[str, Any] = {"alignment": "same frame"}
     try:
         if icp:
-            motion = align_by_icp(a, b)
-            a = (motion.apply(a[0]), a[1])
+            motion = by_icp(a, b)
+            a = a.moved(motion.matrix())
             alignment = {"alignment": "icp", "b_from_a": motion.matrix().tolist()}
-        found = compare_surfaces(a, b)
+        extent = max(a.extent, b.extent)
+        found = measure(a, b, [part * extent for part in DEFAULT_THRESHOLDS])
     except ValueError as error:
         raise InputError(
             f"{paths[0]} and {paths[1]} cannot be compared: {error}.", "Look at the two meshes."
         ) from error
     if distance_map is not None:
-        _write_map(distance_map, a, distances_to(a[0], b), found.a_to_b.p95)
+        _write_map(distance_map, a, Target(b).nearest(a.points).distances, found.accuracy.p95)
     return {
         "a": str(paths[0]),
         "b": str(paths[1]),
         **alignment,
-        "extent": found.extent,
-        "a_to_b": asdict(found.a_to_b),
-        "b_to_a": asdict(found.b_to_a),
-        "f_scores": {f"{threshold:g}": score for threshold, score in found.f_scores.items()},
+        "extent": extent,
+        "a_to_b": asdict(found.accuracy),
+        "b_to_a": asdict(found.completeness),
+        "f_scores": {f"{part:g}": at.f_score for part, at in zip(DEFAULT_THRESHOLDS, found.f_scores, strict=True)},
         "distance_map": None if distance_map is None else str(distance_map),
     }
 
@@ -86,12 +89,12 @@ def read_mesh(path: Path) -> Mesh:
     return vertices, faces
 
 
-def _write_map(path: Path, mesh: Mesh, distances: np.ndarray, largest: float) -> None:
+def _write_map(path: Path, mesh: Surface, distances: np.ndarray, largest: float) -> None:
     from stages.meshing.cleaning import vertex_normals
 
-    data = ply_bytes(
-        mesh[0], vertex_normals(*mesh), distance_colors(distances, largest), mesh[1], f"red is {largest:.6g} and more"
-    )
+    assert mesh.faces is not None
+    normals, colors = vertex_normals(mesh.points, mesh.faces), distance_colors(distances, largest)
+    data = ply_bytes(mesh.points, normals, colors, mesh.faces, f"red is {largest:.6g} and more")
     try:
         path.write_bytes(data)
     except OSError as error:

@@ -6,11 +6,10 @@ returns plain values: the numbers, and under "done" a sentence for each step tha
 
 from __future__ import annotations
 
-import logging
 import re
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -29,13 +28,7 @@ from hineus_cli.truths import (
 from stages.errors import InputError
 from stages.evaluation.surfaces import Keep, Sampling, Surface
 
-if TYPE_CHECKING:
-    from stages.engine.manifest import Manifest
-    from stages.neural.drawing import FieldDrawer
-
-log = logging.getLogger(__name__)
-
-ALIGNMENTS = ("rigid", "similarity")
+MOTIONS = ("rigid", "similarity")
 
 
 @dataclass(frozen=True)
@@ -43,7 +36,8 @@ class MeshOptions:
     """How a surface is held against the truth.
 
     Attributes:
-        thresholds: of the F-scores, in the truth's unit; empty: parts of its extent.
+        thresholds, threshold_parts: of the F-scores, in the truth's unit and as parts of its extent; both empty: as
+            `stages.evaluation.surfaces.DEFAULT_THRESHOLDS`.
         samples, spacing, seed: see `stages.evaluation.surfaces.Sampling`.
         matrix: file with 4 x 4 numbers, truth from prediction.
         cameras: of the prediction, a file of poses; those of a workspace are known.
@@ -57,6 +51,7 @@ class MeshOptions:
     """
 
     thresholds: tuple[float, ...] = ()
+    threshold_parts: tuple[float, ...] = ()
     samples: int | None = None
     spacing: float | None = None
     seed: int = 0
@@ -91,7 +86,8 @@ def evaluate_mesh(predicted: Path, truth: Path, options: MeshOptions) -> dict[st
         ours, matrix = _aligned(ours, true, predicted, options, cameras, done)
         selections = [_selection(each, true, options, cameras) for each in (ours, true)]
         sampling = Sampling(options.samples or SAMPLES, options.spacing, options.seed)
-        found = measure(ours, true, options.thresholds or None, sampling, *selections)
+        thresholds = [*(part * true.extent for part in options.threshold_parts), *options.thresholds]
+        found = measure(ours, true, thresholds or None, sampling, *selections)
     except ValueError as error:
         raise InputError(
             f"{path} cannot be held against {truth}: {error}.", "Are the two in one frame? See `--true-cameras`."
@@ -117,21 +113,28 @@ def _aligned(
     if options.matrix is not None:
         matrix = read_matrix(options.matrix)
         done.append(f"alignment: by the matrix of {options.matrix}")
-    own = options.cameras or (predicted if predicted.is_dir() else None)
-    if cameras is not None and own is not None:
-        known = workspace_cameras(own) if own == predicted else read_cameras(own)
+    known = None if cameras is None else _own_cameras(predicted, options.cameras)
+    if cameras is not None and known is not None:
         centers = {name: matrix[:3, :3] @ center + matrix[:3, 3] for name, center in known.centers.items()}
         motion, paired = by_cameras(centers, cameras.centers)
         matrix = motion.matrix() @ matrix
         done.append(f"alignment: similarity by {paired} camera centres of {known.origin} and {cameras.origin}")
     ours = ours.moved(matrix)
     if options.icp is not None:
-        motion = by_icp(ours, true, scaled=options.icp == "similarity")
+        counted = _selection(ours, true, options, cameras)
+        motion = by_icp(ours, true, options.icp == "similarity", counted)
         ours, matrix = ours.moved(motion.matrix()), motion.matrix() @ matrix
-        done.append(f"alignment: {options.icp} point-to-plane ICP onto the truth, on the nearest 90 % of pairs")
+        done.append(f"alignment: {options.icp} point-to-plane ICP of what counts, on the nearest 90 % of pairs")
     if not done:
         done.append("alignment: none, taken to be in one frame")
     return ours, matrix
+
+
+def _own_cameras(predicted: Path, given: Path | None) -> Cameras | None:
+    """Cameras in the prediction's frame: those that were given, or a workspace's own."""
+    if given is not None:
+        return read_cameras(given)
+    return workspace_cameras(predicted) if predicted.is_dir() else None
 
 
 def _selection(surface: Surface, true: Surface, options: MeshOptions, cameras: Cameras | None) -> Keep | None:
@@ -174,17 +177,15 @@ def _said(options: MeshOptions, cameras: Cameras | None, sampling: Sampling, our
     """A sentence for each thing that was done to get the numbers."""
     said = []
     for name, surface in (("prediction", ours), ("truth", true)):
-        kind = "cloud of points" if surface.faces is None else "mesh"
-        if surface.faces is None:
-            how = "as it is" if sampling.spacing is None else f"thinned to one a cube of {sampling.spacing:g}"
-            how += f", {sampling.count} drawn of more" if sampling.spacing is None else ""
+        if surface.faces is not None:
+            size, how = f"mesh of {len(surface.faces)} faces", f"{sampling.count} points, uniform by area"
+            if sampling.spacing is not None:
+                how = f"one point a square of {sampling.spacing:g}, uniform by area"
         else:
-            how = (
-                f"{sampling.count} points, uniform by area"
-                if sampling.spacing is None
-                else f"one point a square of {sampling.spacing:g}, uniform by area"
-            )
-        said.append(f"{name}: {kind} of {len(surface.points)} points, {how}, seed {sampling.seed}")
+            size, how = f"cloud of {len(surface.points)} points", f"at most {sampling.count} of them"
+            if sampling.spacing is not None:
+                how = f"one a cube of {sampling.spacing:g}"
+        said.append(f"{name}: {size}, {how}, seed {sampling.seed}")
     box = _box(true, options)
     if box is not None:
         corners = " to ".join(" ".join(f"{value:.6g}" for value in corner) for corner in box)
@@ -231,7 +232,7 @@ def evaluate_dtu(predicted: Path, data: Path, scan: int, seed: int = 0) -> dict[
             "protocol: DTU, as in DTUeval-python",
             "alignment: none, the frame of the data set's cameras",
             f"sampling: a point each {DENSITY:g} mm, thinned to that in random order, seed {seed}",
-            f"cut: observed cells of ObsMask, {PATCH:g} mm around its box, scan above the ground plane",
+            f"cut: {PATCH:g} mm below to {2 * PATCH:g} mm above ObsMask's box, observed cells; scan above the ground",
             f"distances of {MAX_DISTANCE:g} mm and more are left out of both means",
         ],
     }
@@ -305,11 +306,9 @@ def evaluate_tanks(
             f"The scene {truth.name} is none of {', '.join(TAU)}: its tau is not known.", "Say it: `--tau 0.005`."
         )
     start, how = np.eye(4), "none, taken to be in the scan's frame"
-    own = cameras or (predicted if predicted.is_dir() else None)
     if matrix is not None:
         start, how = read_matrix(matrix), f"by the matrix of {matrix}"
-    elif own is not None and truth.centers is not None:
-        known = workspace_cameras(own) if own == predicted else read_cameras(own)
+    elif truth.centers is not None and (known := _own_cameras(predicted, cameras)) is not None:
         start, paired = _by_numbers(known, truth.centers, data)
         how = f"similarity by {paired} camera centres of {known.origin} and of the scene's trajectory"
     try:
@@ -351,116 +350,3 @@ def _by_numbers(known: Cameras, true_centers: np.ndarray, data: Path) -> tuple[n
             "Their photos are numbered from 1 as in the data set (000001.jpg); or align with `--matrix`.",
         ) from error
     return motion.matrix(), paired
-
-
-# ---------------------------------------------------------------- photos
-def evaluate_views(workspace: Path, renders: Path | None = None, device: str = "auto") -> dict[str, Any]:
-    """The photos that a workspace held back, against drawings of its field and of its final mesh.
-
-    Args:
-        renders: folder for the pictures, `photo/`, `field/` and `mesh/`; None: none are written.
-        device: auto, cpu or cuda.
-
-    Returns:
-        {"photos": [{"name", "field": {"object": {"psnr", "ssim", "lpips", "pixels"} or None, "whole": ..}, "mesh":
-        {..}}], "mean": the same without names, over the photos, "done"}; regions as in `stages.evaluation.views`.
-
-    Raises:
-        InputError: the workspace holds no photos back.
-        WorkspaceError: a stage is missing, or is of another run than those after it.
-    """
-    from hineus_cli.reconstruct import choose_device
-    from stages import artifacts
-    from stages.evaluation.images import find_lpips
-    from stages.evaluation.views import judge
-    from stages.meshing.view_scores import draw_view, silhouette
-    from stages.report import read_rgb
-
-    folders, drawer = _trained(workspace, choose_device(device))
-    held_out = artifacts.load_held_out(folders["train"])
-    if not held_out:
-        raise InputError(
-            f"{workspace} holds no photos back: all were trained on.",
-            f"Train without every 8th: `hineus run --workspace {workspace} --set train.holdout=8`.",
-        )
-    cameras = artifacts.load_scene(folders["undistort"]).cameras
-    atlas = artifacts.load_atlas(folders["atlas"])
-    texture = read_rgb(artifacts.base_color_path(folders["bake"]))
-    lpips, about_lpips = find_lpips()
-    photos: list[dict[str, Any]] = []
-    masked = 0
-    for name in held_out:
-        index = cameras.names.index(name)
-        mask = artifacts.load_mask(folders["undistort"], name)
-        masked += mask is not None
-        judged = judge(
-            artifacts.load_image(folders["undistort"], name),
-            None if mask is None else mask > 127,
-            drawer.draw(cameras, index),
-            draw_view(atlas, texture, cameras, index),
-            silhouette(atlas.vertices, atlas.faces, cameras, index),
-            lpips,
-        )
-        if renders is not None:
-            for what, picture in judged.pictures.items():
-                artifacts.write_png((renders / what / name).with_suffix(".png"), picture)
-        photos.append({"name": name, "field": asdict(judged.field), "mesh": asdict(judged.mesh)})
-        log.info("%s: %d of %d photos", name, len(photos), len(held_out))
-    return {
-        "workspace": str(workspace),
-        "photos": photos,
-        "mean": {what: mean_scores([photo[what] for photo in photos]) for what in ("field", "mesh")},
-        "renders": None if renders is None else str(renders),
-        "done": [
-            f"photos: {len(held_out)} of {len(cameras)}, held back from training and texture by `train.holdout`",
-            f"object: the photo's mask in {masked} photos, the mesh's silhouette in {len(held_out) - masked}",
-            "whole: the photo as it is for a field with a background; else masked photo and drawing on white",
-            f"lpips: {about_lpips}",
-        ],
-    }
-
-
-DRAWN_FROM = ("undistort", "train", "atlas", "bake")
-
-
-def _trained(workspace: Path, device: str) -> tuple[dict[str, Path], FieldDrawer]:
-    """Folders of the stages that drawings are made from, and what draws the field."""
-    from configs.params import TrainParams
-    from stages import artifacts
-    from stages.engine.workspace import Workspace
-    from stages.errors import WorkspaceError
-    from stages.neural.drawing import FieldDrawer
-    from stages.neural.field import load_field
-
-    opened = Workspace.open(workspace)
-    hint = f"Make it: `hineus run --workspace {workspace}`."
-    manifests: dict[str, Manifest] = {}
-    for stage in DRAWN_FROM:
-        manifest = opened.published(stage)
-        if manifest is None:
-            raise WorkspaceError(f"{workspace} has no result of the stage {stage}.", hint)
-        for before in DRAWN_FROM:
-            made_of = manifest.identity.inputs.get(before)
-            if made_of is not None and made_of != manifests[before].outputs_digest:
-                raise WorkspaceError(
-                    f"The stage {stage} of {workspace} is of another {before} than the one there.", hint
-                )
-        manifests[stage] = manifest
-    folders = {stage: opened.stage_folder(stage) for stage in DRAWN_FROM}
-    params = TrainParams(**manifests["train"].identity.params)
-    field = load_field(artifacts.field_path(folders["train"]), device)
-    return folders, FieldDrawer(field.fields, params, device)
-
-
-def mean_scores(photos: list[dict[str, Any]]) -> dict[str, Any]:
-    """Of each number over the photos that have it, by region; None where none has."""
-    means: dict[str, Any] = {}
-    for region in ("object", "whole"):
-        scored = [photo[region] for photo in photos if photo[region] is not None]
-        means[region] = None
-        if scored:
-            means[region] = {"photos": len(scored)}
-            for key in ("psnr", "ssim", "lpips"):
-                values = [score[key] for score in scored if score[key] is not None]
-                means[region][key] = sum(values) / len(values) if values else None
-    return means

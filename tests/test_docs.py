@@ -9,7 +9,6 @@ import sys
 from pathlib import Path
 
 import pytest
-import typer.main
 
 from configs.load import describe_settings, load_config, preset_names
 from configs.params import Config
@@ -17,12 +16,6 @@ from configs.params import Config
 ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
 PAGES = sorted([*ROOT.glob("*.md"), *DOCS.rglob("*.md")])
-
-
-def _commands():
-    from hineus_cli.app import app
-
-    return typer.main.get_command(app).commands
 
 
 def _make_reference():
@@ -49,7 +42,7 @@ def test_every_setting_is_in_the_reference_with_a_description():
 
 def test_every_command_and_option_says_what_it_does():
     written = (DOCS / "reference.md").read_text(encoding="utf-8")
-    commands = _commands()
+    commands = _make_reference().all_commands()
     assert {"run", "status", "doctor", "demo", "ingest", "train", "report"} <= set(commands)
     for name, command in commands.items():
         assert f"### hineus {name}\n" in written
@@ -146,13 +139,15 @@ def _shell_lines(page):
 @pytest.mark.parametrize("page", [p for p in PAGES if p.name != "reference.md"], ids=lambda p: str(p.relative_to(ROOT)))
 def test_commands_on_the_pages_exist(page):
     """Every `hineus ...` names a command and options it has; every --set names a setting and takes its value."""
-    commands = _commands()
+    commands = _make_reference().all_commands()
     for line in _shell_lines(page):
         words = line.split("#")[0].split("|")[0].split()
         if len(words) < 2 or words[0] != "hineus" or not words[1].isalpha():
             continue
-        assert words[1] in commands, line
-        options = {option for parameter in commands[words[1]].params for option in parameter.opts}
+        name = " ".join(words[1:3])
+        name = name if name in commands else words[1]
+        assert name in commands, line
+        options = {option for parameter in commands[name].params for option in parameter.opts}
         for word in words[2:]:
             if word.startswith("-"):
                 assert word in options, line

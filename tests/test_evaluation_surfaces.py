@@ -205,11 +205,35 @@ def test_icp_finds_the_way_back_and_the_scale_where_it_may(scale, scaled):
     assert found.scale == pytest.approx(1 / scale, abs=5e-3)
 
 
+def test_icp_looks_at_what_counts_only():
+    moved = bar().moved(motion(4, (0.03, 0.02, 0.01)))
+    aside = np.full((100, 3), 9.0)  # stands for a large thing that the truth lacks
+    both = Surface(np.concatenate([moved.points, aside, aside + np.array([0, 3, 0])]))
+    found = alignment.by_icp(both, bar(), keep=lambda points: points[:, 2] < 5)
+    np.testing.assert_allclose(found.apply(moved.points), bar().points, atol=5e-3)
+    everything = alignment.by_icp(both, bar())
+    assert np.abs(everything.apply(moved.points) - bar().points).max() > 0.1
+
+
 def test_icp_takes_a_cloud_without_normals_for_the_truth():
     truth = Surface(draw_points(bar(), Sampling(20_000)).points)
     moved = bar().moved(motion(4, (0.03, 0.02, 0.01)))
     found = alignment.by_icp(moved, truth)
     np.testing.assert_allclose(found.apply(moved.points), bar().points, atol=0.02)
+
+
+def test_a_step_undoes_a_small_motion_and_leaves_what_planes_cannot_tell():
+    rng = np.random.default_rng(0)
+    points = rng.normal(size=(200, 3))
+    normals = np.eye(3)[rng.integers(0, 3, 200)]
+    shift = np.array([0.1, -0.2, 0.3])
+    step = alignment.plane_step(points, np.tile(shift, (200, 1)), normals)
+    np.testing.assert_allclose(step.apply(points), points + shift, atol=1e-9)
+    grown = alignment.plane_step(points, 0.02 * points, normals, scaled=True)
+    np.testing.assert_allclose(grown.apply(points), 1.02 * points, atol=1e-9)
+    upward = np.tile([0.0, 0, 1], (200, 1))  # one plane says nothing of motion within it
+    step = alignment.plane_step(points, np.tile([0.0, 0, 0.3], (200, 1)), upward)
+    np.testing.assert_allclose(step.translation, [0, 0, 0.3], atol=1e-9)
 
 
 def test_cameras_align_by_their_names():

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from stages.evaluation.surfaces import Sampling, Surface, Target, draw_points
+from stages.evaluation.surfaces import Keep, Sampling, Surface, Target, draw_points
 from stages.geometry.similarity import Similarity, align_points
-from stages.meshing.comparing import ICP_SAMPLES, icp
 
+# ICP: points of each round, rounds, and the part of the pairs that is kept (the nearest; the rest is other surface).
+ICP_SAMPLES, ICP_ROUNDS, ICP_KEPT = 20_000, 60, 0.9
+# A round that moves points by less than this part of the extent was the last.
+ICP_STILL = 1e-7
 PLANE_NEIGHBOURS = 20
 
 
@@ -27,11 +30,13 @@ def by_cameras(centers: Mapping[str, np.ndarray], true_centers: Mapping[str, np.
     ), len(shared)
 
 
-def by_icp(predicted: Surface, truth: Surface, scaled: bool = False) -> Similarity:
+def by_icp(predicted: Surface, truth: Surface, scaled: bool = False, keep: Keep | None = None) -> Similarity:
     """The rigid motion (`scaled`: similarity) that takes a surface nearest to the truth, from where it is.
 
-    Trimmed point-to-plane ICP (Chen and Medioni 1992), see `stages.meshing.comparing`. A cloud without normals gets
-    those of planes through 20 neighbours.
+    See `icp`. A cloud without normals gets those of planes through 20 neighbours.
+
+    Args:
+        keep: which points of the prediction are moved, as of `draw_points`.
     """
     target = Target(truth if truth.faces is not None or truth.normals is not None else _with_normals(truth))
 
@@ -40,7 +45,51 @@ def by_icp(predicted: Surface, truth: Surface, scaled: bool = False) -> Similari
         assert found.normals is not None
         return found.points, found.normals
 
-    return icp(draw_points(predicted, Sampling(ICP_SAMPLES)).points, nearest, scaled)
+    return icp(draw_points(predicted, Sampling(ICP_SAMPLES), keep).points, nearest, scaled)
+
+
+def icp(
+    start: np.ndarray, nearest: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]], scaled: bool = False
+) -> Similarity:
+    """The rigid motion (`scaled`: similarity) that takes points [P, 3] nearest to a surface, from where they are.
+
+    Trimmed point-to-plane ICP: Chen and Medioni 1992, with the worst pairs of each round left out. It finds the
+    nearest rest, so the two must lie about right to begin with.
+
+    Args:
+        nearest: points [P, 3] -> the nearest on the surface [P, 3] and its normals there [P, 3].
+    """
+    extent = float(np.ptp(start, axis=0).max())
+    motion = Similarity.identity()
+    moved = start
+    for _ in range(ICP_ROUNDS):
+        places, normals = nearest(moved)
+        offsets = places - moved
+        apart = np.linalg.norm(offsets, axis=1)
+        kept = apart <= np.quantile(apart, ICP_KEPT)
+        motion = plane_step(moved[kept], offsets[kept], normals[kept], scaled).compose(motion)
+        before, moved = moved, motion.apply(start)
+        if np.abs(moved - before).max() < ICP_STILL * extent:
+            break
+    return motion
+
+
+def plane_step(points: np.ndarray, offsets: np.ndarray, normals: np.ndarray, scaled: bool = False) -> Similarity:
+    """The small rigid motion (`scaled`: similarity) after which points [P, 3] lie best in planes, by least squares.
+
+    The plane of each goes through point + offset [P, 3] at right angles to its normal [P, 3]; turn and growth are
+    about the points' middle. Motions that change nothing (of a sphere about its centre) are left out.
+    """
+    from scipy.spatial.transform import Rotation
+
+    middle = points.mean(0)
+    rows = np.concatenate([np.cross(points - middle, normals), normals], axis=1)
+    if scaled:
+        rows = np.concatenate([rows, ((points - middle) * normals).sum(1, keepdims=True)], axis=1)
+    solution = np.linalg.lstsq(rows, (offsets * normals).sum(1), rcond=1e-6)[0]
+    rotation = Rotation.from_rotvec(solution[:3]).as_matrix()
+    scale = 1.0 + float(solution[6]) if scaled else 1.0
+    return Similarity(scale, rotation, solution[3:6] + middle - scale * rotation @ middle)
 
 
 def _with_normals(cloud: Surface) -> Surface:

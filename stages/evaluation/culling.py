@@ -10,7 +10,7 @@ from stages.geometry.cameras import PinholeCameras
 from stages.meshing.cleaning import outside_hull, raycaster
 
 # The way from a point to a camera starts this part of it off the point, whose own surface would hide it.
-CLEAR = 1e-3
+CLEAR = 1e-5
 
 
 def seen(

@@ -13,7 +13,7 @@ from stages.evaluation.surfaces import Surface, Target
 from stages.evaluation.thinning import thin
 
 DENSITY = 0.2  # mm between points at least
-PATCH = 60.0  # mm around the box of the observed part: beyond it nothing is looked at
+PATCH = 60.0  # mm below the box of the observed part, and half of what is looked at above it, as published
 MAX_DISTANCE = 20.0  # mm: what is farther counts neither way
 
 
@@ -61,8 +61,8 @@ def dtu_score(predicted: Surface, truth: DtuTruth, seed: int = 0) -> DtuScore:
     """Hold a mesh or a cloud against a scan.
 
     A mesh is turned into its vertices and a lattice of points on each triangle, `DENSITY` apart; in random order
-    (`seed`) each point takes away all within `DENSITY` of it. Of what is within `PATCH` of the box, the part in
-    observed cells is measured against the scan; the part of the scan above the ground plane is measured against all.
+    (`seed`) each point takes away all within `DENSITY` of it. Of what is in the box grown by `PATCH`, the part
+    in observed cells is measured against the scan; the part of the scan above the ground plane is measured against all.
 
     Raises:
         ValueError: no predicted point lies in observed cells, or no distance is below `MAX_DISTANCE`.

@@ -1,0 +1,84 @@
+"""Photos that training and texture did without, against drawings of the trained field and of the final mesh.
+
+python -m benchmarks.held_out WORKSPACE ...      these, each trained with `--set train.holdout=8`
+python -m benchmarks.held_out --table-only       only rewrite the table of docs/benchmarks.md
+
+Results go to benchmarks/results/held_out/NAME.json, where NAME is the workspace's.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from benchmarks.run_sets import NOT_MEASURED, PAGE, machine, markdown_table, with_table
+from benchmarks.run_sets import RESULTS as ALL_RESULTS
+
+RESULTS = ALL_RESULTS / "held_out"
+# What is shown: drawing, region, number, its heading.
+COLUMNS = (
+    ("field", "object", "psnr", "field, object: PSNR"),
+    ("field", "object", "ssim", "SSIM"),
+    ("mesh", "object", "psnr", "mesh, object: PSNR"),
+    ("mesh", "object", "ssim", "SSIM"),
+    ("field", "whole", "psnr", "field, whole: PSNR"),
+    ("field", "whole", "ssim", "SSIM"),
+    ("mesh", "whole", "psnr", "mesh, whole: PSNR"),
+    ("mesh", "whole", "ssim", "SSIM"),
+)
+
+
+def measure(workspace: Path) -> dict[str, Any]:
+    """One workspace's scores, without what belongs to this machine's folders."""
+    from hineus_cli.evaluating_views import evaluate_views
+
+    found = evaluate_views(workspace)
+    kept = {key: found[key] for key in ("photos", "mean", "done")}
+    return {"name": workspace.resolve().name, **kept, "machine": machine()}
+
+
+def load_results() -> list[dict[str, Any]]:
+    """All results, by name."""
+    return [json.loads(path.read_text(encoding="utf-8")) for path in sorted(RESULTS.glob("*.json"))]
+
+
+def table(results: Sequence[dict[str, Any]]) -> str:
+    """A row a workspace; a dash where a region cannot be scored."""
+    rows = []
+    for result in results:
+        cells = []
+        for what, region, key, _ in COLUMNS:
+            scores = result["mean"][what][region]
+            cells.append("-" if scores is None else f"{scores[key]:.2f}" if key == "psnr" else f"{scores[key]:.3f}")
+        rows.append([result["name"], str(len(result["photos"])), *cells])
+    return markdown_table(["set", "photos", *(heading for *_, heading in COLUMNS)], rows)
+
+
+def with_held_out(page: str) -> str:
+    """The page with the table made anew."""
+    results = load_results()
+    return with_table(page, "held-out", table(results) if results else NOT_MEASURED)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("workspaces", type=Path, nargs="*", help="trained with train.holdout")
+    parser.add_argument("--table-only", action="store_true", help="measure nothing")
+    arguments = parser.parse_args()
+    if not arguments.workspaces and not arguments.table_only:
+        parser.error("name workspaces, or --table-only")
+    RESULTS.mkdir(parents=True, exist_ok=True)
+    for workspace in arguments.workspaces:
+        print(f"{workspace}: drawing", file=sys.stderr, flush=True)
+        result = measure(workspace)
+        (RESULTS / f"{result['name']}.json").write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+    PAGE.write_text(with_held_out(PAGE.read_text(encoding="utf-8")), encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
