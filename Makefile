@@ -37,6 +37,7 @@ docs: venv
 	$(BIN)/python -m benchmarks.run_sets --table-only
 	$(BIN)/python -m benchmarks.ablate --table-only
 	$(BIN)/python -m benchmarks.hard_variants --table-only
+	$(BIN)/python -m benchmarks.suites --table-only
 	$(BIN)/python -m benchmarks.held_out --table-only
 
 # Bundled in a temporary folder: nothing of npm stays in the tree.

@@ -14,8 +14,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
-import platform
 import shutil
 import subprocess
 import sys
@@ -23,6 +21,8 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
+
+from hineus_cli.machine import machine
 
 ROOT = Path(__file__).parent.parent
 RESULTS = ROOT / "benchmarks" / "results"
@@ -202,25 +202,6 @@ def contact_sheet(workspace: Path, path: Path) -> None:
             )
         )
     Image.fromarray(np.vstack(rows)).save(path)
-
-
-def machine() -> dict[str, str]:
-    """What the figures were measured on."""
-    from importlib.metadata import version
-
-    cpu = platform.processor()
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-        cpu = next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
-    except (OSError, StopIteration):
-        pass
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return {
-        "cpu": cpu,
-        "cores": str(cores),
-        "python": platform.python_version(),
-        **{name: version(name) for name in ("hineus", "torch", "pycolmap", "open3d")},
-    }
 
 
 # ---------------------------------------------------------------- result files

@@ -32,6 +32,9 @@ class IngestParams(Section):
         description="plain: photos without a mask get one from their plain background (black cloth, white sweep, "
         "chroma key); an error where it is not plain",
     )
+    leave_out: tuple[str, ...] = Field(
+        (), description="photos that no stage sees, as names or patterns (test_*.jpg) relative to the photo folder"
+    )
 
 
 class SfmParams(Section):

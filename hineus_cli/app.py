@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer.core import TyperGroup
 
+from hineus_cli.bench_app import bench
 from hineus_cli.evaluate_app import evaluate_app
 from stages.engine.stage import Stage
 from stages.errors import HineusError, InputError, SystemRequirementError
@@ -602,7 +603,7 @@ def build_app(pipeline: Sequence[Stage] = PIPELINE) -> typer.Typer:
     ) -> None:
         """Photos in, textured 3D asset out. Start with `hineus doctor`, then `hineus run PHOTOS`."""
 
-    for command in (run, check, status, view, compare, doctor, presets, demo):
+    for command in (run, check, status, view, compare, bench, doctor, presets, demo):
         app.command()(command)
     app.add_typer(evaluate_app, name="evaluate")
     app.command("config")(show_config)

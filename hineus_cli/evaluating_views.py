@@ -39,7 +39,7 @@ def evaluate_views(workspace: Path, renders: Path | None = None, device: str = "
     from stages.evaluation.images import find_lpips
     from stages.evaluation.views import judge
     from stages.meshing.view_scores import draw_view, silhouette
-    from stages.report import read_rgb
+    from stages.reporting.pictures import read_rgb
 
     folders, drawer = _trained(workspace, choose_device(device))
     held_out = artifacts.load_held_out(folders["train"])

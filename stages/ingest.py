@@ -11,9 +11,10 @@ import logging
 import math
 import shutil
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from fnmatch import fnmatchcase
 from pathlib import Path, PurePosixPath
 from typing import Any, TypeVar
 
@@ -63,6 +64,9 @@ def run(context: StageContext) -> dict[str, Any]:
         skipped += [SkippedImage(path, f"has no pose in {poses.origin.name}") for path in paths if path not in cameras]
         paths = list(cameras)
         _tell_unused(poses, {camera.name for camera in cameras.values()})
+    kept_back = [path for path in paths if _is_left_out(path, params.leave_out)]
+    skipped += [SkippedImage(path, "named in ingest.leave_out") for path in kept_back]
+    paths = [path for path in paths if path not in set(kept_back)]
 
     digests = _in_threads(lambda path: _sha256(files[path]), paths, context.workers)
     first_with: dict[str, str] = {}
@@ -145,6 +149,11 @@ def _frames_of(videos: list[str], folder: Path, context: StageContext) -> tuple[
         log.info("%s: %d frames", video, len(frames))
         found |= {f"{video}/{frame.name}": frame for frame in frames}
     return found, damaged
+
+
+def _is_left_out(path: str, patterns: Sequence[str]) -> bool:
+    """Whether a photo is one of those that no stage is to see."""
+    return any(fnmatchcase(path, pattern) for pattern in patterns)
 
 
 def _too_few(folder: Path, found: int, needed: int, skipped: list[SkippedImage]) -> InputError:

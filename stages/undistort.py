@@ -165,6 +165,23 @@ def _plan_warp(camera: Any, max_side: int) -> _Warp:
     return _Warp(intrinsics, (width, height), shrink_to)
 
 
+def pinhole_photo(
+    camera: Any, pixels: np.ndarray, mask: np.ndarray | None, max_side: int
+) -> tuple[np.ndarray, np.ndarray | None]:
+    """One photo [H, W, 3] and its mask [H, W] uint8 as images of `pinhole_camera`, the way the stage makes them."""
+    import cv2
+
+    warp = _plan_warp(camera, max_side)
+    maps = _warp_maps(camera, warp)
+    return _remap(pixels, warp, maps, cv2.INTER_CUBIC), None if mask is None else _warp_mask(mask, warp, maps, 0)
+
+
+def pinhole_camera(camera: Any, max_side: int) -> tuple[np.ndarray, tuple[int, int]]:
+    """Intrinsics [3, 3] and size of the pinhole images of a pycolmap camera."""
+    warp = _plan_warp(camera, max_side)
+    return warp.intrinsics, warp.size
+
+
 def _warp_maps(camera: Any, warp: _Warp) -> tuple[np.ndarray, np.ndarray]:
     """Positions in the (reduced) photo of each pixel of the pinhole image, x and y [height, width] float32.
 

@@ -114,6 +114,14 @@ def test_the_benchmark_tables_are_those_of_the_result_files():
     assert page == with_tables(page, load_results()), "run `make docs`"
 
 
+def test_the_tables_of_suites_are_those_of_their_result_files():
+    from benchmarks.suites import FOLDER, with_suites
+    from hineus_cli.bench import load_results
+
+    page = (DOCS / "benchmarks.md").read_text(encoding="utf-8")
+    assert page == with_suites(page, load_results(FOLDER)), "run `make docs`"
+
+
 # ---------------------------------------------------------------- all pages
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_links_between_pages_lead_somewhere(page):

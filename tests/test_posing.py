@@ -338,6 +338,73 @@ def test_a_pickle_that_would_run_something_is_refused(tmp_path: Path):
     assert not (tmp_path / "hacked").exists()
 
 
+# ---------------------------------------------------------------- MVSNet
+def write_mvsnet(folder: Path) -> Path:
+    write_images(folder / "blended_images", [f"{i:08d}{what}.jpg" for i in range(NUM) for what in ("", "_masked")])
+    (folder / "cams").mkdir()
+    (folder / "cams" / "pair.txt").write_text("4\n")
+    intrinsics = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
+    for i in range(NUM):
+        rows = ["extrinsic", *map(_row, np.vstack([cam_from_world(i), [0, 0, 0, 1]])), ""]
+        rows += ["intrinsic", *map(_row, intrinsics), "", "0.5 0.01 128 1.8"]
+        (folder / "cams" / f"{i:08d}_cam.txt").write_text("\n".join(rows))
+    return folder / "cams"
+
+
+def _row(numbers: np.ndarray) -> str:
+    return " ".join(f"{number:.12g}" for number in numbers)
+
+
+def test_mvsnet(tmp_path: Path):
+    cameras = write_mvsnet(tmp_path)
+    for place in (tmp_path, cameras, cameras / "00000001_cam.txt"):
+        assert locate_poses(place) == cameras
+    assert_reprojects(read_poses(tmp_path), pinhole, [f"{i:08d}.jpg" for i in range(NUM)])
+    image_set = ingested(tmp_path / "blended_images", tmp_path / "out", poses=cameras)
+    assert [record.name for record in image_set.images] == [f"{i:08d}.jpg" for i in range(NUM)]
+
+
+def test_a_camera_of_mvsnet_that_is_cut_off(tmp_path: Path):
+    cameras = write_mvsnet(tmp_path)
+    (cameras / "00000002_cam.txt").write_text("extrinsic\n1 0 0")
+    with pytest.raises(InputError, match=r"00000002_cam.txt cannot be read"):
+        read_poses(tmp_path)
+
+
+# ---------------------------------------------------------------- Mega-NeRF
+def write_meganerf(folder: Path) -> None:
+    import torch
+
+    write_images(folder / "rgbs", [f"{i:06d}.jpg" for i in range(NUM)])
+    (folder / "metadata").mkdir()
+    for i in range(NUM):
+        camera = {
+            "W": WIDTH,
+            "H": HEIGHT,
+            "intrinsics": torch.tensor([FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2]),
+            "c2w": torch.from_numpy(world_from_gl(i)[:3]),
+            "distortion": torch.zeros(4),
+        }
+        torch.save(camera, folder / "metadata" / f"{i:06d}.pt")
+
+
+def test_meganerf(tmp_path: Path):
+    write_meganerf(tmp_path / "train")
+    assert locate_poses(tmp_path / "train") == tmp_path / "train"
+    assert_reprojects(read_poses(tmp_path / "train"), pinhole, [f"rgbs/{i:06d}" for i in range(NUM)])
+    image_set = ingested(tmp_path / "train" / "rgbs", tmp_path / "out", poses=tmp_path / "train")
+    assert [record.name for record in image_set.images] == [f"{i:06d}.jpg" for i in range(NUM)]
+
+
+def test_metadata_of_another_shape_is_refused(tmp_path: Path):
+    import torch
+
+    write_meganerf(tmp_path)
+    torch.save({"W": 1, "H": 1, "intrinsics": torch.ones(3), "c2w": torch.eye(4)}, tmp_path / "metadata" / "000001.pt")
+    with pytest.raises(InputError, match=r"holds c2w \(4, 4\) and intrinsics \(3,\), expected \(3, 4\) and \(4,\)"):
+        read_poses(tmp_path)
+
+
 # ---------------------------------------------------------------- finding and matching
 def test_no_poses_there(tmp_path: Path):
     with pytest.raises(InputError, match="There are no poses at"):
@@ -388,9 +455,9 @@ def test_names_that_do_not_agree():
 
 
 # ---------------------------------------------------------------- ingest
-def ingested(photos: Path, out: Path, **sources: Path) -> artifacts.ImageSet:
+def ingested(photos: Path, out: Path, params: IngestParams | None = None, **sources: Path) -> artifacts.ImageSet:
     out.mkdir()
-    context = StageContext({}, {"photos": photos, **sources}, out, out, IngestParams(), workers=1)
+    context = StageContext({}, {"photos": photos, **sources}, out, out, params or IngestParams(), workers=1)
     INGEST.run(context)
     return artifacts.load_image_set(out)
 
@@ -405,6 +472,17 @@ def test_photos_without_pose_and_poses_without_photo_are_named_and_counted(
     assert [record.name for record in image_set.images] == IMAGES[:3]
     assert "left out images/extra.png: has no pose in transforms.json" in caplog.text
     assert "1 of 4 poses in transforms.json have no photo: images/003.png" in caplog.text
+
+
+def test_photos_that_are_left_out_are_no_poses_without_a_photo(tmp_path: Path, caplog: pytest.LogCaptureFixture):
+    write_images(tmp_path / "photos" / "images", [f"{name}.png" for name in NAMES])
+    file = write_transforms(tmp_path, {"fl_x": FOCAL, **SIZE}, IMAGES)
+    image_set = ingested(
+        tmp_path / "photos", tmp_path / "out", IngestParams(leave_out=("images/00[13].png",), min_images=2), poses=file
+    )
+    assert [record.name for record in image_set.images] == [IMAGES[0], IMAGES[2]]
+    assert {item.source for item in image_set.skipped} == {IMAGES[1], IMAGES[3]}
+    assert "have no photo" not in caplog.text
 
 
 def test_too_few_photos_with_a_pose(tmp_path: Path):

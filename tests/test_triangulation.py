@@ -13,7 +13,6 @@ from test_sfm import FOCAL, HEIGHT, WIDTH, ingested, look_at, render
 
 from configs.params import SfmParams
 from stages import artifacts
-from stages.artifacts import ImageRecord
 from stages.engine.stage import StageContext
 from stages.errors import InputError
 from stages.posing.known import KnownCamera
@@ -80,8 +79,7 @@ def test_plain_photos_are_a_warning_and_no_error(tmp_path: Path, caplog: pytest.
 def test_a_reduced_photo_gets_a_reduced_camera():
     params = (FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, -0.1, 0.0, 0.0, 0.0)
     known = KnownCamera("a.png", (WIDTH, HEIGHT), "OPENCV", params, POSES[0])
-    record = ImageRecord("a.png", "a.jpg", WIDTH // 2, HEIGHT // 2, None, "", 1.0, False, "")
-    camera = fitted_camera(known, record)
+    camera = fitted_camera(known, "a.jpg", (WIDTH // 2, HEIGHT // 2))
     assert (camera.width, camera.height) == (WIDTH // 2, HEIGHT // 2)
     np.testing.assert_allclose(camera.params, [FOCAL / 2, FOCAL / 2, WIDTH / 4, HEIGHT / 4, -0.1, 0, 0, 0])
 

@@ -5,17 +5,17 @@ from __future__ import annotations
 from pathlib import Path
 
 from stages.errors import InputError
-from stages.posing import colmap_model, nero, neus, transforms
+from stages.posing import colmap_model, meganerf, mvsnet, nero, neus, transforms
 from stages.posing.known import KnownPoses
 
 FORMATS = (
     "a COLMAP model, transforms.json (nerfstudio, instant-ngp, Blender), cameras_sphere.npz (NeuS, IDR), "
-    "or a folder of *-camera.pkl (NeRO)"
+    "a folder of *-camera.pkl (NeRO) or *_cam.txt (MVSNet, BlendedMVS), or one of Mega-NeRF's with metadata/*.pt"
 )
 
 
 def locate_poses(path: Path) -> Path:
-    """The file (or the folder, of COLMAP and NeRO) that holds the poses in `path`, a file or a data set's folder.
+    """The file that holds the poses in `path`, a file or a data set's folder; the folder, of formats with many files.
 
     Raises:
         InputError: there are none.
@@ -27,7 +27,7 @@ def locate_poses(path: Path) -> Path:
             return path
         if path.suffix in (".bin", ".txt") and colmap_model.find_model(path.parent) == path.parent:
             return path.parent
-        if path.name.endswith(nero.CAMERA):
+        if path.name.endswith((nero.CAMERA, mvsnet.CAMERA)):
             return path.parent
         raise InputError(f"{path} is no file of poses.", f"`--poses` takes {FORMATS}.")
     if colmap_model.find_model(path) == path:
@@ -35,8 +35,10 @@ def locate_poses(path: Path) -> Path:
     for name in (*neus.FILES, *transforms.FILES):
         if (path / name).is_file():
             return path / name
-    if nero.has_cameras(path):
+    if nero.has_cameras(path) or meganerf.has_metadata(path):
         return path
+    if (cameras := mvsnet.find_cameras(path)) is not None:
+        return cameras
     model = colmap_model.find_model(path)
     if model is None:
         raise InputError(f"No poses were found in {path}.", f"`--poses` takes {FORMATS}.")
@@ -64,4 +66,8 @@ def read_poses(path: Path) -> KnownPoses:
         return transforms.read_transforms(found)
     if found.suffix == ".npz":
         return neus.read_neus(found)
-    return colmap_model.read_colmap(found) if colmap_model.find_model(found) == found else nero.read_nero(found)
+    if colmap_model.find_model(found) == found:
+        return colmap_model.read_colmap(found)
+    if meganerf.has_metadata(found):
+        return meganerf.read_meganerf(found)
+    return mvsnet.read_mvsnet(found) if mvsnet.find_cameras(found) == found else nero.read_nero(found)

@@ -22,8 +22,8 @@ PART_FEATURES, PART_MATCHES = 0.3, 0.9
 NEIGHBOURS = 40
 
 
-def fitted_camera(known: KnownCamera, record: ImageRecord) -> Any:
-    """The pycolmap camera of a photo that may have been reduced since its pose was found.
+def fitted_camera(known: KnownCamera, photo: str, size: tuple[int, int]) -> Any:
+    """The pycolmap camera of a photo that may have been reduced since its pose was found, to `size` pixels.
 
     Raises:
         InputError: photo and pose have different proportions, or the parameters are not valid.
@@ -33,15 +33,14 @@ def fitted_camera(known: KnownCamera, record: ImageRecord) -> Any:
     camera = pycolmap.Camera(model=known.model, width=known.size[0], height=known.size[1], params=list(known.params))
     if not camera.verify_params():
         raise InputError(f"The camera of {known.name} has {len(known.params)} parameters.", "Mend the poses.")
-    scale_x, scale_y = record.width / known.size[0], record.height / known.size[1]
+    scale_x, scale_y = size[0] / known.size[0], size[1] / known.size[1]
     if abs(scale_x / scale_y - 1) > MAX_STRETCH:
         raise InputError(
-            f"{record.source} is {record.width} x {record.height} pixels upright, but its pose is for "
-            f"{known.size[0]} x {known.size[1]}.",
+            f"{photo} is {size[0]} x {size[1]} pixels upright, but its pose is for {known.size[0]} x {known.size[1]}.",
             "Give the photos that the poses were found for, not cropped and not turned.",
         )
-    if (record.width, record.height) != known.size:
-        camera.rescale(record.width, record.height)
+    if size != known.size:
+        camera.rescale(*size)
     camera.has_prior_focal_length = True
     return camera
 
@@ -96,7 +95,8 @@ def _posed_model(
         shared.setdefault(key, []).append(name)
     pycolmap.Database.open(database_path).close()  # creates it
     for names in shared.values():
-        camera = fitted_camera(*cameras[names[0]])
+        known, record = cameras[names[0]]
+        camera = fitted_camera(known, record.source, (record.width, record.height))
         options = pycolmap.ImageReaderOptions()
         options.camera_model = camera.model_name
         options.camera_params = ",".join(f"{value:.17g}" for value in camera.params)

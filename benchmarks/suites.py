@@ -1,0 +1,91 @@
+"""Tables of docs/benchmarks.md from what `hineus bench` measured.
+
+python -m benchmarks.suites OUT             take the results under OUT (that of `hineus bench --out`), then the tables
+python -m benchmarks.suites --table-only    only rewrite the tables
+
+Results go to benchmarks/results/suites/SUITE/SCENE/; each names its settings and the machine.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from benchmarks.run_sets import NOT_MEASURED, PAGE, RESULTS, markdown_table, with_table
+from hineus_cli.bench import load_results
+from hineus_cli.bench_tables import TextTable, tables_of
+from hineus_cli.suites.paper import paper_tables
+from hineus_cli.suites.registry import SUITES
+from stages import artifacts
+
+FOLDER = RESULTS / "suites"
+
+
+def take_results(out: Path) -> int:
+    """Copy the results under `out` that did not fail; returns how many."""
+    results = load_results(out)
+    for result in results:
+        name = f"seed{result['seed']}" if "seed" in result else f"peer-{result['method']}"
+        file = FOLDER / result["suite"] / result["scene"] / f"{result['preset']}-{name}.json"
+        file.parent.mkdir(parents=True, exist_ok=True)
+        artifacts.write_json(file, result)
+    return len(results)
+
+
+def suites_tables(results: Sequence[dict[str, Any]]) -> str:
+    """All tables of all suites that there are results of."""
+    parts = []
+    for name, suite in SUITES.items():
+        own = [result for result in results if result["suite"] == name]
+        parts += [_markdown(table) for table in tables_of(suite, own)] if own else []
+    return "\n\n".join(parts) or NOT_MEASURED
+
+
+def _markdown(table: TextTable) -> str:
+    note = f"\n\n{table.note}" if table.note else ""
+    return f"**{table.title}**\n\n{markdown_table(table.header, table.rows)}{note}"
+
+
+def averages_table() -> str:
+    """The paper's printed averages that are not those of the figures beside them."""
+    rows = []
+    for name, paper in paper_tables().items():
+        decimals = SUITES[name].decimals
+        rows += [
+            [
+                SUITES[name].title,
+                row.method,
+                f"{row.printed:.{decimals}f}",
+                f"{row.average:.{decimals + 1}f}",
+                "no" if row.beyond_rounding(decimals) else "yes",
+            ]
+            for row in paper.rows
+            if row.deviates(decimals)
+        ]
+    return markdown_table(["suite", "row", "printed", "of its figures", "rounding may explain it"], rows)
+
+
+def with_suites(page: str, results: Sequence[dict[str, Any]]) -> str:
+    """The page with the tables of suites and of the paper's averages made anew."""
+    return with_table(with_table(page, "suites", suites_tables(results)), "paper averages", averages_table())
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("out", type=Path, nargs="?", help="folder of results")
+    parser.add_argument("--table-only", action="store_true", help="take no results")
+    arguments = parser.parse_args()
+    if arguments.out is None and not arguments.table_only:
+        parser.error("name a folder of results, or --table-only")
+    if arguments.out is not None and take_results(arguments.out) == 0:
+        print(f"there are no results in {arguments.out}", file=sys.stderr)
+        return 1
+    PAGE.write_text(with_suites(PAGE.read_text(encoding="utf-8"), load_results(FOLDER)), encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,114 @@
+"""The command `bench`: parse, run the suite, print our rows beside the paper's."""
+
+from __future__ import annotations
+
+import json
+from contextlib import nullcontext
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from hineus_cli.bench_tables import TextTable
+
+
+def bench(
+    context: typer.Context,
+    suite: Annotated[
+        str,
+        typer.Argument(
+            help="dtu, nerf-synthetic, mipnerf360, glossy-synthetic, blendedmvs, urbanscene3d, or known.",
+            show_default=False,
+        ),
+    ],
+    data: Annotated[Path, typer.Argument(help="Folder with the suite's scenes as published.", show_default=False)],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for workspaces and results.")] = Path("bench"),
+    scenes: Annotated[
+        str | None, typer.Option(help="Names of scenes, with commas between; default: all.", show_default=False)
+    ] = None,
+    preset: Annotated[
+        str | None,
+        typer.Option(help="See `hineus presets`; default: gpu with a CUDA device, else cpu.", show_default=False),
+    ] = None,
+    sets: Annotated[
+        list[str] | None, typer.Option("--set", help="One setting: section.key=value. Repeatable.", show_default=False)
+    ] = None,
+    seeds: Annotated[int, typer.Option(min=1, help="Runs of each scene, with seeds 0, 1, ...")] = 1,
+    until: Annotated[str | None, typer.Option(help="Stop after this stage.", show_default=False)] = None,
+    hold_out: Annotated[
+        int, typer.Option(min=0, help="Keep every n-th photo back as a test, where the suite names none.")
+    ] = 0,
+    masks: Annotated[bool, typer.Option("--masks", help="Use the masks that come with the photos.")] = False,
+    truth: Annotated[
+        Path | None, typer.Option(help="Folder of the evaluation data, if it lies elsewhere.", show_default=False)
+    ] = None,
+    peer: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Another method to score: poisson, pymeshlab-poisson, ball-pivoting, colmap-dense, or "
+            "'NAME=COMMAND {photos} {model} {masks} {out}'. Repeatable.",
+            show_default=False,
+        ),
+    ] = None,
+    device: Annotated[str, typer.Option(help="auto, cpu or cuda.")] = "auto",
+    workers: Annotated[int | None, typer.Option(min=1, help="CPU threads; default: all.", show_default=False)] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout.")] = False,
+    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Say more.")] = False,
+) -> None:
+    """Run a benchmark's scenes, score them by its protocol, and print them beside the paper's figures."""
+    from dataclasses import asdict
+
+    from hineus_cli.bench import BenchRequest, run_bench
+    from hineus_cli.bench_tables import tables_of
+    from hineus_cli.console import ProgressDisplay, product, set_up_logging, stdout_kept_clean
+    from hineus_cli.peers import parse_peer
+    from hineus_cli.suites.paper import paper_tables
+    from hineus_cli.suites.registry import find_suite
+    from hineus_cli.suites.scene import Wanted
+
+    session = context.obj
+    session.json = as_json
+    set_up_logging(verbose)
+    request = BenchRequest(
+        suite=find_suite(suite),
+        data=data,
+        out=out,
+        scenes=tuple(name.strip() for name in scenes.split(",")) if scenes else (),
+        seeds=seeds,
+        wanted=Wanted(masks, hold_out, truth),
+        peers=tuple(parse_peer(text) for text in peer or ()),
+        preset=preset,
+        sets=tuple(sets or ()),
+        until=until,
+        device=device,
+        workers=workers,
+    )
+    with stdout_kept_clean() if as_json else nullcontext(), ProgressDisplay() as session.progress:
+        results = list(run_bench(request, session.pipeline, session.progress))
+    if as_json:
+        paper = paper_tables().get(suite)
+        answer = {
+            "ok": not any("error" in result for result in results),
+            "suite": suite,
+            "results": results,
+            "paper": asdict(paper) if paper else None,
+        }
+        typer.echo(json.dumps(answer))
+    else:
+        for table in tables_of(request.suite, results):
+            _print(product(), table)
+    failed = [result["error"]["exit_code"] for result in results if "error" in result]
+    if failed:
+        raise typer.Exit(failed[0])
+
+
+def _print(console: Any, text: TextTable) -> None:
+    from rich.table import Table
+
+    table = Table(title=text.title, title_justify="left", caption=text.note, caption_justify="left")
+    for i, heading in enumerate(text.header):
+        table.add_column(heading, justify="right" if i else "left", overflow="fold")
+    for row in text.rows:
+        table.add_row(*row, style="bold" if row[0].startswith("ours") else None)
+    console.print(table)

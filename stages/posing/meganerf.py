@@ -1,0 +1,63 @@
+"""Poses in the layout of Mega-NeRF, whose authors refined those of UrbanScene3D: `train/metadata/000000.pt` beside
+`train/rgbs/000000.jpg`, and the same under `val`.
+
+A camera's file is torch's: W, H, intrinsics (fx, fy, cx, cy), and c2w [3, 4], world_from_camera with OpenGL axes.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from stages.errors import InputError
+from stages.posing.known import KnownCamera, KnownPoses, nearest_rotation
+from stages.posing.transforms import OPENCV_FROM_OPENGL
+
+METADATA, IMAGES = "metadata", "rgbs"
+
+
+def has_metadata(folder: Path) -> bool:
+    return next((folder / METADATA).glob("*.pt"), None) is not None
+
+
+def read_meganerf(folder: Path) -> KnownPoses:
+    """Cameras of one part of the scene, `train` or `val`. Names have no suffix.
+
+    Raises:
+        InputError: a camera cannot be read.
+    """
+    cameras = []
+    for file in sorted((folder / METADATA).glob("*.pt")):
+        data = _load(file)
+        world_from_cam = nearest_rotation(data["c2w"][:, :3], file.stem, file) @ OPENCV_FROM_OPENGL
+        translation = -(world_from_cam.T @ data["c2w"][:, 3:])
+        cameras.append(
+            KnownCamera(
+                name=f"{IMAGES}/{file.stem}",
+                size=(int(data["W"]), int(data["H"])),
+                model="PINHOLE",
+                params=tuple(data["intrinsics"].tolist()),
+                cam_from_world=np.concatenate([world_from_cam.T, translation], 1),
+            )
+        )
+    return KnownPoses(folder, tuple(cameras))
+
+
+def _load(file: Path) -> dict[str, np.ndarray]:
+    import torch
+
+    try:
+        data = torch.load(file, map_location="cpu", weights_only=True)  # tensors and plain values only
+        found = {key: np.asarray(data[key], dtype=np.float64) for key in ("W", "H", "intrinsics", "c2w")}
+    except Exception as error:  # a damaged file raises nearly anything
+        raise InputError(
+            f"The camera {file} cannot be read ({error}).", "It needs W, H, intrinsics and c2w."
+        ) from error
+    if found["c2w"].shape != (3, 4) or found["intrinsics"].shape != (4,):
+        raise InputError(
+            f"The camera {file} holds c2w {found['c2w'].shape} and intrinsics {found['intrinsics'].shape}, "
+            "expected (3, 4) and (4,).",
+            "It is not one of Mega-NeRF's.",
+        )
+    return found
