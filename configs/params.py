@@ -129,7 +129,7 @@ class CleanupParams(Section):
         0.002, ge=0, le=1, description="pieces with fewer faces than this part of the largest piece are dropped"
     )
     min_views: int = Field(1, ge=0, description="faces seen by fewer cameras than this count as unseen")
-    keep_closed: bool = Field(False, description="keep unseen faces that close the surface (watertight where possible)")
+    keep_closed: bool = Field(False, description="a closed mesh: keep unseen faces, and close what cuts leave open")
     rings: int = Field(
         3, ge=0, description="faces within this many steps of a seen one are kept, so borders are not ragged"
     )

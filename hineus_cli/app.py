@@ -65,6 +65,9 @@ Time = Annotated[
     str | None, typer.Option(help="Training budget, like 5m or 90s: sets train.minutes.", show_default=False)
 ]
 NoGround = Annotated[bool, typer.Option("--no-ground", help="Cut off the ground or table: sets cleanup.remove_ground.")]
+Watertight = Annotated[
+    bool, typer.Option("--watertight", help="A closed mesh, as for printing: sets cleanup.keep_closed.")
+]
 Deterministic = Annotated[
     bool,
     typer.Option("--deterministic", help="The same poses every time, bit for bit, but slower: sfm.deterministic=true."),
@@ -156,6 +159,7 @@ def run(
     workers: Workers = None,
     time: Time = None,
     no_ground: NoGround = False,
+    watertight: Watertight = False,
     deterministic: Deterministic = False,
     as_json: Json = False,
     verbose: Verbose = False,
@@ -180,6 +184,7 @@ def run(
         workers=workers,
         time=time,
         no_ground=no_ground,
+        watertight=watertight,
     )
     _run(context.obj, request, as_json, verbose)
 
@@ -208,6 +213,7 @@ def stage_command(stage: Stage) -> Callable[..., None]:
         workers: Workers = None,
         time: Time = None,
         no_ground: NoGround = False,
+        watertight: Watertight = False,
         deterministic: Deterministic = False,
         as_json: Json = False,
         verbose: Verbose = False,
@@ -230,6 +236,7 @@ def stage_command(stage: Stage) -> Callable[..., None]:
             workers=workers,
             time=time,
             no_ground=no_ground,
+            watertight=watertight,
         )
         _run(context.obj, request, as_json, verbose)
 

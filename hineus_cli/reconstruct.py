@@ -42,6 +42,7 @@ class Request:
         workers: CPU threads; default all that this process may use.
         time: training budget, for example "5m".
         no_ground: cut off the ground; "not said" leaves the settings as they are.
+        watertight: a closed mesh; "not said" leaves the settings as they are.
     """
 
     photos: Path | None = None
@@ -60,6 +61,7 @@ class Request:
     workers: int | None = None
     time: str | None = None
     no_ground: bool = False
+    watertight: bool = False
 
 
 @dataclass(frozen=True)
@@ -213,6 +215,8 @@ def choose_config(request: Request, workspace: Workspace) -> tuple[str | None, C
         sets.append(f"train.minutes={minutes(request.time)}")
     if request.no_ground:
         sets.append("cleanup.remove_ground=true")
+    if request.watertight:
+        sets.append("cleanup.keep_closed=true")
     kept = request.preset is None and request.config is None and workspace.config_path.exists()
     if not kept:
         named = request.preset or default_preset()
