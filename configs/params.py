@@ -182,6 +182,13 @@ class ExportParams(Section):
     formats: tuple[Literal["glb", "usdz", "obj", "ply", "stl"], ...] = Field(
         ("glb", "usdz", "obj", "ply"), description="files to write; stl is the bare shape"
     )
+    lods: int = Field(
+        0, ge=0, le=4, description="lighter GLBs with the same textures, each with half the faces of the one before"
+    )
+    collision: Literal["off", "hulls"] = Field(
+        "off", description="a GLB of convex pieces for physics engines; needs `pip install coacd`"
+    )
+    collision_pieces: int = Field(16, ge=1, le=256, description="at most this many convex pieces")
 
 
 class ReportParams(Section):
