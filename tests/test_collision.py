@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stages.meshing.collision import convex_pieces, hull
+from stages.meshing.cleaning import MeshState, mesh_state, repair_manifold
+from stages.meshing.collision import _without_holes, convex_pieces, hull
 from stages.meshing.isosurface import extract_isosurface
 
 RADIUS = 0.15
@@ -40,6 +41,19 @@ def test_a_hull_is_turned_outwards_and_has_no_spare_corners():
     a, b, c = corners[faces].transpose(1, 0, 2)
     assert (a * np.cross(b, c)).sum() / 6 == pytest.approx(1)
     np.testing.assert_allclose(heights(np.array([[0.5, 0.5, 0.5], [2, 0.5, 0.5]]), (corners, faces)), [-0.5, 1])
+
+
+def test_holes_are_closed():
+    vertices, faces = dumbbell()
+    solid = (vertices[faces].mean(1)[:, 0] > -0.6) & (np.arange(len(faces)) != 7)  # two holes
+    open_mesh = repair_manifold(vertices, faces[solid])
+    assert mesh_state(open_mesh[1]).open_edges > 10
+    closed, filled = _without_holes(*open_mesh)
+    assert mesh_state(filled) == MeshState(0, 0, 0)
+    np.testing.assert_array_equal(filled[: solid.sum()], open_mesh[1])
+    a, b, c = closed[filled].transpose(1, 0, 2)
+    assert (a * np.cross(b, c)).sum() > 0
+    np.testing.assert_array_equal(_without_holes(vertices, faces)[1], faces)
 
 
 def test_pieces_are_convex_few_and_cover_the_shape():
