@@ -132,7 +132,7 @@ class CleanupParams(Section):
         0.002, ge=0, le=1, description="pieces with fewer faces than this part of the largest piece are dropped"
     )
     min_views: int = Field(1, ge=0, description="faces seen by fewer cameras than this count as unseen")
-    keep_closed: bool = Field(False, description="keep unseen faces that close the surface (watertight where possible)")
+    keep_closed: bool = Field(False, description="a closed mesh: keep unseen faces, and close what cuts leave open")
     rings: int = Field(
         3, ge=0, description="faces within this many steps of a seen one are kept, so borders are not ragged"
     )
@@ -185,6 +185,13 @@ class ExportParams(Section):
     formats: tuple[Literal["glb", "usdz", "obj", "ply", "stl"], ...] = Field(
         ("glb", "usdz", "obj", "ply"), description="files to write; stl is the bare shape"
     )
+    lods: int = Field(
+        0, ge=0, le=4, description="lighter GLBs with the same textures, each with half the faces of the one before"
+    )
+    collision: Literal["off", "hulls"] = Field(
+        "off", description="a GLB of convex pieces for physics engines; needs `pip install coacd`"
+    )
+    collision_pieces: int = Field(16, ge=1, le=256, description="at most this many convex pieces")
 
 
 class ReportParams(Section):

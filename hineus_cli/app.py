@@ -77,6 +77,9 @@ HoldOut = Annotated[
     ),
 ]
 NoGround = Annotated[bool, typer.Option("--no-ground", help="Cut off the ground or table: sets cleanup.remove_ground.")]
+Watertight = Annotated[
+    bool, typer.Option("--watertight", help="A closed mesh, as for printing: sets cleanup.keep_closed.")
+]
 Deterministic = Annotated[
     bool,
     typer.Option("--deterministic", help="The same poses every time, bit for bit, but slower: sfm.deterministic=true."),
@@ -169,6 +172,7 @@ def run(
     time: Time = None,
     hold_out: HoldOut = None,
     no_ground: NoGround = False,
+    watertight: Watertight = False,
     deterministic: Deterministic = False,
     as_json: Json = False,
     verbose: Verbose = False,
@@ -194,6 +198,7 @@ def run(
         time=time,
         hold_out=hold_out,
         no_ground=no_ground,
+        watertight=watertight,
     )
     _run(context.obj, request, as_json, verbose)
 
@@ -223,6 +228,7 @@ def stage_command(stage: Stage) -> Callable[..., None]:
         time: Time = None,
         hold_out: HoldOut = None,
         no_ground: NoGround = False,
+        watertight: Watertight = False,
         deterministic: Deterministic = False,
         as_json: Json = False,
         verbose: Verbose = False,
@@ -246,6 +252,7 @@ def stage_command(stage: Stage) -> Callable[..., None]:
             time=time,
             hold_out=hold_out,
             no_ground=no_ground,
+            watertight=watertight,
         )
         _run(context.obj, request, as_json, verbose)
 

@@ -35,12 +35,16 @@ REQUIRED = {
     "open3d": "open3d",
     "pymeshlab": "pymeshlab",
     "trimesh": "trimesh",
+    "manifold3d": "manifold3d",
     "xatlas": "xatlas",
     "fast_simplification": "fast-simplification",
     "jinja2": "jinja2",
     "pxr": "usd-core",
 }
-OPTIONAL = {"rawpy": ("rawpy", "camera raw files are left out")}
+OPTIONAL = {
+    "rawpy": ("rawpy", "camera raw files are left out"),
+    "coacd": ("coacd", "no convex pieces (export.collision)"),
+}
 
 # PyMeshLab imports even where the libraries of its plug-ins are missing; then its filters are not there.
 _PROBES = {

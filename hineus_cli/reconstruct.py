@@ -43,6 +43,7 @@ class Request:
         time: training budget, for example "5m".
         hold_out: percent of the photos to keep back from training and texture.
         no_ground: cut off the ground; "not said" leaves the settings as they are.
+        watertight: a closed mesh; "not said" leaves the settings as they are.
     """
 
     photos: Path | None = None
@@ -62,6 +63,7 @@ class Request:
     time: str | None = None
     hold_out: float | None = None
     no_ground: bool = False
+    watertight: bool = False
 
 
 @dataclass(frozen=True)
@@ -217,6 +219,8 @@ def choose_config(request: Request, workspace: Workspace) -> tuple[str | None, C
         sets.append(f"train.holdout={every_nth(request.hold_out)}")
     if request.no_ground:
         sets.append("cleanup.remove_ground=true")
+    if request.watertight:
+        sets.append("cleanup.keep_closed=true")
     kept = request.preset is None and request.config is None and workspace.config_path.exists()
     if not kept:
         named = request.preset or default_preset()

@@ -422,9 +422,20 @@ def occlusion_path(folder: Path) -> Path:
     return folder / OCCLUSION
 
 
-# ------------------------------------------------------------ export: model.glb, .usdz, .obj, .mtl, .ply, .stl, .png
+# ------------------------------------------------------------ export: model.glb, .usdz, .obj, .mtl, .ply, .stl, .png,
+# and as set: model_lod1.glb, ..., model_collision.glb
 def glb_path(folder: Path) -> Path:
     return folder / "model.glb"
+
+
+def lod_path(folder: Path, level: int) -> Path:
+    """The GLB of a level of detail, 1 or more; `glb_path` is level 0."""
+    return folder / f"model_lod{level}.glb"
+
+
+def collision_path(folder: Path) -> Path:
+    """The GLB of convex pieces."""
+    return folder / "model_collision.glb"
 
 
 def obj_path(folder: Path) -> Path:

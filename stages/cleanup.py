@@ -63,6 +63,8 @@ def run(context: StageContext) -> dict[str, Any]:
 
     context.progress(0, 5, "region of interest and masks")
     inside = cleaning.inside_ball(vertices, faces, params.roi_radius)
+    if params.keep_closed:
+        inside = cleaning.whole_pieces(faces, inside)
     keep(
         inside, "outside_region", "Try `--set undistort.roi_scale=1.5`, or train for longer: `--set train.steps=6000`."
     )
@@ -73,8 +75,9 @@ def run(context: StageContext) -> dict[str, Any]:
     if params.mask_hull:
         masks = _masks(context.inputs["undistort"], cameras, params.mask_margin)
         outside = cleaning.outside_hull(vertices, cameras, masks, params.mask_outside)
+        within = np.count_nonzero(outside[faces], axis=1) < 2
         keep(
-            np.count_nonzero(outside[faces], axis=1) < 2,
+            cleaning.whole_pieces(faces, within) if params.keep_closed else within,
             "outside_masks",
             "Look at the masks (white is the object), or try `--set cleanup.mask_hull=false`.",
         )
@@ -105,6 +108,8 @@ def run(context: StageContext) -> dict[str, Any]:
     state = cleaning.mesh_state(faces)
     if not state.manifold:
         logger.warning("mesh is not manifold: %d edges, %d vertices", state.bad_edges, state.bad_vertices)
+    if params.keep_closed and not state.watertight:
+        logger.warning("mesh was to be closed, but %d edges are open", state.open_edges)
     artifacts.save_mesh(context.out, vertices, faces)
     return {
         **numbers,
@@ -117,9 +122,14 @@ def run(context: StageContext) -> dict[str, Any]:
 
 
 def _crop(vertices: np.ndarray, faces: np.ndarray, scene: PosedScene, params: Any) -> tuple[np.ndarray, np.ndarray]:
-    """The mesh within the box and above the ground, where there is a box and the ground is to go."""
-    from stages.meshing import cleaning
+    """The mesh within the box and above the ground, where there is a box and the ground is to go.
 
+    A mesh that is to be closed ends in lids there, and at the border of the region of interest.
+    """
+    from stages.meshing import cleaning, solids
+
+    if params.keep_closed:
+        vertices, faces = solids.cut_to_ball(vertices, faces, params.roi_radius)
     sides = [] if scene.box is None else box_sides(scene.box, scene.world_from_scene)
     if params.remove_ground:
         if scene.ground is None:
@@ -127,14 +137,13 @@ def _crop(vertices: np.ndarray, faces: np.ndarray, scene: PosedScene, params: An
         else:
             sides.append(_cut_above_ground(vertices, faces, scene.ground, params.ground_tolerance))
     for normal, offset in sides:
-        vertices, faces = cleaning.clip(vertices, faces, normal, offset)
+        cut = solids.cut_at_plane if params.keep_closed else cleaning.clip
+        vertices, faces = cut(vertices, faces, normal, offset)
         if not len(faces):
             raise ReconstructionError(
                 "Nothing of the mesh is left inside the box and above the ground.",
                 "Look at `undistort.region` and at the report's drawing, or try `--set cleanup.remove_ground=false`.",
             )
-        if params.keep_closed:
-            vertices, faces = cleaning.close_cut(vertices, faces, normal, offset)
     if params.remove_ground and scene.ground is not None:
         vertices, faces = _without_bumps(vertices, faces, *sides[-1], BUMP_TOLERANCES * params.ground_tolerance)
     return vertices, faces
@@ -189,8 +198,7 @@ def _seen_faces(vertices: np.ndarray, faces: np.ndarray, seen: np.ndarray, param
 
     chosen = seen[faces].any(1)
     if params.keep_closed:
-        pieces = cleaning.label_pieces(len(faces), cleaning.face_adjacency(faces))
-        return np.bincount(pieces, chosen)[pieces] > 0
+        return cleaning.whole_pieces(faces, chosen)
     if not chosen.any():
         return chosen
     chosen = cleaning.spread(faces, len(vertices), chosen, params.rings)
@@ -201,7 +209,7 @@ def _seen_faces(vertices: np.ndarray, faces: np.ndarray, seen: np.ndarray, param
 
 CLEANUP = Stage(
     name="cleanup",
-    version=3,
+    version=4,
     needs=("undistort", "extract"),
     params="cleanup",
     run=run,

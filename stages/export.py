@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,69 +16,74 @@ from stages.engine.stage import Stage, StageContext
 from stages.errors import ReconstructionError, SystemRequirementError
 from stages.geometry.cameras import PosedScene
 from stages.geometry.orientation import y_up_rotation
+from stages.geometry.similarity import Similarity
 
 if TYPE_CHECKING:
     from stages.meshing.writing import Textures
 
 
-def run(context: StageContext) -> dict[str, Any]:
-    """Write each format of the settings. Returns counts, extents in world units, and bytes of each file."""
-    from stages.meshing.writing import glb_bytes, mtl_text, obj_text, ply_bytes, stl_bytes
+@dataclass(frozen=True)
+class Asset:
+    """What all files are written from.
 
+    Attributes:
+        mesh: in the scene frame.
+        world_from_scene: similarity.
+        gltf_from_world: rotation [3, 3] to Y up.
+        textures: of the one material.
+        extras: what the file says of its origin.
+        note: the same in a line of ASCII.
+        out: the folder for files.
+    """
+
+    mesh: artifacts.AtlasMesh
+    world_from_scene: Similarity
+    gltf_from_world: np.ndarray
+    textures: Textures
+    extras: dict[str, Any]
+    note: str
+    out: Path
+
+    def in_world(self, mesh: artifacts.AtlasMesh) -> tuple[np.ndarray, np.ndarray]:
+        """Vertices and unit normals [V, 3] of a mesh of the scene frame."""
+        normals = unit_normals(mesh.vertices, mesh.normals, mesh.faces) @ self.world_from_scene.rotation.T
+        return self.world_from_scene.apply(mesh.vertices.astype(np.float64)), normals
+
+    def in_gltf(self, mesh: artifacts.AtlasMesh) -> tuple[np.ndarray, np.ndarray]:
+        """The same with Y up."""
+        vertices, normals = self.in_world(mesh)
+        return vertices @ self.gltf_from_world.T, normals @ self.gltf_from_world.T
+
+
+def run(context: StageContext) -> dict[str, Any]:
+    """Write what the settings ask for. Returns counts, extents in world units, and bytes of each file."""
+    params = context.params
     scene = artifacts.load_scene(context.inputs["undistort"])
-    atlas = artifacts.load_atlas(context.inputs["atlas"])
-    textures = load_textures(context.inputs["bake"])
-    world = scene.world_from_scene
-    vertices = world.apply(atlas.vertices.astype(np.float64))
-    normals = unit_normals(atlas.vertices, atlas.normals, atlas.faces) @ world.rotation.T
+    gltf_from_world = y_up_rotation(scene.world_from_scene.rotation @ scene.up)
+    asset = Asset(
+        mesh=artifacts.load_atlas(context.inputs["atlas"]),
+        world_from_scene=scene.world_from_scene,
+        gltf_from_world=gltf_from_world,
+        textures=load_textures(context.inputs["bake"]),
+        extras=provenance(scene, gltf_from_world, run_id(context.inputs["bake"])),
+        note="" if scene.place is None else scene.place.describe().replace("±", "+-"),
+        out=context.out,
+    )
     numbers: dict[str, Any] = {
-        "vertices": len(vertices),
-        "faces": len(atlas.faces),
+        "vertices": len(asset.mesh.vertices),
+        "faces": len(asset.mesh.faces),
         "units": "arbitrary units" if scene.place is None else scene.place.units,
-        "extent": [round(float(side), 6) for side in np.ptp(vertices, axis=0)],
     }
-    note = "" if scene.place is None else scene.place.describe().replace("±", "+-")
-    sizes: dict[str, int] = {}
+    writers = {"glb": _write_glb, "usdz": _write_usdz, "obj": _write_obj, "ply": _write_ply, "stl": _write_stl}
     try:
-        gltf_from_world = y_up_rotation(world.rotation @ scene.up)
-        extras = provenance(scene, gltf_from_world, run_id(context.inputs["bake"]))
-        if "glb" in context.params.formats:
-            data = glb_bytes(
-                vertices @ gltf_from_world.T,
-                normals @ gltf_from_world.T,
-                atlas.uvs,
-                atlas.faces,
-                textures,
-                generator=generator(),
-                extras=extras,
-            )
-            artifacts.glb_path(context.out).write_bytes(data)
-            sizes["glb"] = len(data)
-        if "usdz" in context.params.formats:
-            data = _usdz(vertices @ gltf_from_world.T, normals @ gltf_from_world.T, atlas, textures, extras)
-            artifacts.usdz_path(context.out).write_bytes(data)
-            sizes["usdz"] = len(data)
-        if "obj" in context.params.formats:
-            texture_path, mtl = artifacts.obj_texture_path(context.out), artifacts.mtl_path(context.out)
-            texture_path.write_bytes(textures.base_color)
-            normal_map_name = None
-            if textures.normal is not None:
-                normal_map_path = artifacts.obj_normal_map_path(context.out)
-                normal_map_path.write_bytes(textures.normal)
-                normal_map_name = normal_map_path.name
-            mtl.write_text(mtl_text(texture_path.name, normal_map_name), encoding="utf-8")
-            text = obj_text(vertices, normals, atlas.uvs, atlas.faces, mtl.name, note)
-            artifacts.obj_path(context.out).write_text(text, encoding="utf-8")
-            sizes["obj"] = len(text)
-        if "ply" in context.params.formats:
-            colors = vertex_colors(textures.base_color, atlas.uvs)
-            data = ply_bytes(vertices, normals, colors, atlas.faces, note)
-            artifacts.ply_path(context.out).write_bytes(data)
-            sizes["ply"] = len(data)
-        if "stl" in context.params.formats:
-            data = stl_bytes(vertices, atlas.faces, note)
-            artifacts.stl_path(context.out).write_bytes(data)
-            sizes["stl"] = len(data)
+        vertices, _ = asset.in_world(asset.mesh)
+        numbers["extent"] = [round(float(side), 6) for side in np.ptp(vertices, axis=0)]
+        sizes = {name: write(asset) for name, write in writers.items() if name in params.formats}
+        for level, (faces, size) in enumerate(_write_levels(asset, params.lods), 1):
+            numbers.setdefault("lod_faces", []).append(faces)
+            sizes[f"lod{level}"] = size
+        if params.collision == "hulls":
+            numbers["collision_pieces"], sizes["collision"] = _write_collision(asset, params.collision_pieces)
     except ValueError as error:
         raise ReconstructionError(
             f"The mesh cannot be exported: {error}.", "Rebuild it: `hineus run PHOTOS --from cleanup`."
@@ -84,23 +91,92 @@ def run(context: StageContext) -> dict[str, Any]:
     return {**numbers, "bytes": sizes}
 
 
-def _usdz(
-    vertices: np.ndarray,
-    normals: np.ndarray,
-    atlas: artifacts.AtlasMesh,
-    textures: Textures,
-    extras: dict[str, Any],
-) -> bytes:
-    """The USDZ package; lengths without a known unit are taken for metres, as glTF does with all."""
-    from stages.meshing.usd import usdz_bytes
+def _write_glb(asset: Asset) -> int:
+    return artifacts.glb_path(asset.out).write_bytes(_textured_glb(asset, asset.mesh, asset.extras))
+
+
+def _textured_glb(asset: Asset, mesh: artifacts.AtlasMesh, extras: dict[str, Any]) -> bytes:
+    from stages.meshing.writing import glb_bytes
+
+    vertices, normals = asset.in_gltf(mesh)
+    return glb_bytes(vertices, normals, mesh.uvs, mesh.faces, asset.textures, generator=generator(), extras=extras)
+
+
+def _write_levels(asset: Asset, count: int) -> Iterator[tuple[int, int]]:
+    """Faces and bytes of each level of detail."""
+    from stages.meshing.levels import levels_of_detail
+
+    for level, light in enumerate(levels_of_detail(asset.mesh, count) if count else (), 1):
+        data = _textured_glb(asset, light, {**asset.extras, "level_of_detail": level})
+        yield len(light.faces), artifacts.lod_path(asset.out, level).write_bytes(data)
+
+
+def _write_collision(asset: Asset, count: int) -> tuple[int, int]:
+    """Pieces and bytes of the collision shapes."""
+    from stages.meshing.collision import convex_pieces
+    from stages.meshing.writing import shapes_glb_bytes
 
     try:
-        return usdz_bytes(vertices, normals, atlas.uvs, atlas.faces, textures, meters_per_unit=1.0, extras=extras)
+        pieces = convex_pieces(asset.mesh.vertices, asset.mesh.faces, count)
+    except ImportError as error:
+        raise SystemRequirementError(
+            f"Convex pieces are found by coacd, which cannot be imported: {error}.",
+            "Try `pip install coacd`, or `--set export.collision=off`.",
+        ) from error
+    shapes = {
+        # the name by which Unreal knows a convex collision shape of the mesh "model"
+        f"UCX_model_{k:02d}": (asset.world_from_scene.apply(corners) @ asset.gltf_from_world.T, faces)
+        for k, (corners, faces) in enumerate(pieces)
+    }
+    data = shapes_glb_bytes(shapes, generator(), asset.extras)
+    return len(pieces), artifacts.collision_path(asset.out).write_bytes(data)
+
+
+def _write_usdz(asset: Asset) -> int:
+    """Lengths without a known unit are taken for metres, as glTF does with all."""
+    from stages.meshing.usd import usdz_bytes
+
+    vertices, normals = asset.in_gltf(asset.mesh)
+    uvs, faces = asset.mesh.uvs, asset.mesh.faces
+    try:
+        data = usdz_bytes(vertices, normals, uvs, faces, asset.textures, meters_per_unit=1.0, extras=asset.extras)
     except ImportError as error:
         raise SystemRequirementError(
             f"USDZ files are written with usd-core, which cannot be imported: {error}.",
             "Try `pip install usd-core`, or take usdz out of `export.formats`.",
         ) from error
+    return artifacts.usdz_path(asset.out).write_bytes(data)
+
+
+def _write_obj(asset: Asset) -> int:
+    """The OBJ, its material and its images. Returns the bytes of the OBJ."""
+    from stages.meshing.writing import mtl_text, obj_text
+
+    texture_path, mtl = artifacts.obj_texture_path(asset.out), artifacts.mtl_path(asset.out)
+    texture_path.write_bytes(asset.textures.base_color)
+    normal_map_name = None
+    if asset.textures.normal is not None:
+        normal_map_path = artifacts.obj_normal_map_path(asset.out)
+        normal_map_path.write_bytes(asset.textures.normal)
+        normal_map_name = normal_map_path.name
+    mtl.write_text(mtl_text(texture_path.name, normal_map_name), encoding="utf-8")
+    text = obj_text(*asset.in_world(asset.mesh), asset.mesh.uvs, asset.mesh.faces, mtl.name, asset.note)
+    return artifacts.obj_path(asset.out).write_text(text, encoding="utf-8")
+
+
+def _write_ply(asset: Asset) -> int:
+    from stages.meshing.writing import ply_bytes
+
+    colors = vertex_colors(asset.textures.base_color, asset.mesh.uvs)
+    data = ply_bytes(*asset.in_world(asset.mesh), colors, asset.mesh.faces, asset.note)
+    return artifacts.ply_path(asset.out).write_bytes(data)
+
+
+def _write_stl(asset: Asset) -> int:
+    from stages.meshing.writing import stl_bytes
+
+    vertices, _ = asset.in_world(asset.mesh)
+    return artifacts.stl_path(asset.out).write_bytes(stl_bytes(vertices, asset.mesh.faces, asset.note))
 
 
 def load_textures(baked: Path) -> Textures:
@@ -177,7 +253,7 @@ def provenance(scene: PosedScene, gltf_from_world: np.ndarray, run: str | None) 
 
 EXPORT = Stage(
     name="export",
-    version=4,
+    version=5,
     needs=("undistort", "atlas", "bake"),
     params="export",
     run=run,

@@ -1,4 +1,4 @@
-"""Neural field to mesh: marching cubes at the resolution the photos support."""
+"""Neural field to a closed mesh: marching cubes at the resolution the photos support."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ def supported_resolution(cameras: PinholeCameras) -> int:
 
 
 def run(context: StageContext) -> dict[str, Any]:
-    from stages.meshing.isosurface import extract_isosurface
+    from stages.meshing.solids import extract_solid
     from stages.neural.field import load_field
 
     scene = artifacts.load_scene(context.inputs["undistort"])
     field = load_field(artifacts.field_path(context.inputs["train"]), context.device)
     supported = max(supported_resolution(scene.cameras), MIN_RESOLUTION)
     resolution = min(context.params.resolution, supported)
-    surface = extract_isosurface(
+    surface = extract_solid(
         field.sdf,
         resolution,
         block=context.params.block,
@@ -56,7 +56,7 @@ def run(context: StageContext) -> dict[str, Any]:
 
 EXTRACT = Stage(
     name="extract",
-    version=1,
+    version=2,
     needs=("undistort", "train"),
     params="extract",
     run=run,

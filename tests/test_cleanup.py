@@ -18,6 +18,7 @@ from stages.geometry.similarity import Similarity
 from stages.meshing import cleaning
 from stages.meshing.isosurface import extract_isosurface
 from stages.meshing.simplify import decimate
+from stages.meshing.solids import extract_solid
 
 SIZE = 160
 
@@ -187,6 +188,17 @@ def test_repair_drops_duplicates_slivers_and_fins_and_leaves_the_rest_alone():
     np.testing.assert_array_equal(repaired, vertices)
 
 
+def test_repair_drops_faces_back_to_back():
+    """Alone, one of them would be a hole."""
+    vertices, faces = ball()
+    pillow = np.array([[5, 90, 200], [90, 5, 200]])  # shares vertices with the ball, but no edges
+    repaired, new_faces = cleaning.repair_manifold(vertices, np.concatenate([faces, pillow]))
+    np.testing.assert_array_equal(new_faces, faces)
+    np.testing.assert_array_equal(repaired, vertices)
+    thrice = np.concatenate([faces, faces[:1], faces[:1, ::-1]])  # once there and back: the first one stays
+    np.testing.assert_array_equal(cleaning.repair_manifold(vertices, thrice)[1], faces)
+
+
 def test_decimation_keeps_shape_and_closedness():
     vertices, faces = ball(resolution=64)
     light, kept = decimate(vertices, faces, 1000)
@@ -209,6 +221,16 @@ def test_decimation_falls_back_where_the_fast_one_breaks_the_mesh(monkeypatch):
     assert len(kept) <= 400
     assert cleaning.mesh_state(kept).manifold
     assert cleaning.mesh_state(kept).watertight
+
+
+def test_decimation_of_a_closed_mesh_leaves_no_hole(monkeypatch):
+    import fast_simplification
+
+    vertices, faces = ball(resolution=24)
+    monkeypatch.setattr(fast_simplification, "simplify", lambda *a, **k: (vertices, faces[1:]))
+    _, kept = decimate(vertices, faces, 400)
+    assert len(kept) <= 400
+    assert cleaning.mesh_state(kept) == cleaning.MeshState(0, 0, 0)
 
 
 def test_decimation_refuses_an_impossible_target():
@@ -323,22 +345,10 @@ def test_clipping_a_ball_cuts_at_the_plane_and_keeps_the_rest():
     np.testing.assert_array_equal(cleaning.clip(vertices, faces, normal, -0.6)[1], faces)
 
 
-def test_a_cut_is_closed_and_other_holes_are_not():
-    vertices, faces = ball(0.5, resolution=48)
-    top = vertices[faces].mean(1)[:, 2].argmax()
-    vertices, faces = cleaning.clip(vertices, np.delete(faces, top, axis=0), np.array([0.0, 0.0, 1.0]), -0.1)
-    closed, filled = cleaning.close_cut(vertices, faces, np.array([0.0, 0.0, 1.0]), -0.1)
-    assert cleaning.mesh_state(filled) == cleaning.MeshState(3, 0, 0)
-    lid = closed[filled][(np.abs(closed[filled][:, :, 2] + 0.1) < 1e-5).all(1)]
-    normals = np.cross(lid[:, 1] - lid[:, 0], lid[:, 2] - lid[:, 0])
-    assert normals[:, 2].max() <= 1e-9  # faces down
-    assert np.abs(normals[:, 2]).sum() / 2 == pytest.approx(np.pi * (0.25 - 0.01), rel=0.01)
-
-
 def table_with_ball(tilt=0.02):
     """A ball of radius 0.4 that stands on a slab whose upper side is z = tilt x - 0.35."""
     sides = lambda p: np.abs(p[:, 2] - tilt * p[:, 0] + 0.4) - 0.05  # noqa: E731
-    surface = extract_isosurface(lambda p: np.minimum(np.linalg.norm(p, axis=1) - 0.4, sides(p)), 64)
+    surface = extract_solid(lambda p: np.minimum(np.linalg.norm(p, axis=1) - 0.4, sides(p)), 64)
     return surface.vertices, surface.faces
 
 
@@ -355,6 +365,43 @@ def test_stage_removes_the_ground_on_request(stage, keep_closed):
     assert heights.min() == pytest.approx(0.015, abs=0.005)
     assert vertices[:, 2].max() > 0.38
     assert numbers["watertight"] == keep_closed
+
+
+@pytest.mark.parametrize(
+    ("cut", "params"),
+    [
+        ({}, {}),
+        ({"ground": Plane(np.array([0.0, 0, 1]), -0.35, 0.01, 0.5)}, {"remove_ground": True}),
+        ({"box": np.array([[-0.6, -0.2, -0.38], [0.3, 0.7, 0.2]])}, {}),
+        ({}, {"mask_hull": True}),
+    ],
+    ids=["ball", "ground", "box", "masks"],
+)
+def test_stage_makes_a_solid_of_what_leaves_the_region(stage, cut, params):
+    masks = silhouettes if params.pop("mask_hull", False) else None
+    numbers, vertices, faces = stage(
+        *table_with_ball(), masks, scene_extras=cut, keep_closed=True, target_faces=2000, **params
+    )
+    assert (numbers["open_edges"], numbers["watertight"], numbers["manifold"]) == (0, True, True)
+    assert numbers["faces"] <= 2000
+    a, b, c = vertices.astype(float)[faces].transpose(1, 0, 2)
+    assert (a * np.cross(b, c)).sum() > 0
+    assert np.linalg.norm(vertices, axis=1).max() < 0.99
+
+
+def test_stage_drops_what_closes_the_surface_beyond_the_region(stage):
+    surface = extract_solid(lambda p: p[:, 2] + 0.1, 32)  # below ground all is solid
+    _, vertices, _ = stage(surface.vertices, surface.faces, roi_radius=1.0)
+    np.testing.assert_allclose(vertices[:, 2], -0.1, atol=1e-4)
+    assert np.linalg.norm(vertices, axis=1).max() > 0.95
+
+
+def test_stage_says_when_a_solid_was_wanted_and_is_none(stage, monkeypatch, caplog):
+    decimated = "stages.meshing.simplify.decimate"
+    monkeypatch.setattr(decimated, lambda vertices, faces, target: (vertices, faces[1:]))
+    numbers, _, _ = stage(*ball(), keep_closed=True)
+    assert numbers["open_edges"] > 0
+    assert "was to be closed" in caplog.text
 
 
 def test_stage_keeps_the_ground_where_none_was_found_and_says_so(stage, caplog):

@@ -174,6 +174,11 @@ def test_no_ground_sets_the_cut_and_is_remembered(folder: Path) -> None:
     assert "remove_ground: false" in config.read_text()
 
 
+def test_watertight_sets_the_closed_mesh(folder: Path) -> None:
+    hineus("run", "photos", "--watertight")
+    assert "keep_closed: true" in (folder / "photos_hineus" / "config.yaml").read_text()
+
+
 @pytest.mark.parametrize(
     ("text", "expected"), [("5m", 5), ("90s", 1.5), ("1h30m", 90), ("5", 5), ("0.5h", 30), ("2min", 2)]
 )

@@ -25,7 +25,7 @@ from stages.geometry.cameras import PinholeCameras, PosedScene
 from stages.geometry.orientation import y_up_rotation
 from stages.geometry.place import Place
 from stages.geometry.similarity import Similarity
-from stages.meshing.writing import Textures, glb_bytes, obj_text, ply_bytes
+from stages.meshing.writing import Textures, glb_bytes, obj_text, ply_bytes, shapes_glb_bytes
 
 ROOT = Path(__file__).parents[1]
 # No rotation maps this tetrahedron with its four colours to its mirror image.
@@ -190,6 +190,64 @@ def test_glb_read_by_open3d(exported):
     assert len(mesh.triangles) == 4
     assert mesh.has_triangle_uvs()
     np.testing.assert_allclose(np.asarray(mesh.vertices).min(0), to_gltf(CORNERS).min(0), atol=1e-4)
+
+
+def test_ply_read_by_open3d_is_coloured(exported):
+    import open3d as o3d
+
+    mesh = o3d.io.read_triangle_mesh(str(exported[0] / "model.ply"))
+    assert (len(mesh.vertices), len(mesh.triangles)) == (4, 4)
+    assert mesh.has_vertex_normals()
+    near = [int(np.argmin(np.linalg.norm(np.asarray(mesh.vertices) - p, axis=1))) for p in WORLD.apply(CORNERS)]
+    for k, vertex in enumerate(near):
+        expected = COLORS[(k == FACES).any(1)].mean(0)
+        np.testing.assert_allclose(np.asarray(mesh.vertex_colors)[vertex] * 255, expected, atol=1.1)
+
+
+def test_levels_of_detail_have_the_same_textures_and_place(tmp_path):
+    import trimesh
+
+    context = workspace(tmp_path, ExportParams(formats=("glb",), lods=2))
+    numbers = EXPORT.run(context)
+    assert numbers["lod_faces"] == [4, 4]  # a tetrahedron cannot lose any
+    assert sorted(p.name for p in context.out.iterdir()) == ["model.glb", "model_lod1.glb", "model_lod2.glb"]
+    for level in (1, 2):
+        path = artifacts.lod_path(context.out, level)
+        mesh = trimesh.load(path, force="mesh", process=False)
+        texture = np.asarray(mesh.visual.material.baseColorTexture.convert("RGB"))
+        centers = np.asarray(mesh.visual.uv)[mesh.faces].mean(1)
+        expect_marks(np.asarray(mesh.vertices), np.asarray(mesh.faces), color_of(texture, centers), to_gltf)
+        assert mesh.visual.material.normalTexture is not None
+        assert numbers["bytes"][f"lod{level}"] == path.stat().st_size
+
+
+def test_collision_pieces_read_by_trimesh_and_open3d(tmp_path):
+    import open3d as o3d
+    import trimesh
+
+    pytest.importorskip("coacd")
+    context = workspace(tmp_path, ExportParams(formats=("glb",), collision="hulls"))
+    numbers = EXPORT.run(context)
+    assert numbers["collision_pieces"] == 1  # a tetrahedron is convex
+    scene = trimesh.load(artifacts.collision_path(context.out))
+    assert list(scene.geometry) == ["UCX_model_00"]
+    piece = scene.to_mesh()
+    assert piece.is_watertight
+    assert piece.is_convex
+    expected = trimesh.load(context.out / "model.glb", force="mesh")
+    assert piece.volume == pytest.approx(expected.volume, rel=1e-3)
+    np.testing.assert_allclose(piece.bounds, expected.bounds, atol=1e-3)
+    other = o3d.io.read_triangle_mesh(str(artifacts.collision_path(context.out)))
+    assert len(other.triangles) == len(piece.faces)
+
+
+def test_without_coacd_the_command_to_get_it_is_named(tmp_path, monkeypatch):
+    import sys
+
+    monkeypatch.setitem(sys.modules, "coacd", None)
+    with pytest.raises(SystemRequirementError) as caught:
+        EXPORT.run(workspace(tmp_path, ExportParams(formats=(), collision="hulls")))
+    assert "pip install coacd" in caught.value.hint
 
 
 def test_the_glb_says_its_units_and_where_on_earth_it_is(tmp_path):
@@ -378,12 +436,17 @@ def test_glb_names_the_run_it_comes_from(tmp_path):
     assert extras_of(context)["run"] == "c0ffee"
 
 
-def test_gltf_validator_finds_nothing(exported):
+def test_gltf_validator_finds_nothing(tmp_path):
     folder = os.environ.get("GLTF_VALIDATOR_DIR", str(ROOT))
     if not shutil.which("node") or not (Path(folder) / "node_modules" / "gltf-validator").is_dir():
         pytest.skip("needs node and `npm install gltf-validator`")
+    context = workspace(tmp_path, ExportParams(formats=("glb",), lods=1))
+    EXPORT.run(context)
+    corners = {"UCX_model_00": (CORNERS, FACES), "UCX_model_01": (CORNERS + 1, FACES)}
+    artifacts.collision_path(context.out).write_bytes(shapes_glb_bytes(corners, extras={"photos": 1}))
+    files = [artifacts.glb_path(context.out), artifacts.lod_path(context.out, 1), artifacts.collision_path(context.out)]
     done = subprocess.run(
-        ["node", str(ROOT / "benchmarks" / "validate_glb.mjs"), str(exported[0] / "model.glb")],
+        ["node", str(ROOT / "benchmarks" / "validate_glb.mjs"), *map(str, files)],
         capture_output=True,
         text=True,
         check=False,
@@ -391,9 +454,10 @@ def test_gltf_validator_finds_nothing(exported):
         env={**os.environ, "GLTF_VALIDATOR_DIR": folder},
     )
     assert done.returncode == 0, done.stdout + done.stderr
-    report = json.loads(done.stdout)
-    assert (report["numErrors"], report["numWarnings"], report["numInfos"]) == (0, 0, 0), report["messages"]
-    assert report["info"]["totalTriangleCount"] == 4
+    reports = [json.loads(line) for line in done.stdout.splitlines()]
+    for report in reports:
+        assert (report["numErrors"], report["numWarnings"], report["numInfos"]) == (0, 0, 0), report["messages"]
+    assert [report["info"]["totalTriangleCount"] for report in reports] == [4, 4, 8]
 
 
 @given(st.lists(st.floats(-1, 1), min_size=3, max_size=3).filter(lambda v: np.linalg.norm(v) > 1e-2))

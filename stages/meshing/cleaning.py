@@ -153,14 +153,18 @@ def _fans(faces: np.ndarray, use: EdgeUse) -> np.ndarray:
 def repair_manifold(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """A 2-manifold from a mesh that nearly is one.
 
-    Drops degenerate and duplicate faces; at edges of more than two faces, those with the most open edges, then the
-    smallest, until two are left; where two faces at an edge are turned against each other, or several fans meet in
-    one vertex, gives each fan its own copy of the vertex. Unused vertices go.
+    Drops degenerate and duplicate faces, and both of two that lie back to back; at edges of more than two faces, those
+    with the most open edges, then the smallest, until two are left; where two faces at an edge are turned against each
+    other, or several fans meet in one vertex, gives each fan its own copy of the vertex. Unused vertices go.
     """
     a, b, c = faces.T
     faces = faces[(a != b) & (b != c) & (c != a)]
-    _, first = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
-    faces = faces[np.sort(first)]
+    # +1 or -1, which way around the corners go. Faces back to back close nothing: one of two alone would leave a hole.
+    turn = np.where((np.diff(faces, axis=1, append=faces[:, :1]) > 0).sum(1) == 2, 1, -1)
+    _, same = np.unique(np.sort(faces, axis=1), axis=0, return_inverse=True)
+    same = same.reshape(-1)
+    faces, same = (rows[turn * np.bincount(same, turn)[same] > 0] for rows in (faces, same))
+    faces = faces[np.sort(np.unique(same, return_index=True)[1])]
     while True:
         use = edge_use(faces)
         crowded = use.counts[use.edge] > 2
@@ -193,6 +197,12 @@ def large_pieces(faces: np.ndarray, min_part: float) -> tuple[np.ndarray, int]:
     return keep[labels], int(np.count_nonzero(~keep))
 
 
+def whole_pieces(faces: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+    """Faces [F] bool of the pieces of which any face is chosen [F]: a closed mesh stays closed."""
+    pieces = label_pieces(len(faces), face_adjacency(faces))
+    return np.bincount(pieces, chosen)[pieces] > 0
+
+
 def inside_ball(vertices: np.ndarray, faces: np.ndarray, radius: float) -> np.ndarray:
     """Faces [F] bool with all corners within `radius` of the origin."""
     return (np.linalg.norm(vertices, axis=1) <= radius)[faces].all(1)
@@ -219,27 +229,6 @@ def clip(vertices: np.ndarray, faces: np.ndarray, normal: np.ndarray, offset: fl
     tips = inside[a]
     new = [np.stack([a, ab, ac], 1)[tips], np.stack([ab, b, c], 1)[~tips], np.stack([ab, c, ac], 1)[~tips]]
     return compact(np.concatenate([vertices, cut.astype(vertices.dtype)]), np.concatenate([whole, *new]))
-
-
-def close_cut(
-    vertices: np.ndarray, faces: np.ndarray, normal: np.ndarray, offset: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """The mesh with the holes that `clip` left at this plane closed, each by itself. All else is as it was."""
-    import pymeshlab
-
-    on_plane = np.abs(vertices @ normal - offset) < 1e-5
-    if not on_plane.any():
-        return vertices, faces
-    meshes = pymeshlab.MeshSet()
-    meshes.add_mesh(
-        pymeshlab.Mesh(
-            vertices.astype(np.float64), faces, f_scalar_array=(on_plane[faces].sum(1) >= 2).astype(np.float64)
-        )
-    )
-    meshes.compute_selection_by_condition_per_face(condselect="fq > 0.5")
-    meshes.meshing_close_holes(maxholesize=len(faces), selected=True, selfintersection=False)
-    closed = meshes.current_mesh()
-    return closed.vertex_matrix().astype(vertices.dtype), closed.face_matrix().astype(faces.dtype)
 
 
 def raycaster(vertices: np.ndarray, faces: np.ndarray) -> Any:

@@ -15,7 +15,8 @@ def decimate(vertices: np.ndarray, faces: np.ndarray, target_faces: int) -> tupl
     """A mesh of about `target_faces` faces; the same one where it has no more.
 
     fast-simplification first: many times faster than the others, but it does not promise a manifold. Where it leaves
-    edges of more than two faces, it goes half the way and pymeshlab's topology-preserving collapse does the rest.
+    edges of more than two faces, or a hole once these are mended, it goes half the way and pymeshlab's
+    topology-preserving collapse does the rest; and all of it, where half the way is too far.
 
     Args:
         vertices: [V, 3].
@@ -23,23 +24,27 @@ def decimate(vertices: np.ndarray, faces: np.ndarray, target_faces: int) -> tupl
         target_faces: >= 4.
 
     Returns:
-        Vertices float32 and faces int32, a 2-manifold.
+        Vertices float32 and faces int32, a 2-manifold; closed, if the mesh was.
 
     Raises:
         ValueError: `target_faces` out of bounds.
     """
     if target_faces < 4:
         raise ValueError(f"expected target_faces >= 4, got {target_faces}")
-    light = (vertices, faces)
-    if len(faces) > target_faces:
+    if len(faces) <= target_faces:
+        light = repair_manifold(vertices, faces)
+    else:
+        closed = mesh_state(faces).open_edges == 0
         for aggressiveness in AGGRESSIVENESS:
-            light = _fast(vertices, faces, target_faces, aggressiveness)
-            if mesh_state(light[1]).bad_edges == 0:
+            rough = _fast(vertices, faces, target_faces, aggressiveness)
+            light = repair_manifold(*rough)
+            if mesh_state(rough[1]).bad_edges == 0 and not (closed and mesh_state(light[1]).open_edges):
                 break
         else:
             halfway = repair_manifold(*_fast(vertices, faces, 2 * target_faces, AGGRESSIVENESS[0]))
-            light = _careful(*halfway, target_faces)
-    light = repair_manifold(*light)
+            if closed and mesh_state(halfway[1]).open_edges:
+                halfway = (vertices, faces)
+            light = repair_manifold(*_careful(*halfway, target_faces))
     return light[0].astype(np.float32), light[1]
 
 

@@ -105,15 +105,52 @@ def glb_bytes(
         "bufferViews": buffer.views,
         "buffers": [{"byteLength": len(buffer.data)}],
     }
+    return _chunks(tree, buffer.data)
+
+
+def shapes_glb_bytes(
+    shapes: dict[str, tuple[np.ndarray, np.ndarray]],
+    generator: str = "hineus",
+    extras: dict[str, Any] | None = None,
+) -> bytes:
+    """A binary glTF 2.0 file of bare shapes: a node and a mesh for each name, without normals and material.
+
+    Args:
+        shapes: name -> vertices [V, 3] in a right-handed, Y-up frame, and faces [F, 3], counter-clockwise from outside.
+        extras: JSON-able, kept in the asset's extras.
+    """
+    buffer = _GlbBuffer()
+    meshes = []
+    for name, (vertices, faces) in shapes.items():
+        points = np.ascontiguousarray(vertices, dtype=np.float32)
+        bounds = {"min": points.min(0).tolist(), "max": points.max(0).tolist()}
+        position = buffer.add_numbers(points, "VEC3", **bounds)
+        indices = buffer.add_numbers(faces.ravel().astype(np.uint32), "SCALAR", _ELEMENT_ARRAY_BUFFER)
+        meshes.append({"name": name, "primitives": [{"attributes": {"POSITION": position}, "indices": indices}]})
+    tree = {
+        "asset": {"version": "2.0", "generator": generator, **({"extras": extras} if extras else {})},
+        "scene": 0,
+        "scenes": [{"nodes": list(range(len(meshes)))}],
+        "nodes": [{"mesh": k, "name": name} for k, name in enumerate(shapes)],
+        "meshes": meshes,
+        "accessors": buffer.accessors,
+        "bufferViews": buffer.views,
+        "buffers": [{"byteLength": len(buffer.data)}],
+    }
+    return _chunks(tree, buffer.data)
+
+
+def _chunks(tree: dict[str, Any], data: bytearray) -> bytes:
+    """The file of a JSON and a binary chunk, each of a multiple of four bytes."""
     text = json.dumps(tree, separators=(",", ":"), allow_nan=False).encode()
     text += b" " * (-len(text) % 4)
     return b"".join(
         [
-            struct.pack("<4sII", b"glTF", 2, 12 + 8 + len(text) + 8 + len(buffer.data)),
+            struct.pack("<4sII", b"glTF", 2, 12 + 8 + len(text) + 8 + len(data)),
             struct.pack("<I4s", len(text), b"JSON"),
             text,
-            struct.pack("<I4s", len(buffer.data), b"BIN\0"),
-            buffer.data,
+            struct.pack("<I4s", len(data), b"BIN\0"),
+            data,
         ]
     )
 

@@ -1,0 +1,54 @@
+"""The Blender benchmark: what it calls missing, and a real import where Blender is there."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks import blender_import
+from stages.meshing.writing import Textures, glb_bytes, shapes_glb_bytes
+
+CORNERS = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
+
+
+@pytest.fixture
+def model(tmp_path: Path) -> Path:
+    import cv2
+
+    png = cv2.imencode(".png", np.full((4, 4, 3), 128, np.uint8))[1].tobytes()
+    normals = np.tile([0.0, 0.0, 1.0], (4, 1))
+    path = tmp_path / "model.glb"
+    path.write_bytes(glb_bytes(CORNERS, normals, CORNERS[:, :2], FACES, Textures(png, png, png)))
+    return path
+
+
+FULL = {"meshes": 1, "triangles": 4, "uv_layers": 1, "images": {"Base Color": "", "Normal": "", "Occlusion": ""}}
+
+
+def test_what_the_file_has_and_blender_does_not_is_missing(model: Path, tmp_path: Path) -> None:
+    assert blender_import.missing(model, FULL) == []
+    assert blender_import.missing(model, {**FULL, "images": {"Base Color": ""}}) == ["Normal", "Occlusion"]
+    assert blender_import.missing(model, {**FULL, "triangles": 0, "uv_layers": 0}) == ["mesh", "UVs"]
+    bare = tmp_path / "bare.glb"
+    bare.write_bytes(shapes_glb_bytes({"shape": (CORNERS, FACES)}))
+    assert blender_import.missing(bare, {**FULL, "uv_layers": 0, "images": {}}) == []
+
+
+def test_without_blender_it_says_how_to_get_it(model: Path, monkeypatch, capsys) -> None:
+    monkeypatch.setenv("PATH", str(model.parent))
+    assert blender_import.main([str(model)]) == 2
+    assert "apt-get install blender" in capsys.readouterr().err
+
+
+def test_blender_takes_mesh_and_textures(model: Path) -> None:
+    blender = shutil.which("blender")
+    if blender is None:
+        pytest.skip("needs Blender")
+    found = blender_import.import_model(blender, model, None)
+    assert blender_import.missing(model, found) == []
+    assert found["triangles"] == 4
+    np.testing.assert_allclose(found["size"], [1, 1, 1], atol=1e-4)
