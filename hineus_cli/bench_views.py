@@ -93,7 +93,7 @@ def score_test_views(photos: TestPhotos, workspace: Workspace, fresh: set[str], 
     from stages.evaluation.images import find_lpips
     from stages.evaluation.views import judge
     from stages.meshing.view_scores import draw_view, silhouette
-    from stages.report import read_rgb
+    from stages.reporting.pictures import read_rgb
 
     drawer = _field_drawer(workspace, device)
     textured = "bake" in fresh
