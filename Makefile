@@ -1,5 +1,6 @@
 # make demo   photos -> textured model of a made-up object, with its score; result in demo/
 # make test   all tests
+# make bench-smoke   a small scene through the whole pipeline, its figures against committed ones
 # make lint   formatting, lint, types, who-may-import-whom
 # Each makes .venv first where needed.
 
@@ -7,7 +8,7 @@ PYTHON ?=
 export PYTHON
 BIN := .venv/bin
 
-.PHONY: help venv demo test lint format docs clean
+.PHONY: help venv demo test bench-smoke lint format docs clean
 
 help:
 	@sed -n 's/^# //p' Makefile
@@ -20,6 +21,9 @@ demo: venv
 
 test: venv
 	$(BIN)/python -m pytest
+
+bench-smoke: venv
+	$(BIN)/python -m benchmarks.smoke
 
 lint: venv
 	$(BIN)/ruff check .

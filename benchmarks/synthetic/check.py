@@ -66,9 +66,7 @@ def _middle(mask: np.ndarray) -> np.ndarray:
 def _away_from_outlines(mask: np.ndarray) -> np.ndarray:
     import cv2
 
-    inside, outside = (
-        cv2.distanceTransform(side.astype(np.uint8), cv2.DIST_L2, 5) for side in (mask, ~mask)
-    )  # fmt: skip
+    inside, outside = (cv2.distanceTransform(side.astype(np.uint8), cv2.DIST_L2, 5) for side in (mask, ~mask))
     return np.maximum(inside, outside) > EDGE
 
 

@@ -5,9 +5,11 @@ Boxes are split into small faces before they are painted, so that windows can be
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
-from benchmarks.synthetic.model import Paint, Part
+from benchmarks.synthetic.model import Paint, Part, plain
 from hineus_cli.demo_scene import ValueNoise
 
 STREET = 0.05  # wide
@@ -15,6 +17,8 @@ LOTS = (4, 3)
 FLOOR = 0.017  # height of a storey
 WINDOW = 0.014  # from one window to the next
 FINEST = 0.003  # longest edge of a painted face; half of the faces' edges are half as long, about a pixel
+CAR_COLORS = ((0.5, 0.05, 0.04), (0.7, 0.7, 0.7), (0.05, 0.08, 0.25), (0.04, 0.04, 0.04), (0.5, 0.45, 0.1))
+GLASS = (0.06, 0.07, 0.09)
 
 BOX_FACES = np.array([[0, 2, 1], [0, 3, 2], [4, 5, 6], [4, 6, 7], [0, 1, 5], [0, 5, 4],
                       [1, 2, 6], [1, 6, 5], [2, 3, 7], [2, 7, 6], [3, 0, 4], [3, 4, 7]])  # fmt: skip
@@ -184,33 +188,22 @@ def _tree(place: np.ndarray, rng: np.random.Generator, noise: ValueNoise) -> Par
 
 def _car(rng: np.random.Generator) -> list[Part]:
     """A car that is parked or drives along a street."""
-    color = np.array([[0.5, 0.05, 0.04], [0.7, 0.7, 0.7], [0.05, 0.08, 0.25], [0.04, 0.04, 0.04], [0.5, 0.45, 0.1]])[
-        rng.integers(5)
-    ]
+    color = CAR_COLORS[rng.integers(len(CAR_COLORS))]
     along, across = rng.uniform(-0.47, 0.47), rng.choice((-0.011, 0.011))
-    if rng.random() < 0.5:
-        line = rng.integers(1, LOTS[1]) / LOTS[1] - 0.5 + across
-        spots = [
-            ((along, line - 0.0045), (along + 0.022, line + 0.0045)),
-            ((along + 0.005, line - 0.004), (along + 0.017, line + 0.004)),
-        ]
-    else:
-        line = rng.integers(1, LOTS[0]) / LOTS[0] - 0.5 + across
-        spots = [
-            ((line - 0.0045, along), (line + 0.0045, along + 0.022)),
-            ((line - 0.004, along + 0.005), (line + 0.004, along + 0.017)),
-        ]
-    heights, paints = ((0, 0.0045), (0.0045, 0.0075)), (color, np.array([0.06, 0.07, 0.09]))
+    axis = 0 if rng.random() < 0.5 else 1  # that of the street
+    lanes = LOTS[1 - axis]
+    line = rng.integers(1, lanes) / lanes - 0.5 + across
+    body = np.array([[along, line - 0.0045, 0], [along + 0.022, line + 0.0045, 0.0045]])
+    cabin = np.array([[along + 0.005, line - 0.004, 0.0045], [along + 0.017, line + 0.004, 0.0075]])
+    turned = [axis, 1 - axis, 2]
     return [
-        Part(
-            *_box((*a, bottom), (*b, top)), "glossy", lambda points, normals, p=paint: np.broadcast_to(p, points.shape)
-        )
-        for (a, b), (bottom, top), paint in zip(spots, heights, paints, strict=True)
+        Part(*_box(*(corner[turned] for corner in shape)), "glossy", plain(*tint))
+        for shape, tint in ((body, color), (cabin, GLASS))
     ]
 
 
 # ---------------------------------------------------------------- shapes
-def _box(low: tuple, high: tuple) -> tuple[np.ndarray, np.ndarray]:
+def _box(low: Sequence[float], high: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
     (x0, y0, z0), (x1, y1, z1) = low, high
     bottom, top = [[(x, y, z) for x, y in ((x0, y0), (x1, y0), (x1, y1), (x0, y1))] for z in (z0, z1)]
     return np.array(bottom + top, float), BOX_FACES

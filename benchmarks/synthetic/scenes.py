@@ -23,7 +23,7 @@ OBLIQUE_DEG = 42.0  # of the oblique photos, from straight down
 
 @dataclass(frozen=True)
 class Recipe:
-    """A scene's name and how it is made.
+    """What a scene is for and how it is made.
 
     Attributes:
         shows: what it asks of a method.
