@@ -1,5 +1,6 @@
 # make demo   photos -> textured model of a made-up object, with its score; result in demo/
 # make test   all tests
+# make bench-smoke   a small scene through the whole pipeline, its figures against committed ones
 # make lint   formatting, lint, types, who-may-import-whom
 # make vendor the report's copy of three.js, from npm
 # Each makes .venv first where needed.
@@ -8,7 +9,7 @@ PYTHON ?=
 export PYTHON
 BIN := .venv/bin
 
-.PHONY: help venv demo test lint format docs vendor clean
+.PHONY: help venv demo test bench-smoke lint format docs vendor clean
 
 help:
 	@sed -n 's/^# //p' Makefile
@@ -21,6 +22,9 @@ demo: venv
 
 test: venv
 	$(BIN)/python -m pytest
+
+bench-smoke: venv
+	$(BIN)/python -m benchmarks.smoke
 
 lint: venv
 	$(BIN)/ruff check .

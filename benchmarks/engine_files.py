@@ -19,8 +19,8 @@ import numpy as np
 from configs.params import ExportParams
 from stages import artifacts
 from stages.engine.stage import StageContext
+from stages.evaluation.surfaces import Surface, Target
 from stages.export import EXPORT
-from stages.meshing.comparing import distances_to
 from stages.meshing.levels import levels_of_detail
 from stages.meshing.view_scores import draw_view, psnr, silhouette
 
@@ -50,7 +50,7 @@ def level_rows(workspace: Path, out: Path, count: int) -> list[str]:
     numbers, seconds = export(workspace, out, lods=count)
     rows = [f"| {workspace.name}, 0 | {len(atlas.faces)} | {numbers['bytes']['glb'] / 1e6:.1f} | - | - | - | - |"]
     for level, mesh in enumerate(levels_of_detail(atlas, count), 1):
-        away = 100 * distances_to(atlas.vertices, (mesh.vertices, mesh.faces)) / extent
+        away = 100 * Target(Surface(mesh.vertices, mesh.faces)).nearest(atlas.vertices).distances / extent
         scores = [
             psnr(draw_view(mesh, texture, cameras, view), image, mask)
             for view, image, mask in zip(views, full, masks, strict=True)

@@ -6,7 +6,8 @@ python -m benchmarks.run_sets --demo                `hineus demo`
 python -m benchmarks.run_sets --table-only          only rewrite the tables of docs/benchmarks.md
 
 A set is a folder with `images/` (or `image/`) and, where the truth is known, `gt_mesh.ply` and `transforms.json`.
-Results go to benchmarks/results/SET.json; workspaces and contact sheets to benchmarks/out/. A set that was cut off
+Results go to benchmarks/results/SET.json, those of the scenes that `benchmarks.synthetic` made to results/synthetic/,
+which has a table of its own; workspaces and contact sheets to benchmarks/out/. A set that was cut off
 goes on where it stopped; seconds are those of the stages, as the workspace recorded them when each ran.
 """
 
@@ -22,6 +23,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from benchmarks.synthetic import MADE_WITH
 from hineus_cli.machine import machine
 
 ROOT = Path(__file__).parent.parent
@@ -31,6 +33,7 @@ PAGE = ROOT / "docs" / "benchmarks.md"
 VALIDATOR = ROOT / "benchmarks" / "validate_glb.mjs"
 DEMO = "demo"
 NOT_MEASURED = "Not measured yet."
+SYNTHETIC = "synthetic"  # folder of results, and table
 GIB = 1 << 30
 
 
@@ -205,13 +208,18 @@ def contact_sheet(workspace: Path, path: Path) -> None:
 
 
 # ---------------------------------------------------------------- result files
-def save_result(result: Result) -> None:
-    RESULTS.mkdir(parents=True, exist_ok=True)
-    text = json.dumps(asdict(result), indent=1, allow_nan=False)
-    (RESULTS / f"{result.name}.json").write_text(text + "\n", encoding="utf-8")
+def result_path(name: str, data: Path | None) -> Path:
+    """Where the result of a set belongs; `data`: its folder of sets, None for the demo."""
+    ours = data is not None and (data / name / MADE_WITH).is_file()
+    return (RESULTS / SYNTHETIC if ours else RESULTS) / f"{name}.json"
 
 
-def load_results(folder: Path = RESULTS) -> list[Result]:
+def save_result(result: Result, path: Path) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(asdict(result), indent=1, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def load_results(folder: Path) -> list[Result]:
     """All results there are, the demo first, then by name."""
     results = []
     for path in folder.glob("*.json"):
@@ -295,6 +303,17 @@ def with_tables(page: str, results: Sequence[Result]) -> str:
     return page
 
 
+def updated_page(page: str) -> str:
+    """The page with all its tables made anew from the result files.
+
+    Raises:
+        ValueError: a marker is missing.
+    """
+    synthetic = load_results(RESULTS / SYNTHETIC)
+    page = with_tables(page, load_results(RESULTS))
+    return with_table(page, SYNTHETIC, summary_table(synthetic) if synthetic else NOT_MEASURED)
+
+
 def with_table(page: str, name: str, body: str) -> str:
     """The page with `body` between the markers of table `name`.
 
@@ -340,16 +359,17 @@ def main() -> int:
         parser.error("name a folder of sets, or --demo, or --table-only")
     failed = []
     for name, data in [] if arguments.table_only else jobs:
-        if (RESULTS / f"{name}.json").exists() and not arguments.again:
+        path = result_path(name, data)
+        if path.exists() and not arguments.again:
             print(f"{name}: has a result (--again measures it anew)", file=sys.stderr)
             continue
         print(f"{name}: running", file=sys.stderr)
         try:
-            save_result(run_set(name, data))
+            save_result(run_set(name, data), path)
         except RuntimeError as error:
             print(f"{name}: {error}", file=sys.stderr)
             failed.append(name)
-    PAGE.write_text(with_tables(PAGE.read_text(encoding="utf-8"), load_results()), encoding="utf-8")
+    PAGE.write_text(updated_page(PAGE.read_text(encoding="utf-8")), encoding="utf-8")
     return 1 if failed else 0
 
 

@@ -5,7 +5,16 @@ from __future__ import annotations
 import pytest
 
 from benchmarks import run_sets
-from benchmarks.run_sets import Result, StageCost, find_sets, load_results, save_result, with_tables
+from benchmarks.run_sets import (
+    Result,
+    StageCost,
+    find_sets,
+    load_results,
+    result_path,
+    save_result,
+    updated_page,
+    with_tables,
+)
 
 
 def _result(name="banana", score=None):
@@ -61,11 +70,24 @@ def test_tables_are_replaced_between_their_markers_and_nothing_else():
         with_tables("no markers", [])
 
 
-def test_results_survive_their_files_and_the_demo_comes_first(tmp_path, monkeypatch):
-    monkeypatch.setattr(run_sets, "RESULTS", tmp_path)
+def test_results_survive_their_files_and_the_demo_comes_first(tmp_path):
     for result in (_result("banana", SCORE), _result("demo")):
-        save_result(result)
+        save_result(result, tmp_path / f"{result.name}.json")
     assert load_results(tmp_path) == [_result("demo"), _result("banana", SCORE)]
+
+
+def test_results_of_our_own_scenes_lie_apart_and_have_their_own_table(tmp_path, monkeypatch):
+    (tmp_path / "data" / "thin").mkdir(parents=True)
+    (tmp_path / "data" / "thin" / "made_with.json").write_text("{}")
+    monkeypatch.setattr(run_sets, "RESULTS", tmp_path / "results")
+    for name in ("thin", "banana"):
+        save_result(_result(name), result_path(name, tmp_path / "data"))
+    names = [*run_sets.TABLES, run_sets.SYNTHETIC]
+    page = updated_page("".join(f"<!-- table {n} -->\nold\n<!-- end {n} -->\n" for n in names))
+    others, ours = page.split("<!-- table synthetic -->")
+    assert "| thin |" in ours
+    assert "banana" not in ours
+    assert "thin" not in others
 
 
 def test_sets_are_folders_with_photos(tmp_path):

@@ -1,0 +1,198 @@
+"""From radiance to files: what a camera does to a picture, and the folder of a scene.
+
+A folder: `images/000.jpg` ..., `masks/000.png` ..., `gt_mesh.ply`, and, last, `transforms.json` as `hineus_cli.scoring`
+reads it. `made_with.json` says what is being made: photos of another recipe are removed, finished ones are kept.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from datetime import datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.synthetic import MADE_WITH
+from benchmarks.synthetic.mitsuba_camera import Photographer
+from benchmarks.synthetic.model import Scene
+from benchmarks.synthetic.scenes import RECIPES
+from hineus_cli.scoring import TRUTH_CAMERAS, TRUTH_MESH
+
+SUITE_VERSION = 1  # raise it when the same recipe would give other photos
+IMAGES, MASKS = "images", "masks"
+
+FOCAL_35MM = 40  # as EXIF says it
+FOCAL_ERROR = 1.01  # true over stated: no lens is what it says
+MASK_PATHS = 16  # a pixel
+METER_PATHS = 16
+WHITE_POINT = 0.55  # of the sensor, where the brightest tenth of the first photo begins
+DRIFT = 0.06  # standard deviation of the exposure over the photos, relative
+READ_NOISE = 0.002  # of full scale
+SHOT_NOISE = 0.006  # of full scale at full scale; grows with the root of the light
+JPEG_QUALITY = 95
+
+
+@dataclass(frozen=True)
+class Order:
+    """What is asked for.
+
+    Attributes:
+        scene: name in RECIPES.
+        num_photos: how many.
+        size: width and height in pixels.
+        spp: paths a pixel.
+        seed: of the scene, its cameras and its noise.
+    """
+
+    scene: str
+    num_photos: int
+    size: tuple[int, int]
+    spp: int
+    seed: int
+
+    @property
+    def focal(self) -> float:
+        """Pixels."""
+        return FOCAL_ERROR * FOCAL_35MM / 36 * self.size[0]
+
+    def as_dict(self) -> dict[str, Any]:
+        return {"suite_version": SUITE_VERSION, **asdict(self), "size": list(self.size)}
+
+
+def make(order: Order, folder: Path, variant: str, progress: Callable[[int], None] = lambda done: None) -> bool:
+    """Make what is not there yet; whether there was anything to do."""
+    if _is_made(order, folder):
+        return False
+    _begin(order, folder)
+    rng = np.random.default_rng(order.seed)
+    scene = RECIPES[order.scene].make(rng, order.num_photos)
+    exposures = 1 + DRIFT * _drift(order.num_photos, rng)
+    _write_mesh(scene, folder / TRUTH_MESH)
+    camera = Photographer(scene, order.focal, order.size, variant)
+    exposures *= _meter(scene, order, variant)
+    for i, cam_from_world in enumerate(scene.cam_from_world):
+        photo, mask = folder / IMAGES / f"{i:03d}.jpg", folder / MASKS / f"{i:03d}.png"
+        if not photo.is_file():  # it is renamed into place, after its mask
+            covered = camera.coverage(cam_from_world, MASK_PATHS, seed=_noise_seed(order, i, 1))
+            _save(mask, _picture(np.where(covered >= 0.5, 255, 0).astype(np.uint8)))
+            radiance = camera.radiance(cam_from_world, order.spp, seed=_noise_seed(order, i, 0))
+            developed = develop(radiance * exposures[i], np.random.default_rng([order.seed, i]))
+            picture = _picture(developed)
+            _save(photo, picture, quality=JPEG_QUALITY, exif=_exif(picture, i))
+        progress(i + 1)
+    _write_cameras(order, scene, exposures, folder / TRUTH_CAMERAS)
+    return True
+
+
+def develop(light: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """8-bit sRGB [H, W, 3] of what falls on the sensor, 1 being its full scale; noise comes before the tone curve."""
+    clipped = np.clip(light, 0, 1)
+    sigma = np.sqrt(READ_NOISE**2 + SHOT_NOISE**2 * clipped)
+    linear = np.clip(clipped + sigma * rng.standard_normal(clipped.shape), 0, 1)
+    srgb = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+    return (srgb * 255 + 0.5).astype(np.uint8)
+
+
+def _drift(count: int, rng: np.random.Generator) -> np.ndarray:
+    """[count] slow wandering around 0 with standard deviation 1."""
+    walk = np.cumsum(rng.standard_normal(count))
+    return (walk - walk.mean()) / walk.std()
+
+
+def _meter(scene: Scene, order: Order, variant: str) -> float:
+    """Exposure of the whole set, from a small first photo."""
+    small = (order.size[0] // 4, order.size[1] // 4)
+    first = Photographer(scene, order.focal / 4, small, variant).radiance(scene.cam_from_world[0], METER_PATHS, seed=0)
+    return float(WHITE_POINT / np.percentile(first, 90))
+
+
+def _noise_seed(order: Order, index: int, purpose: int) -> int:
+    return int(np.random.default_rng([order.seed, index, purpose]).integers(1 << 31))
+
+
+# ---------------------------------------------------------------- files
+def _is_made(order: Order, folder: Path) -> bool:
+    try:
+        truth = json.loads((folder / TRUTH_CAMERAS).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return False
+    return truth.get("made_with") == order.as_dict() and all(
+        (folder / frame["file_path"]).is_file() for frame in truth["frames"]
+    )
+
+
+def _begin(order: Order, folder: Path) -> None:
+    """Empty folders, or those of the same order."""
+    note = folder / MADE_WITH
+    if not note.is_file() or json.loads(note.read_text(encoding="utf-8")) != order.as_dict():
+        for name in (IMAGES, MASKS):
+            shutil.rmtree(folder / name, ignore_errors=True)
+    (folder / TRUTH_CAMERAS).unlink(missing_ok=True)
+    for name in (IMAGES, MASKS):
+        (folder / name).mkdir(parents=True, exist_ok=True)
+    note.write_text(json.dumps(order.as_dict(), indent=1) + "\n", encoding="utf-8")
+
+
+def _save(path: Path, picture: Any, **options: Any) -> None:
+    """All of it or nothing."""
+    partial = path.with_name(f"partial{path.suffix}")
+    picture.save(partial, **options)
+    os.replace(partial, path)
+
+
+def _picture(pixels: np.ndarray) -> Any:
+    from PIL import Image
+
+    return Image.fromarray(pixels)
+
+
+def _write_mesh(scene: Scene, path: Path) -> None:
+    import trimesh
+
+    trimesh.Trimesh(*scene.surface(), process=False).export(path)
+
+
+def _write_cameras(order: Order, scene: Scene, exposures: np.ndarray, path: Path) -> None:
+    opengl = np.diag([1.0, -1, -1, 1])
+    frames = [
+        {
+            "file_path": f"{IMAGES}/{i:03d}.jpg",
+            "exposure": round(float(exposure), 5),
+            "transform_matrix": (np.linalg.inv(cam_from_world) @ opengl).tolist(),
+            "w2c_opencv": cam_from_world.tolist(),
+        }
+        for i, (cam_from_world, exposure) in enumerate(zip(scene.cam_from_world, exposures, strict=True))
+    ]
+    truth = {
+        "camera_model": "PINHOLE",
+        "w": order.size[0],
+        "h": order.size[1],
+        "fl_x": order.focal,
+        "fl_y": order.focal,
+        "cx": order.size[0] / 2,
+        "cy": order.size[1] / 2,
+        "made_with": order.as_dict(),
+        "frames": frames,
+    }
+    partial = path.with_suffix(".partial")
+    partial.write_text(json.dumps(truth, indent=1) + "\n", encoding="utf-8")
+    os.replace(partial, path)
+
+
+def _exif(picture: Any, index: int) -> Any:
+    from PIL import ExifTags
+
+    exif = picture.getexif()
+    taken = datetime(2025, 6, 1, 12, 0, 0) + timedelta(seconds=5 * index)
+    exif[ExifTags.Base.Make] = "HiNeuS"
+    exif[ExifTags.Base.Model] = "Synthetic camera"
+    exif[ExifTags.Base.DateTime] = taken.strftime("%Y:%m:%d %H:%M:%S")
+    details = exif.get_ifd(ExifTags.IFD.Exif)
+    details[ExifTags.Base.FocalLength] = float(FOCAL_35MM)
+    details[ExifTags.Base.FocalLengthIn35mmFilm] = FOCAL_35MM
+    return exif

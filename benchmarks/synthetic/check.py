@@ -1,0 +1,82 @@
+"""Whether photos, masks, cameras and surface of a folder belong together: the surface, cast through the cameras that
+`transforms.json` states, must cover what the renderer's masks cover."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from hineus_cli.scoring import load_known_surface
+from stages.meshing.cleaning import raycaster
+
+# A camera that is half a pixel off, or a focal length off by 0.3 %, is far beyond these.
+MAX_SHIFT = 0.1  # pixels
+MIN_OVERLAP = 0.99
+MIN_INSIDE = 0.999
+EDGE = 1.0  # pixels next to which a pixel centre may fall to either side
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """The worst of all photos.
+
+    Attributes:
+        shift: between the middles of the cast and of the rendered silhouette, pixels.
+        overlap: intersection over union of the two, pixels within EDGE of an outline left out.
+        inside: share of the surface's vertices before the camera that fall onto the mask, or next to it.
+    """
+
+    shift: float
+    overlap: float
+    inside: float
+
+    @property
+    def is_exact(self) -> bool:
+        return self.shift <= MAX_SHIFT and self.overlap >= MIN_OVERLAP and self.inside >= MIN_INSIDE
+
+
+def check(folder: Path) -> Agreement:
+    """Compare all masks of a finished folder with its surface and cameras."""
+    import cv2
+    import open3d as o3d
+
+    known, _ = load_known_surface(folder)
+    scene = raycaster(known.vertices, known.faces)
+    width, height = known.size
+    shifts, overlaps, insides = [], [], []
+    for path, cam_from_world in zip(sorted((folder / "masks").iterdir()), known.cam_from_world, strict=True):
+        mask = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) > 127
+        rays = o3d.t.geometry.RaycastingScene.create_rays_pinhole(
+            o3d.core.Tensor(known.intrinsics), o3d.core.Tensor(cam_from_world), width, height
+        )
+        cast = np.isfinite(scene.cast_rays(rays)["t_hit"].numpy())
+        shifts.append(np.linalg.norm(_middle(mask) - _middle(cast)))
+        sure = _away_from_outlines(cast)
+        overlaps.append((mask & cast)[sure].sum() / max((mask | cast)[sure].sum(), 1))
+        insides.append(_share_inside(known.vertices, known.intrinsics, cam_from_world, mask))
+    return Agreement(float(max(shifts)), float(min(overlaps)), float(min(insides)))
+
+
+def _middle(mask: np.ndarray) -> np.ndarray:
+    return np.argwhere(mask).mean(0)
+
+
+def _away_from_outlines(mask: np.ndarray) -> np.ndarray:
+    import cv2
+
+    inside, outside = (cv2.distanceTransform(side.astype(np.uint8), cv2.DIST_L2, 5) for side in (mask, ~mask))
+    return np.maximum(inside, outside) > EDGE
+
+
+def _share_inside(vertices: np.ndarray, intrinsics: np.ndarray, cam_from_world: np.ndarray, mask: np.ndarray) -> float:
+    import cv2
+
+    in_cam = vertices @ cam_from_world[:3, :3].T + cam_from_world[:3, 3]
+    pixels = in_cam @ intrinsics.T
+    pixels = np.floor(pixels[:, :2] / pixels[:, 2:]).astype(int)
+    seen = (in_cam[:, 2] > 0) & np.all((pixels >= 0) & (pixels < np.array(mask.shape)[::-1]), axis=1)
+    grown = cv2.dilate(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    column, row = pixels[seen].T
+    return float(grown[row, column].mean())
