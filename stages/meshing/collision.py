@@ -1,4 +1,7 @@
-"""A shape as a few convex pieces, as physics engines want it. Arrays in, arrays out."""
+"""A shape as a few convex pieces, as physics engines want it. Arrays in, arrays out.
+
+CoACD rather than VHACD: in about the same time it needs half as many pieces for a union that is as tight.
+"""
 
 from __future__ import annotations
 
