@@ -16,7 +16,7 @@ from typing import Any
 
 from benchmarks.run_sets import NOT_MEASURED, PAGE, RESULTS, markdown_table, with_table
 from hineus_cli.bench import load_results
-from hineus_cli.bench_tables import TextTable, tables_of
+from hineus_cli.bench_tables import TextTable, score_of, tables_of
 from hineus_cli.suites.paper import paper_tables
 from hineus_cli.suites.registry import SUITES
 from stages import artifacts
@@ -40,7 +40,11 @@ def suites_tables(results: Sequence[dict[str, Any]]) -> str:
     parts = []
     for name, suite in SUITES.items():
         own = [result for result in results if result["suite"] == name]
-        parts += [_markdown(table) for table in tables_of(suite, own)] if own else []
+        if own:
+            tables = tables_of(suite, own)
+            # the paper's figures stand on the page only beside some of ours
+            scored = any(score_of(suite, result) is not None for result in own)
+            parts += [_markdown(table) for table in (tables if scored else tables[1:])]
     return "\n\n".join(parts) or NOT_MEASURED
 
 

@@ -28,8 +28,8 @@ class TextTable:
 def tables_of(suite: Suite, results: Sequence[Result]) -> list[TextTable]:
     """All tables of one suite's results: its score beside the paper's, costs, view synthesis where there is any."""
     good = [result for result in results if "error" not in result]
-    found = [score_table(suite, good), cost_table(good)]
-    return found + ([views_table(good)] if any(_at(result, "scores.views") for result in good) else [])
+    found = [score_table(suite, good), cost_table(suite, good)]
+    return found + ([views_table(suite, good)] if any(_at(result, "scores.views") for result in good) else [])
 
 
 def score_table(suite: Suite, results: Sequence[Result]) -> TextTable:
@@ -40,7 +40,7 @@ def score_table(suite: Suite, results: Sequence[Result]) -> TextTable:
     scenes = [*(name for name in known if name in names), *sorted(names - set(known), key=_natural)]
     rows = [*(_paper_rows(paper, scenes, suite.decimals) if paper else ())]
     for label, runs in _by_method(results).items():
-        scores = [[_at(run, f"scores.{suite.score}") for run in runs if run["scene"] == name] for name in scenes]
+        scores = [[score_of(suite, run) for run in runs if run["scene"] == name] for name in scenes]
         average = _average([_mean(own) for own in scores], suite.decimals)
         rows.append((label, *(_spread(own, suite.decimals) for own in scores), average))
     note = ""
@@ -52,7 +52,7 @@ def score_table(suite: Suite, results: Sequence[Result]) -> TextTable:
     return TextTable(f"{suite.title}: {suite.score_name}{unit}", ("method", *scenes, "average"), tuple(rows), note)
 
 
-def cost_table(results: Sequence[Result]) -> TextTable:
+def cost_table(suite: Suite, results: Sequence[Result]) -> TextTable:
     """One row a run: what it took."""
     rows = [
         (
@@ -60,16 +60,16 @@ def cost_table(results: Sequence[Result]) -> TextTable:
             label_of(result),
             _number(result.get("seed"), 0),
             _number(result.get("photos"), 0),
-            _number(result["wall_s"] / 60, 1),
+            _number(result["wall_s"] / 60, 2),
             # peers start from photos that have poses, so all of their time is after that
-            _number(result.get("wall_after_poses_s", result["wall_s"]) / 60, 1),
-            _number(result["cpu_s"] / 60, 1),
+            _number(result.get("wall_after_poses_s", result["wall_s"]) / 60, 2),
+            _number(result["cpu_s"] / 60, 2),
             _number(result["peak_rss"] / GIB, 2),
         )
         for result in results
     ]
     header = ("scene", "method", "seed", "photos", "wall min", "after the poses", "CPU min", "peak GiB")
-    return TextTable("Time and memory", header, tuple(rows))
+    return TextTable(f"{suite.title}: time and memory", header, tuple(rows))
 
 
 VIEW_SCORES = (
@@ -80,7 +80,7 @@ VIEW_SCORES = (
 )
 
 
-def views_table(results: Sequence[Result]) -> TextTable:
+def views_table(suite: Suite, results: Sequence[Result]) -> TextTable:
     """One row a run: PSNR and SSIM of test photos that no stage has seen, of the field and of the textured mesh."""
     rows = []
     for result in results:
@@ -93,7 +93,13 @@ def views_table(results: Sequence[Result]) -> TextTable:
             cells.append(NONE if psnr is None else f"{psnr:.2f} / {ssim:.3f}")
         rows.append(tuple(cells))
     header = ("scene", "method", "seed", "test photos", *(name for name, _ in VIEW_SCORES))
-    return TextTable("Test photos: PSNR dB / SSIM", header, tuple(rows))
+    return TextTable(f"{suite.title}: test photos, PSNR dB / SSIM", header, tuple(rows))
+
+
+def score_of(suite: Suite, result: Result) -> float | None:
+    """The score that the suite's papers compare; None where the run has none."""
+    score = _at(result, f"scores.{suite.score}")
+    return None if score is None else float(score)
 
 
 def label_of(result: Result) -> str:

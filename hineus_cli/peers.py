@@ -7,8 +7,8 @@ a folder of its own, and is timed.
 
 from __future__ import annotations
 
+import contextlib
 import difflib
-import os
 import resource
 import shlex
 import shutil
@@ -18,6 +18,8 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+import psutil
 
 from hineus_cli.machine import machine
 from stages import artifacts
@@ -33,6 +35,7 @@ BUILT_IN = {
 PROGRAM = Path(__file__).with_name("builtin_peers.py")
 PLACEHOLDERS = ("photos", "model", "masks", "out")
 MESH, LOG = "mesh.ply", "output.log"
+SAMPLE_EVERY_S = 0.1  # of its memory
 TOLD = 400  # characters of a failed command's output that are repeated
 
 
@@ -84,7 +87,7 @@ def run_peer(peer: Peer, given: Path, folder: Path) -> dict[str, Any]:
     """Run a peer on `given`, what `export-colmap` writes; its mesh is `folder/mesh.ply`.
 
     Returns:
-        Wall and CPU seconds, peak memory in bytes (of its largest process), the machine, the command as it was given,
+        Wall and CPU seconds, peak memory in bytes, the machine, the command as it was given,
         and the number of photos.
 
     Raises:
@@ -100,25 +103,25 @@ def run_peer(peer: Peer, given: Path, folder: Path) -> dict[str, Any]:
         "out": folder / MESH,
     }
     words = [_filled(word, places) for word in peer.words]
-    started = time.monotonic()
-    code, used = _call(words, folder, peer.name)
-    wall_s = time.monotonic() - started
+    started, before = time.monotonic(), _children_s()
+    code, peak_rss = _call(words, folder, peer.name)
+    wall_s, cpu_s = time.monotonic() - started, _children_s() - before
     if code != 0 or not (folder / MESH).is_file():
         said = " ".join((folder / LOG).read_text(encoding="utf-8", errors="replace").split())[-TOLD:]
         what = f"ended with {code}" if code else f"wrote no {MESH}"
         raise ReconstructionError(f"Peer {peer.name} {what}: {said or 'it said nothing'}", f"See {folder / LOG}.")
     return {
         "wall_s": round(wall_s, 2),
-        "cpu_s": round(used.ru_utime + used.ru_stime, 2),
-        "peak_rss": used.ru_maxrss * (1 if sys.platform == "darwin" else 1024),
+        "cpu_s": round(cpu_s, 2),
+        "peak_rss": peak_rss,
         "machine": machine(),
         "command": shlex.join(peer.given),
         "photos": sum(path.is_file() for path in places["photos"].rglob("*")),
     }
 
 
-def _call(words: list[str], folder: Path, name: str) -> tuple[int, resource.struct_rusage]:
-    """Exit code of a command, and what it and those of its children that it waited for used.
+def _call(words: list[str], folder: Path, name: str) -> tuple[int, int]:
+    """Exit code of a command, and the most memory in bytes that it and its children held at once, by samples.
 
     The command runs in `folder`, where it may leave other files; what it says goes to a file there.
     """
@@ -129,14 +132,33 @@ def _call(words: list[str], folder: Path, name: str) -> tuple[int, resource.stru
             raise ReconstructionError(
                 f"Peer {name} could not be started: {words[0]}: {error.strerror}.", "Name the program's full path."
             ) from error
+        peak_rss = 0
         try:
-            _, status, used = os.wait4(process.pid, 0)
+            while True:
+                peak_rss = max(peak_rss, _held_by(process.pid))
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    return process.wait(SAMPLE_EVERY_S), peak_rss
         except BaseException:  # it is not to outlive us
             process.kill()
             process.wait()
             raise
-    process.returncode = os.waitstatus_to_exitcode(status)  # so that nobody waits for it again
-    return process.returncode, used
+
+
+def _held_by(pid: int) -> int:
+    """Resident memory in bytes of a process and its children. The kernel's own peak would count ours: it was forked."""
+    total = 0
+    with contextlib.suppress(psutil.Error):  # it has ended
+        process = psutil.Process(pid)
+        for each in (process, *process.children(recursive=True)):
+            with contextlib.suppress(psutil.Error):
+                total += each.memory_info().rss
+    return total
+
+
+def _children_s() -> float:
+    """CPU seconds of all children that were waited for."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
 
 
 def _filled(word: str, places: dict[str, Path]) -> str:

@@ -365,6 +365,6 @@ def test_an_average_that_the_paper_prints_otherwise_is_said_where_all_its_scenes
 
 def test_runs_that_failed_are_in_no_table():
     tables = tables_of(SUITES["dtu"], [{**run_result("24", 0, 0.5), "error": {}}, run_result("37", 0, 0.5)])
-    assert [table.title for table in tables] == ["DTU: Chamfer distance, mm", "Time and memory"]
+    assert [table.title for table in tables] == ["DTU: Chamfer distance, mm", "DTU: time and memory"]
     assert tables[0].header == ("method", "37", "average")
     assert [row[0] for row in tables[1].rows] == ["37"]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -79,7 +79,7 @@ class SuiteScene:
     left_out: tuple[str, ...] = ()
     views: TestViews | None = None
     truth: Truth | None = None
-    lacking: tuple[str, ...] = field(default=())
+    lacking: tuple[str, ...] = ()
 
 
 def photo_names(folder: Path) -> list[str]:
