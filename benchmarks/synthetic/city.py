@@ -61,18 +61,16 @@ def _house(
 ) -> list[Part]:  # fmt: skip
     (x0, y0), (x1, y1) = corner, corner + size
     eave, middle = 0.006, (y0 + y1) / 2
-    walls = _box((x0, y0, 0), (x1, y1, height))
     ring = ((x0 - eave, y0 - eave), (x1 + eave, y0 - eave), (x1 + eave, y1 + eave), (x0 - eave, y1 + eave))
     base = [(*corner, height) for corner in ring] + [(x, middle, height + roof) for x in (x0 - eave, x1 + eave)]
     sides = [[0, 2, 1], [0, 3, 2], [0, 1, 5], [0, 5, 4], [2, 3, 4], [2, 4, 5], [1, 2, 5], [3, 0, 4]]
-    prism = (np.array(base), np.array(sides))
     x = rng.uniform(x0 + 0.01, x1 - 0.02)
-    chimney = _box((x, middle + 0.008, height), (x + 0.009, middle + 0.017, height + roof + 0.012))
-    tiles = rng.uniform(0.7, 1.2) * np.array([0.42, 0.17, 0.10])
+    chimney = (x, middle + 0.008, height), (x + 0.009, middle + 0.017, height + roof + 0.012)
+    tiles = _tiles(rng.uniform(0.7, 1.2) * np.array([0.42, 0.17, 0.10]), noise)
     return [
-        Part(*walls, "matte", _facade(rng, noise), grain=FINEST),
-        Part(*prism, "matte", _tiles(tiles, noise), grain=FINEST),
-        Part(*chimney, "matte", _speckled((0.3, 0.16, 0.12), noise), grain=FINEST),
+        _block((x0, y0, 0), (x1, y1, height), _facade(rng, noise)),
+        Part(np.array(base), np.array(sides), "matte", tiles, grain=FINEST),
+        _block(*chimney, _speckled((0.3, 0.16, 0.12), noise)),
     ]
 
 
@@ -88,16 +86,16 @@ def _flat(low: np.ndarray, high: np.ndarray, rng: np.random.Generator, noise: Va
 def _with_parapet(low: tuple, high: tuple, height: float, rng: np.random.Generator, noise: ValueNoise) -> list[Part]:
     wall, rim = 0.006, 0.012
     facade, gravel = _facade(rng, noise), _speckled((0.42, 0.41, 0.38), noise)
-    parts = [Part(*_box((*low, 0), (*high, height)), "matte", facade, grain=FINEST)]
+    steel = _speckled((0.5, 0.52, 0.55), noise)
+    parts = [_block((*low, 0), (*high, height), facade)]
     edges = [((low[0], low[1]), (high[0], low[1] + wall)), ((low[0], high[1] - wall), (high[0], high[1])),
              ((low[0], low[1] + wall), (low[0] + wall, high[1] - wall)),
              ((high[0] - wall, low[1] + wall), (high[0], high[1] - wall))]  # fmt: skip
-    parts += [Part(*_box((*a, height), (*b, height + rim)), "matte", gravel, grain=FINEST) for a, b in edges]
+    parts += [_block((*a, height), (*b, height + rim), gravel) for a, b in edges]
     for _ in range(4):
         corner = rng.uniform(np.array(low) + 0.01, np.array(high) - 0.035)
         size = [*rng.uniform(0.012, 0.024, 2), rng.uniform(0.008, 0.02)]
-        machine = _box((*corner, height), (*(corner + size[:2]), height + size[2]))
-        parts.append(Part(*machine, "matte", _speckled((0.5, 0.52, 0.55), noise), grain=FINEST))
+        parts.append(_block((*corner, height), (*(corner + size[:2]), height + size[2]), steel))
     return parts
 
 
@@ -111,7 +109,7 @@ def _court(low: np.ndarray, high: np.ndarray, rng: np.random.Generator, noise: V
              ((gate - 0.014, y0, 1.6 * FLOOR), (gate + 0.014, y0 + depth, top)),
              ((x0, y1 - depth, 0), (x1, y1, height)), ((x0, y0 + depth, 0), (x0 + depth, y1 - depth, height)),
              ((x1 - depth, y0 + depth, 0), (x1, y1 - depth, height))]  # fmt: skip
-    parts = [Part(*_box(a, b), "matte", facade, grain=FINEST) for a, b in wings]
+    parts = [_block(a, b, facade) for a, b in wings]
     yard = np.array([[x0, y0], [x1, y1]]) + [[depth + 0.02], [-depth - 0.02]]
     return parts + [_tree(rng.uniform(*yard), rng, noise) for _ in range(2)]
 
@@ -122,9 +120,7 @@ def _tower(low: np.ndarray, high: np.ndarray, rng: np.random.Generator, noise: V
     facade = _facade(rng, noise)
     levels = ((0.085, 0.10, 0.0, 2), (0.06, 0.07, 2, 7), (0.045, 0.05, 7, 11), (0.018, 0.018, 11, 13))
     return [
-        Part(
-            *_box((*(center - (a, b)), start * FLOOR), (*(center + (a, b)), end * FLOOR)), "matte", facade, grain=FINEST
-        )
+        _block((*(center - (a, b)), start * FLOOR), (*(center + (a, b)), end * FLOOR), facade)
         for a, b, start, end in levels
     ]
 
@@ -134,18 +130,10 @@ def _church(low: np.ndarray, high: np.ndarray, rng: np.random.Generator, noise: 
     middle = (low[1] + high[1]) / 2
     parts = _house(np.array([low[0] + 0.07, middle - 0.035]), np.array([0.11, 0.07]), 0.06, 0.06, rng, noise)
     stone = _speckled((0.45, 0.40, 0.32), noise)
-    parts.append(
-        Part(
-            *_box((low[0] + 0.03, middle - 0.022, 0), (low[0] + 0.074, middle + 0.022, 0.15)),
-            "matte",
-            stone,
-            grain=FINEST,
-        )
-    )
-    x0, x1, y0, y1 = low[0] + 0.028, low[0] + 0.076, middle - 0.024, middle + 0.024
-    spire = np.array([(x0, y0, 0.15), (x1, y0, 0.15), (x1, y1, 0.15), (x0, y1, 0.15), ((x0 + x1) / 2, middle, 0.26)])
-    sides = np.array([[0, 2, 1], [0, 3, 2], [0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]])
-    parts.append(Part(spire, sides, "matte", _tiles(np.array([0.16, 0.24, 0.22]), noise), grain=FINEST))
+    x0, x1, y0, y1 = low[0] + 0.03, low[0] + 0.074, middle - 0.022, middle + 0.022
+    parts.append(_block((x0, y0, 0), (x1, y1, 0.15), stone))
+    slate, eave = _tiles(np.array([0.16, 0.24, 0.22]), noise), 0.002
+    parts.append(_pyramid((x0 - eave, y0 - eave), (x1 + eave, y1 + eave), 0.15, 0.26, slate))
     corners = [(low[0] + 0.02, low[1] + 0.03), (high[0] - 0.02, low[1] + 0.03), (high[0] - 0.03, high[1] - 0.03)]
     return parts + [_tree(np.array(corner), rng, noise) for corner in corners]
 
@@ -153,13 +141,10 @@ def _church(low: np.ndarray, high: np.ndarray, rng: np.random.Generator, noise: 
 def _park(low: np.ndarray, high: np.ndarray, rng: np.random.Generator, noise: ValueNoise) -> list[Part]:
     """Trees, and a pavilion on posts."""
     center = (low + high) / 2
-    posts = [_box((*(center + [a, b]), 0), (*(center + [a + 0.008, b + 0.008]), 0.035)) for a in (-0.035, 0.027)
-             for b in (-0.035, 0.027)]  # fmt: skip
-    roof = np.array([(*(center + 0.045 * np.array(c)), 0.035) for c in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
-                    + [(*center, 0.065)])  # fmt: skip
-    sides = np.array([[0, 2, 1], [0, 3, 2], [0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]])
-    parts = [Part(*post, "matte", _speckled((0.5, 0.45, 0.4), noise), grain=FINEST) for post in posts]
-    parts.append(Part(roof, sides, "matte", _tiles(np.array([0.38, 0.2, 0.1]), noise), grain=FINEST))
+    wood, tiles = _speckled((0.5, 0.45, 0.4), noise), _tiles(np.array([0.38, 0.2, 0.1]), noise)
+    feet = [center + [a, b] for a in (-0.035, 0.027) for b in (-0.035, 0.027)]
+    parts = [_block((*foot, 0), (*(foot + 0.008), 0.035), wood) for foot in feet]
+    parts.append(_pyramid(center - 0.045, center + 0.045, 0.035, 0.065, tiles))
     places = []
     while len(places) < 11:
         place = rng.uniform(low + 0.015, high - 0.015)
@@ -207,6 +192,25 @@ def _box(low: Sequence[float], high: Sequence[float]) -> tuple[np.ndarray, np.nd
     (x0, y0, z0), (x1, y1, z1) = low, high
     bottom, top = [[(x, y, z) for x, y in ((x0, y0), (x1, y0), (x1, y1), (x0, y1))] for z in (z0, z1)]
     return np.array(bottom + top, float), BOX_FACES
+
+
+def _block(low: Sequence[float], high: Sequence[float], paint: Paint) -> Part:
+    """A painted box between two corners."""
+    return Part(*_box(low, high), "matte", paint, grain=FINEST)
+
+
+def _pyramid(low: Sequence[float], high: Sequence[float], bottom: float, top: float, paint: Paint) -> Part:
+    """A roof over the rectangle from `low` to `high`, from height `bottom` to `top`."""
+    (x0, y0), (x1, y1) = low, high
+    corners = [
+        (x0, y0, bottom),
+        (x1, y0, bottom),
+        (x1, y1, bottom),
+        (x0, y1, bottom),
+        ((x0 + x1) / 2, (y0 + y1) / 2, top),
+    ]
+    sides = np.array([[0, 2, 1], [0, 3, 2], [0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]])
+    return Part(np.array(corners), sides, "matte", paint, grain=FINEST)
 
 
 def _pavement() -> tuple[np.ndarray, np.ndarray]:
