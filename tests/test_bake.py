@@ -375,6 +375,41 @@ def test_charts_without_texels_are_refused(capture):
         bake(replace(mesh, uvs=np.zeros_like(mesh.uvs)), cameras, photos)
 
 
+def test_a_texture_done_in_parts_is_the_same(capture, baked, monkeypatch):
+    monkeypatch.setattr("stages.meshing.baking.BAND_BYTES", 16 * 25 * 3000)
+    monkeypatch.setattr("stages.meshing.baking.KEPT_BYTES", 0)  # and photos are made ready anew for each
+    monkeypatch.setattr("stages.meshing.baking._CHUNK", 1000)
+    again = bake(*capture)
+    assert (again.base_color == baked.base_color).all()
+    assert again.numbers == baked.numbers
+
+
+def test_a_blurred_photo_counts_less(capture):
+    import cv2
+
+    mesh, cameras, _ = capture
+
+    def rough(points):
+        return true_color(points) + 25 * np.sign(np.sin(60 * points[:, :1]) * np.sin(60 * points[:, 1:2] + 1))
+
+    sharp = [photograph(mesh, cameras, i, rough) for i in range(len(cameras))]
+    blurred = [cv2.GaussianBlur(p, (0, 0), 3) if i % 2 else p for i, p in enumerate(sharp)]
+    assert bake(mesh, cameras, sharp).numbers["blurred_photos"] == 0
+    assert bake(mesh, cameras, blurred[:-1] + sharp[-1:]).numbers["blurred_photos"] == 7
+
+
+def test_photos_finer_than_the_texels_do_not_alias():
+    """A checkerboard of pixels, too fine for the texture, becomes its mean."""
+    mesh = join([quad((0, 0, 0), X, Z, 0.5, 4, (0, 0), 1)])
+    camera = look_at(np.array([0.0, -2.0, 0]), np.zeros(3), Z, 400, 400, 30)
+    board = np.where(np.indices((400, 400)).sum(0)[..., None] % 2, 200, 60).astype(np.uint8).repeat(3, 2)
+    fine = rasterize_atlas(mesh.uvs, mesh.faces, 48)
+    coarse = bake_texture(mesh, fine, camera, lambda i: (board, None), constant_field)
+    seen = coarse.provenance == Provenance.PHOTO
+    assert seen.sum() > 1000
+    assert np.abs(coarse.base_color[seen].astype(int) - 130).mean() < 12
+
+
 # ---------------------------------------------------------------- parts
 def test_gains_of_photos_that_share_nothing_are_one():
     colors = np.full((6, 2, 3), 100.0)
@@ -428,6 +463,17 @@ def test_padding_fills_everything_and_leaves_charts_alone():
     assert padded.sum() > 0
     assert not (padded & known).any()
     assert not padded[20:, 20:].any()
+
+
+def test_the_smooth_fill_lies_between_the_charts_colours():
+    image = np.zeros((64, 64, 3), np.uint8)
+    known = np.zeros((64, 64), bool)
+    known[:, :6] = known[:, 58:] = True
+    image[:, :6], image[:, 58:] = 40, 200
+    filled, _ = pad_charts(image, known, reach=2)
+    assert (filled[known] == image[known]).all()
+    assert 60 < filled[32, 32, 0] < 180
+    assert filled[32, 12, 0] < filled[32, 50, 0]
 
 
 # ---------------------------------------------------------------- renderer
