@@ -255,14 +255,20 @@ def best_view(capture: Capture, texels: Texels) -> tuple[np.ndarray, np.ndarray]
 
 
 def held_out_mean(capture: Capture, texels: Texels) -> np.ndarray:
-    """The mean of the held-out photos themselves: about the best that colours fixed to the surface can score."""
+    """The mean of the held-out photos themselves: about the best that colours fixed to the surface can score.
+
+    At depth edges no photo is trusted; colours come from a few texels off, as padding's do.
+    """
+    from stages.meshing.padding import pad_charts
+
     points, normals = _surface_points(capture.atlas, texels.face_ids, texels.corner)
     total, count = np.zeros((len(texels), 3)), np.zeros((len(texels), 1))
     for index in capture.held_out:
         weights, colors = _observe(capture, index, points, normals)
         total += np.sqrt(weights)[:, None] * colors
         count += np.sqrt(weights)[:, None]
-    return _paint(texels, total / np.maximum(count, 1e-12))
+    colors = np.clip(total / np.maximum(count, 1e-12) + 0.5, 0, 255).astype(np.uint8)
+    return pad_charts(texels.paint(colors)[0], texels.paint(count > 0)[0][..., 0])[0]
 
 
 def baked(capture: Capture, texels: Texels, **options: Any) -> np.ndarray:
@@ -426,9 +432,10 @@ def scores_table(results: Sequence[SetResult]) -> str:
         "chart borders", "photo borders",
     ]  # fmt: skip
     rows = []
+    order = [OURS, VERTEX, NAIVE, BOUND, *VARIANTS]
     for result in results:
         base = {row.name: row.psnr for row in result.scores}
-        for row in result.scores:
+        for row in sorted(result.scores, key=lambda row: order.index(row.name)):
             rows.append(
                 [
                     result.name, row.name, f"{row.psnr:.2f}", f"{row.psnr - base[VERTEX]:+.2f}",
