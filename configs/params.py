@@ -158,7 +158,9 @@ class CleanupParams(Section):
 class AtlasParams(Section):
     """Mesh to UV charts."""
 
-    texture_size: int = Field(2048, ge=64, le=16384, description="side of the texture, pixels")
+    texture_size: int | None = Field(
+        None, ge=64, le=16384, description="side of the texture, pixels; null: as large as the photos can fill"
+    )
     padding: int = Field(4, ge=1, le=64, description="texels kept free between charts")
     time_limit: float = Field(120.0, gt=0, description="seconds before the fallback parametrisation takes over")
 
@@ -166,11 +168,14 @@ class AtlasParams(Section):
 class BakeParams(Section):
     """Photos to texture."""
 
-    views: int = Field(8, ge=1, le=32, description="photos blended for the low band, the best ones for each texel")
-    detail: bool = Field(True, description="add the high band of the single best photo")
+    views: int = Field(24, ge=1, le=32, description="photos blended, the best ones for each texel")
+    detail: bool = Field(True, description="add the high band of the photos that resolve the most")
     gain: bool = Field(True, description="compensate brightness between photos")
+    diffuse: bool = Field(
+        False, description="count photos that show a point brighter than the others do less: fewer highlights"
+    )
     robust_sigma: float = Field(
-        2.5, gt=0, description="colours further than this many (robust) standard deviations are rejected"
+        6.0, gt=0, description="colours further than this many (robust) standard deviations are rejected"
     )
     normal_map: bool = Field(True, description="keep the detail that decimation takes away as a normal map")
     occlusion_rays: int = Field(64, ge=0, le=4096, description="rays per sample of the occlusion map; 0: no such map")

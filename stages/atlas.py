@@ -19,21 +19,22 @@ def run(context: StageContext) -> dict[str, Any]:
 
     params = context.params
     vertices, faces = artifacts.load_mesh(context.inputs["cleanup"])
+    size = params.texture_size or _fitting_size(context, vertices, faces)
     context.progress(0, 1, f"charts for {len(faces)} faces")
     method, why = "xatlas", ""
     try:
-        layout = atlas.unwrap_xatlas(vertices, faces, params.texture_size, params.padding, params.time_limit)
+        layout = atlas.unwrap_xatlas(vertices, faces, size, params.padding, params.time_limit)
     except (atlas.AtlasTimeoutError, atlas.AtlasProcessError) as error:
         method, why = "projected", str(error)
         logger.warning("%s; projecting along the axes instead", error)
         try:
-            layout = atlas.unwrap_projected(vertices, faces, params.texture_size, params.padding)
+            layout = atlas.unwrap_projected(vertices, faces, size, params.padding)
         except ValueError as misfit:
             raise ReconstructionError(
                 f"The charts do not fit the texture: {misfit}.",
-                f"Try `--set atlas.texture_size={2 * params.texture_size}`, or `--set cleanup.target_faces=20000`.",
+                f"Try `--set atlas.texture_size={2 * size}`, or `--set cleanup.target_faces=20000`.",
             ) from misfit
-    uvs = layout.texels / params.texture_size
+    uvs = layout.texels / size
     artifacts.save_atlas(
         context.out,
         artifacts.AtlasMesh(
@@ -41,7 +42,7 @@ def run(context: StageContext) -> dict[str, Any]:
             normals=atlas.smooth_normals(vertices, faces, layout.source),
             uvs=np.clip(uvs, 0, 1).astype(np.float32),
             faces=layout.faces,
-            texture_size=params.texture_size,
+            texture_size=size,
         ),
     )
     corners = uvs[layout.faces]
@@ -49,6 +50,7 @@ def run(context: StageContext) -> dict[str, Any]:
     used = np.abs(edges[:, 0, 0] * edges[:, 1, 1] - edges[:, 0, 1] * edges[:, 1, 0]).sum() / 2
     return {
         "method": method,
+        "texture_size": size,
         "fallback_reason": why,
         "charts": int(layout.charts.max()) + 1,
         "faces": len(faces),
@@ -57,6 +59,19 @@ def run(context: StageContext) -> dict[str, Any]:
     }
 
 
+def _fitting_size(context: StageContext, vertices: np.ndarray, faces: np.ndarray) -> int:
+    """The size of texture that the photos can fill."""
+    from stages.meshing.footprint import pixels_per_area, texture_size_for
+
+    cameras = artifacts.load_scene(context.inputs["undistort"]).cameras
+    return texture_size_for(*pixels_per_area(vertices, faces, cameras))
+
+
 ATLAS = Stage(
-    name="atlas", version=1, needs=("cleanup",), params="atlas", run=run, summary="UV charts without overlaps"
+    name="atlas",
+    version=2,
+    needs=("undistort", "cleanup"),
+    params="atlas",
+    run=run,
+    summary="UV charts without overlaps",
 )

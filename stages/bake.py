@@ -17,6 +17,7 @@ def run(context: StageContext) -> dict[str, Any]:
     """Bake the textures. Returns `stages.meshing.baking.Baked.numbers`, and how much of the normal map is known."""
     from stages.meshing.baking import bake_texture
     from stages.meshing.quality import measure_quality
+    from stages.meshing.rasterizing import rasterize_atlas
     from stages.meshing.relief import bake_normals, bake_occlusion
     from stages.neural.field import load_field
 
@@ -27,16 +28,18 @@ def run(context: StageContext) -> dict[str, Any]:
     atlas = artifacts.load_atlas(context.inputs["atlas"])
     field = load_field(artifacts.field_path(context.inputs["train"]), context.device)
     params = context.params
+    texels = rasterize_atlas(atlas.uvs, atlas.faces, atlas.texture_size)
     try:
         baked = bake_texture(
             atlas,
+            texels,
             cameras,
             lambda index: load_photo(undistorted, cameras, index),
             field.color,
-            atlas.texture_size,
             views=params.views,
             detail=params.detail,
             gain=params.gain,
+            diffuse=params.diffuse,
             robust_sigma=params.robust_sigma,
             workers=context.workers,
             listener=context.progress,
@@ -50,6 +53,7 @@ def run(context: StageContext) -> dict[str, Any]:
     artifacts.write_png(artifacts.provenance_path(context.out), baked.provenance)
     quality = measure_quality(
         atlas,
+        texels,
         cameras,
         lambda index: load_photo(undistorted, cameras, index),
         baked.provenance,
@@ -61,14 +65,14 @@ def run(context: StageContext) -> dict[str, Any]:
     if params.normal_map:
         full = artifacts.load_mesh(context.inputs["cleanup"], artifacts.FULL_MESH)
         normal_map, met = bake_normals(
-            atlas, *full, atlas.texture_size, lambda done, total: context.progress(done, total, "normals")
+            atlas, texels, *full, lambda done, total: context.progress(done, total, "normals")
         )
         artifacts.write_png(artifacts.normal_map_path(context.out), normal_map)
         numbers["normals_share"] = round(met, 4)
     if params.occlusion_rays > 0:
         occlusion = bake_occlusion(
             atlas,
-            atlas.texture_size,
+            texels,
             params.occlusion_rays,
             params.occlusion_reach,
             lambda done, total: context.progress(done, total, "occlusion"),
@@ -86,7 +90,7 @@ def load_photo(undistorted: Path, cameras: PinholeCameras, index: int) -> tuple[
 
 BAKE = Stage(
     name="bake",
-    version=5,
+    version=6,
     needs=("undistort", "train", "cleanup", "atlas"),
     params="bake",
     run=run,

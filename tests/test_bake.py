@@ -10,10 +10,9 @@ import pytest
 
 from stages.artifacts import AtlasMesh
 from stages.geometry.cameras import PinholeCameras
-from stages.meshing.baking import Baked, Provenance, bake_texture, label_costs
-from stages.meshing.filling import harmonic_offsets
+from stages.meshing.baking import Baked, Provenance, bake_texture
+from stages.meshing.filling import face_neighbors, harmonic_offsets
 from stages.meshing.gains import solve_gains
-from stages.meshing.labels import UNSEEN, choose_labels, face_neighbors
 from stages.meshing.padding import pad_charts
 from stages.meshing.rasterizing import (
     NO_FACE,
@@ -132,19 +131,19 @@ def constant_field(points, normals, view_dirs):
 def bake(mesh, cameras, photos, masks=None, field=constant_field, **options) -> Baked:
     return bake_texture(
         mesh,
+        rasterize_atlas(mesh.uvs, mesh.faces, SIZE),
         cameras,
         lambda i: (photos[i], None if masks is None else masks[i]),
         field,
-        SIZE,
         workers=WORKERS,
         **options,
     )
 
 
 def texel_truth(mesh: AtlasMesh, paint=true_color) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    texels, face_ids, corner = rasterize_atlas(mesh.uvs, mesh.faces, SIZE)
-    points = np.einsum("pc,pcd->pd", corner, mesh.vertices[mesh.faces[face_ids]])
-    return texels, points, paint(points)
+    texels = rasterize_atlas(mesh.uvs, mesh.faces, SIZE)
+    points = np.einsum("pc,pcd->pd", texels.corner, mesh.vertices[mesh.faces[texels.face_ids]])
+    return texels.index, points, paint(points)
 
 
 @pytest.fixture(scope="module")
@@ -187,10 +186,10 @@ def test_atlas_texels_lie_on_their_faces_whichever_way_the_chart_is_turned():
     mesh = box(cells=3)
     mirrored = replace(mesh, uvs=np.stack([1 - mesh.uvs[:, 0], mesh.uvs[:, 1]], 1))
     for atlas in (mesh, mirrored):
-        texels, face_ids, corner = rasterize_atlas(atlas.uvs, atlas.faces, 64)
-        uv = np.einsum("pc,pcd->pd", corner, atlas.uvs[atlas.faces[face_ids]])
-        np.testing.assert_allclose(uv[:, 0], (texels % 64 + 0.5) / 64, atol=1e-5)
-        np.testing.assert_allclose(uv[:, 1], 1 - (texels // 64 + 0.5) / 64, atol=1e-5)
+        texels = rasterize_atlas(atlas.uvs, atlas.faces, 64)
+        uv = np.einsum("pc,pcd->pd", texels.corner, atlas.uvs[atlas.faces[texels.face_ids]])
+        np.testing.assert_allclose(uv[:, 0], (texels.index % 64 + 0.5) / 64, atol=1e-5)
+        np.testing.assert_allclose(uv[:, 1], 1 - (texels.index // 64 + 0.5) / 64, atol=1e-5)
     assert len(texels) == pytest.approx(64**2 * 6 / 9 * 0.88**2, rel=0.05)
 
 
@@ -376,6 +375,41 @@ def test_charts_without_texels_are_refused(capture):
         bake(replace(mesh, uvs=np.zeros_like(mesh.uvs)), cameras, photos)
 
 
+def test_a_texture_done_in_parts_is_the_same(capture, baked, monkeypatch):
+    monkeypatch.setattr("stages.meshing.baking.BAND_BYTES", 16 * 25 * 3000)
+    monkeypatch.setattr("stages.meshing.baking.KEPT_BYTES", 0)  # and photos are made ready anew for each
+    monkeypatch.setattr("stages.meshing.baking._CHUNK", 1000)
+    again = bake(*capture)
+    assert (again.base_color == baked.base_color).all()
+    assert again.numbers == baked.numbers
+
+
+def test_a_blurred_photo_counts_less(capture):
+    import cv2
+
+    mesh, cameras, _ = capture
+
+    def rough(points):
+        return true_color(points) + 25 * np.sign(np.sin(60 * points[:, :1]) * np.sin(60 * points[:, 1:2] + 1))
+
+    sharp = [photograph(mesh, cameras, i, rough) for i in range(len(cameras))]
+    blurred = [cv2.GaussianBlur(p, (0, 0), 3) if i % 2 else p for i, p in enumerate(sharp)]
+    assert bake(mesh, cameras, sharp).numbers["blurred_photos"] == 0
+    assert bake(mesh, cameras, blurred[:-1] + sharp[-1:]).numbers["blurred_photos"] == 7
+
+
+def test_photos_finer_than_the_texels_do_not_alias():
+    """A checkerboard of pixels, too fine for the texture, becomes its mean."""
+    mesh = join([quad((0, 0, 0), X, Z, 0.5, 4, (0, 0), 1)])
+    camera = look_at(np.array([0.0, -2.0, 0]), np.zeros(3), Z, 400, 400, 30)
+    board = np.where(np.indices((400, 400)).sum(0)[..., None] % 2, 200, 60).astype(np.uint8).repeat(3, 2)
+    fine = rasterize_atlas(mesh.uvs, mesh.faces, 48)
+    coarse = bake_texture(mesh, fine, camera, lambda i: (board, None), constant_field)
+    seen = coarse.provenance == Provenance.PHOTO
+    assert seen.sum() > 1000
+    assert np.abs(coarse.base_color[seen].astype(int) - 130).mean() < 12
+
+
 # ---------------------------------------------------------------- parts
 def test_gains_of_photos_that_share_nothing_are_one():
     colors = np.full((6, 2, 3), 100.0)
@@ -404,33 +438,10 @@ def test_sheen_is_not_taken_for_gain():
     np.testing.assert_allclose(gains[1] / gains[0], 1, atol=0.03)
 
 
-def test_labels_prefer_smoothness_over_a_slightly_better_photo():
-    neighbors = np.stack([np.arange(9), np.arange(1, 10)], 1)
-    cost = np.zeros((10, 2), np.float32)
-    cost[:, 1] = 1.0
-    cost[4] = [0.5, 0.0]  # one face would like the other photo, a little
-    assert (choose_labels(cost, neighbors, smoothness=1.0) == 0).all()
-    cost[4] = [5.0, 0.0]  # or a lot
-    assert choose_labels(cost, neighbors, smoothness=1.0)[4] == 1
-    cost[7] = np.inf
-    assert choose_labels(cost, neighbors, smoothness=1.0)[7] == UNSEEN
-
-
 def test_neighbours_reach_across_uv_seams():
     mesh = box(cells=1)  # 12 faces, every edge shared by two of them
     pairs = face_neighbors(mesh.vertices, mesh.faces)
     assert len(pairs) == 18
-
-
-def test_label_costs_rise_with_weaker_and_with_odd_photos():
-    weights = np.array([[4.0, 2.0, 1.0, 0.0, 4.0]])
-    colors = np.full((1, 5, 3), 100.0)
-    colors[0, 4] = 160
-    cost = label_costs(weights, colors)[0]
-    assert cost[0] == 0
-    assert cost[1] == pytest.approx(np.log(2), rel=1e-4)
-    assert np.isinf(cost[3])
-    assert cost[4] > cost[2]
 
 
 def test_offsets_between_two_known_faces_are_their_blend():
@@ -452,6 +463,17 @@ def test_padding_fills_everything_and_leaves_charts_alone():
     assert padded.sum() > 0
     assert not (padded & known).any()
     assert not padded[20:, 20:].any()
+
+
+def test_the_smooth_fill_lies_between_the_charts_colours():
+    image = np.zeros((64, 64, 3), np.uint8)
+    known = np.zeros((64, 64), bool)
+    known[:, :6] = known[:, 58:] = True
+    image[:, :6], image[:, 58:] = 40, 200
+    filled, _ = pad_charts(image, known, reach=2)
+    assert (filled[known] == image[known]).all()
+    assert 60 < filled[32, 32, 0] < 180
+    assert filled[32, 12, 0] < filled[32, 50, 0]
 
 
 # ---------------------------------------------------------------- renderer

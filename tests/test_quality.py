@@ -18,6 +18,7 @@ from stages.meshing.quality import (
     measure_quality,
     texel_density,
 )
+from stages.meshing.rasterizing import Texels, rasterize_atlas
 
 
 def ball() -> AtlasMesh:
@@ -36,12 +37,16 @@ def square(size: int = 32) -> AtlasMesh:
     return AtlasMesh(corners, normals, corners[:, :2] / 4, np.array([[0, 1, 2], [0, 2, 3]], np.int32), size)
 
 
+def texels_of(atlas: AtlasMesh) -> Texels:
+    return rasterize_atlas(atlas.uvs, atlas.faces, atlas.texture_size)
+
+
 @pytest.fixture(scope="module")
 def measured():
     cameras, atlas = ring_of_cameras(8, 96, 80), ball()
     provenance = np.full((64, 64), Provenance.PHOTO, np.uint8)
     photos = [render(cameras, i)[0] for i in range(8)]
-    even = measure_quality(atlas, cameras, lambda i: (photos[i], None), provenance, np.ones((8, 3)))
+    even = measure_quality(atlas, texels_of(atlas), cameras, lambda i: (photos[i], None), provenance, np.ones((8, 3)))
     return cameras, atlas, photos, even
 
 
@@ -65,7 +70,7 @@ def test_photos_that_show_one_ball_agree_and_a_strange_one_is_noticed(measured):
     cameras, atlas, photos, quality = measured
     strange = [*photos[:3], 255 - photos[3], *photos[4:]]
     provenance = np.full((64, 64), Provenance.PHOTO, np.uint8)
-    worse = measure_quality(atlas, cameras, lambda i: (strange[i], None), provenance, np.ones((8, 3)))
+    worse = measure_quality(atlas, texels_of(atlas), cameras, lambda i: (strange[i], None), provenance, np.ones((8, 3)))
     before_it = atlas.normals @ cameras.centers[3] / np.linalg.norm(cameras.centers[3]) > 0.8
     assert np.median(worse.ambiguity[before_it]) > 3 * np.median(quality.ambiguity[before_it])
 
@@ -76,7 +81,7 @@ def test_gains_take_a_brighter_photo_back(measured):
     gains[2] = 2
     darker = [*photos[:2], photos[2] // 2, *photos[3:]]
     provenance = np.full((64, 64), Provenance.PHOTO, np.uint8)
-    again = measure_quality(atlas, cameras, lambda i: (darker[i], None), provenance, gains)
+    again = measure_quality(atlas, texels_of(atlas), cameras, lambda i: (darker[i], None), provenance, gains)
     np.testing.assert_allclose(again.ambiguity, quality.ambiguity, atol=0.03)
 
 
@@ -107,13 +112,13 @@ def test_precision_is_the_inverse_covariance_with_a_floor():
 def test_texels_per_unit_and_the_share_that_no_photo_saw():
     np.testing.assert_allclose(texel_density(square(32)), 8)  # 16 texels on a side of 2
     provenance = np.full((32, 32), Provenance.PHOTO, np.uint8)
-    assert (invented_share(square(), provenance) == 0).all()
+    assert (invented_share(square(), texels_of(square()), provenance) == 0).all()
     provenance[:] = Provenance.FIELD
-    assert (invented_share(square(), provenance) == 1).all()
+    assert (invented_share(square(), texels_of(square()), provenance) == 1).all()
     texels = {(x, y) for x, y in itertools.product(range(16), range(16)) if y > x}  # of the face that has corner 3
     for x, y in texels:
         provenance[31 - y, x] = Provenance.PHOTO
-    share = invented_share(square(), provenance)
+    share = invented_share(square(), texels_of(square()), provenance)
     assert share[1] > 0.99
     assert share[3] == 0
     assert share[0] == pytest.approx(0.5, abs=0.06)

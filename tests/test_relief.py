@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stages.artifacts import AtlasMesh
-from stages.meshing.rasterizing import rasterize_atlas
+from stages.meshing.rasterizing import Texels, rasterize_atlas
 from stages.meshing.relief import FLAT, bake_normals, bake_occlusion, sky_seen, spread_samples
 from stages.meshing.tangents import to_tangent_space, vertex_tangents
 
@@ -39,9 +39,14 @@ def bumpy(cells: int = 150) -> tuple[np.ndarray, np.ndarray]:
     return np.stack([x, y, height(x, y)], 1).astype(np.float32), faces.astype(np.int32)
 
 
+def texels_of(atlas: AtlasMesh, size: int = SIZE) -> Texels:
+    return rasterize_atlas(atlas.uvs, atlas.faces, size)
+
+
 def shaded_normals(atlas: AtlasMesh, image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Positions and normals [T, 3] that a glTF viewer makes of the map at the texels: x t + y b + z n."""
-    texels, face_ids, corner = rasterize_atlas(atlas.uvs, atlas.faces, len(image))
+    rastered = texels_of(atlas, len(image))
+    texels, face_ids, corner = rastered.index, rastered.face_ids, rastered.corner
     tangents = vertex_tangents(atlas.vertices, atlas.normals, atlas.uvs, atlas.faces)
     points, n, t = (
         np.einsum("tk,tkc->tc", corner, values[atlas.faces[face_ids]])
@@ -69,14 +74,14 @@ def angles_deg(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 )
 def test_bumps_on_a_plane_come_back_however_the_chart_lies(uvs, tangent, bitangent):
     atlas = sheet(uvs)
-    image, met = bake_normals(atlas, *bumpy(), SIZE)
+    image, met = bake_normals(atlas, texels_of(atlas), *bumpy())
     assert met == 1.0
     points, shaded = shaded_normals(atlas, image)
     expected = height_normals(points[:, 0], points[:, 1])
     assert angles_deg(expected, np.array([[0.0, 0, 1]])).max() > 6  # the bumps are worth a map
     assert angles_deg(shaded, expected).max() < 0.6  # half a level is 0.3 degrees
     # the same from the pixels alone: red is along u, green along v upwards
-    texels, _, _ = rasterize_atlas(atlas.uvs, atlas.faces, SIZE)
+    texels = texels_of(atlas).index
     red, green, _ = (image.reshape(-1, 3)[texels] / 127.5 - 1).T
     np.testing.assert_allclose(red, expected @ tangent, atol=0.01)
     np.testing.assert_allclose(green, expected @ bitangent, atol=0.01)
@@ -85,7 +90,7 @@ def test_bumps_on_a_plane_come_back_however_the_chart_lies(uvs, tangent, bitange
 def test_a_plane_far_from_the_full_mesh_or_facing_away_from_it_stays_flat():
     vertices, faces = bumpy(20)
     for full in ((vertices + np.float32([0, 0, 3]), faces), (vertices, faces[:, ::-1])):
-        image, met = bake_normals(sheet(), *full, SIZE)
+        image, met = bake_normals(sheet(), texels_of(sheet()), *full)
         assert met == 0.0
         assert (image == FLAT).all()
 
@@ -113,11 +118,11 @@ def test_a_sphere_decimated_to_an_icosahedron_shades_as_a_sphere():
     flat = np.repeat(flat / np.linalg.norm(flat, axis=1, keepdims=True), 3, axis=0).astype(np.float32)
     for normals in (atlas.normals, flat):
         model = AtlasMesh(atlas.vertices, normals, atlas.uvs, atlas.faces, 128)
-        image, met = bake_normals(model, sphere.vertices, sphere.faces.astype(np.int32), 128)
+        image, met = bake_normals(model, texels_of(model, 128), sphere.vertices, sphere.faces.astype(np.int32))
         assert met == 1.0
         points, shaded = shaded_normals(model, image)
         if normals is flat:  # the ray goes straight up from the face and meets the sphere there
-            up = flat.reshape(20, 3, 3)[rasterize_atlas(atlas.uvs, atlas.faces, 128)[1], 0]
+            up = flat.reshape(20, 3, 3)[texels_of(atlas, 128).face_ids, 0]
             along = (points * up).sum(1, keepdims=True)
             points = points + up * (np.sqrt(1 - (points**2).sum(1, keepdims=True) + along**2) - along)
         expected = points / np.linalg.norm(points, axis=1, keepdims=True)
@@ -189,7 +194,7 @@ def test_a_floor_beside_a_wall_sees_the_known_part_of_the_sky():
 
 def test_the_map_of_a_floor_beside_a_wall_and_nothing_bleeds_between_charts():
     atlas = floor_and_wall()
-    image = bake_occlusion(atlas, SIZE, rays=256, reach=1e4)
+    image = bake_occlusion(atlas, texels_of(atlas), rays=256, reach=1e4)
     row = image[SIZE // 2] / 255
     x = (np.arange(30) + 0.5) / (0.48 * SIZE)
     np.testing.assert_allclose(row[:30][2:-2], beside_a_wall(x)[2:-2], atol=0.04)
@@ -202,7 +207,7 @@ def test_a_convex_body_is_open_everywhere():
     flat = np.cross(atlas.vertices[1::3] - atlas.vertices[::3], atlas.vertices[2::3] - atlas.vertices[::3])
     flat = np.repeat(flat / np.linalg.norm(flat, axis=1, keepdims=True), 3, axis=0).astype(np.float32)
     model = AtlasMesh(atlas.vertices, flat, atlas.uvs, atlas.faces, 64)
-    assert (bake_occlusion(model, 64, rays=32) == 255).all()
+    assert (bake_occlusion(model, texels_of(model, 64), rays=32) == 255).all()
 
 
 def test_samples_are_carried_between_squares_linearly_and_not_across_space():

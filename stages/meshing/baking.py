@@ -1,10 +1,10 @@
-"""Photos to texture: visibility, gains, a robust low band, one photo's high band, and what no photo saw.
+"""Photos to texture: visibility, gains, a robust mean in two bands, and what no photo saw.
 
 1. Each photo gets a depth map of the mesh, a trust map that fades near depth edges, and two bands (`views`).
-2. Face centres and sample texels seen by several photos give the gains (`gains`) and each face's label
-   (`labels`).
-3. Each texel collects its best views (`observing`): low band = robust mean of them, high band = that of the
-   face's label. Only the low band could show a seam, and it is the one that is averaged.
+2. A sample of texels, seen by several photos, gives the gains (`gains`) and tells blurred photos (`sharpness`).
+3. Each texel collects its best views (`observing`): low band = robust mean of many, high band = robust mean of those
+   that resolve the most. Weights change smoothly over the surface and fade out before a view leaves the set, so
+   there are no borders between photos, and no seams to level.
 4. Texels no photo saw take the colour field's answer, shifted to meet the photos (`filling`); then the
    charts are padded (`padding`).
 """
@@ -21,13 +21,13 @@ import numpy as np
 
 from stages.artifacts import AtlasMesh
 from stages.geometry.cameras import PinholeCameras
-from stages.meshing.filling import harmonic_offsets, vertex_means
+from stages.meshing.filling import face_neighbors, harmonic_offsets, vertex_means
 from stages.meshing.gains import solve_gains
-from stages.meshing.labels import choose_labels, face_neighbors
 from stages.meshing.observing import blend_texels, gather_texels, sample_points
 from stages.meshing.padding import pad_charts
-from stages.meshing.rasterizing import rasterize_atlas, surface_points
-from stages.meshing.views import View, prepare_view
+from stages.meshing.rasterizing import Texels, surface_points
+from stages.meshing.sharpness import BLURRED, sharpness_of_photos
+from stages.meshing.views import BYTES_PER_PIXEL, View, prepare_view
 
 # (photo index) -> [H, W, 3] uint8 RGB and [H, W] bool mask or None.
 LoadPhoto = Callable[[int], tuple[np.ndarray, np.ndarray | None]]
@@ -35,20 +35,15 @@ LoadPhoto = Callable[[int], tuple[np.ndarray, np.ndarray | None]]
 ColorField = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 Listener = Callable[[float, float, str], None]
 
-# Extra texels that take part in solving the gains.
-GAIN_SAMPLES = 20_000
-# A photo whose colour lies this far (levels) off the other photos' pays as much as one with 1/e of the best
-# weight.
-CONSISTENCY_LEVELS = 12.0
-# Price of a border between labels, in the same unit.
-SMOOTHNESS = 0.7
-# See `observing.blend_texels`.
-GHOST_LEVELS = 25.0
+# Texels that take part in comparing photos.
+SAMPLES = 20_000
+# Texels blended at a time: the buffers take 16 bytes a texel and kept view. More texels go over the photos again.
+BAND_BYTES = 1 << 30
+# Prepared photos that stay in memory for the next pass; the others are made again.
+KEPT_BYTES = 1 << 30
 # Texels handed to a thread at a time.
 _CHUNK = 250_000
-# Faces whose labels are priced at a time.
-_FACES = 10_000
-# Photos made ready ahead of use: each takes 23 bytes a pixel.
+# Photos made ready ahead of use.
 _MAX_AHEAD = 8
 
 
@@ -80,14 +75,15 @@ class Baked:
 
 def bake_texture(
     atlas: AtlasMesh,
+    texels: Texels,
     cameras: PinholeCameras,
     load_photo: LoadPhoto,
     color_field: ColorField,
-    texture_size: int,
-    views: int = 8,
+    views: int = 24,
     detail: bool = True,
     gain: bool = True,
-    robust_sigma: float = 2.5,
+    diffuse: bool = False,
+    robust_sigma: float = 6.0,
     workers: int = 1,
     listener: Listener | None = None,
 ) -> Baked:
@@ -95,13 +91,14 @@ def bake_texture(
 
     Args:
         atlas: mesh with UVs, scene frame.
+        texels: the atlas rasterised, see `rasterizing.rasterize_atlas`.
         cameras: N posed photos.
         load_photo: gives photo and mask of a camera.
         color_field: answers where no photo saw the surface.
-        texture_size: side in texels.
-        views: photos in the low band of a texel.
+        views: photos that make a texel, the best ones.
         detail: add the high band.
         gain: compensate gains.
+        diffuse: count views that are brighter than the others less: see `observing.blend_texels`.
         robust_sigma: colours further than this many robust standard deviations are rejected.
         workers: threads.
         listener: told (done, total, note).
@@ -110,57 +107,83 @@ def bake_texture(
         ValueError: the atlas covers no texel, or a photo is not of its camera's size.
     """
     tell = listener or (lambda done, total, note: None)
-    texels, face_ids, corner = rasterize_atlas(atlas.uvs, atlas.faces, texture_size)
-    if not len(texels):
-        raise ValueError(f"expected charts covering texels of a {texture_size}² texture, got none")
-    points, normals = surface_points(atlas, face_ids, corner)
-    num_views = len(cameras)
-
+    size, count, num_views = texels.size, len(texels), len(cameras)
+    if not count:
+        raise ValueError(f"expected charts covering texels of a {size}² texture, got none")
+    colors = np.zeros((count, 3), dtype=np.uint8)
+    seen_by = np.zeros(count, dtype=np.uint16)
+    per_band = max(BAND_BYTES // (16 * (views + 1)), _CHUNK)
+    bands = [slice(start, min(start + per_band, count)) for start in range(0, count, per_band)]
+    total = num_views * (1 + len(bands))
     with ThreadPoolExecutor(max_workers=max(1, workers)) as pool:
-        prepare = partial(_prepare, atlas, cameras, load_photo)
-        labels = np.full(len(atlas.faces), -1, dtype=np.int32)
-        gains = np.ones((num_views, 3))
-        if num_views and (detail or gain):
-            gains, labels = _gains_and_labels(
-                atlas, points, normals, num_views, _prefetch(pool, prepare, num_views, workers), gain, tell
-            )
-        texel_labels = labels[face_ids] if detail else np.full(len(face_ids), -1, dtype=np.int32)
-        colors, seen_by = _blend(
-            pool, points, normals, texel_labels, gains, detail,
-            _prefetch(pool, prepare, num_views, workers), num_views, views, robust_sigma, tell,
-        )  # fmt: skip
+        prepare = _Prepare(atlas, cameras, load_photo, _texel_side(atlas, count))
+        gains, sharpness = _compare(atlas, texels, _prefetch(pool, prepare, num_views, workers), num_views, tell, total)
+        if not gain:
+            gains = np.ones((num_views, 3))
+        blend = partial(blend_texels, detail=detail, robust_sigma=robust_sigma, diffuse=diffuse)
+        for number, band in enumerate(bands):
+            begun = num_views * (1 + number)
+            _blend(
+                pool, *surface_points(atlas, texels.face_ids[band], texels.corner[band]), gains, sharpness,
+                _prefetch(pool, prepare, num_views, workers), views, blend, colors[band], seen_by[band],
+                partial(_tell_blending, tell, begun, total),
+            )  # fmt: skip
+        prepare.kept.clear()
 
     seen = seen_by > 0
-    _fill_unseen(colors, seen, atlas, face_ids, corner, points, normals, color_field)
-    image = np.zeros((texture_size * texture_size, 3), dtype=np.uint8)
-    image[texels] = np.clip(colors + 0.5, 0, 255).astype(np.uint8)
-    provenance = np.full(texture_size * texture_size, Provenance.OUTSIDE, dtype=np.uint8)
-    provenance[texels] = np.where(seen, Provenance.PHOTO, Provenance.FIELD)
-    square = (texture_size, texture_size)
-    filled, padded = pad_charts(image.reshape(*square, 3), (provenance != Provenance.OUTSIDE).reshape(square))
-    provenance = provenance.reshape(square)
+    _fill_unseen(colors, seen, atlas, texels, color_field)
+    image, inside = texels.paint(colors)
+    filled, padded = pad_charts(image, inside)
+    origin = np.where(seen, Provenance.PHOTO, Provenance.FIELD).astype(np.uint8)
+    provenance = texels.paint(origin[:, None])[0][..., 0]
     provenance[padded] = Provenance.PADDING
-    tell(2 * num_views, 2 * num_views, "done")
+    tell(total, total, "done")
     return Baked(
         base_color=filled,
         provenance=provenance,
         gains=gains,
         numbers={
-            "texture_size": texture_size,
-            "texels": len(texels),
-            "coverage": round(len(texels) / texture_size**2, 4),
+            "texture_size": size,
+            "texels": count,
+            "coverage": round(count / size**2, 4),
             "seen_share": round(float(seen.mean()), 4),
             "filled_share": round(float(1 - seen.mean()), 4),
             "mean_views": round(float(seen_by[seen].mean()), 2) if seen.any() else 0.0,
             "gain_min": round(float(gains.min(initial=1.0)), 4),
             "gain_max": round(float(gains.max(initial=1.0)), 4),
+            "blurred_photos": int((sharpness < BLURRED).sum()),
         },
     )
 
 
-def _prepare(atlas: AtlasMesh, cameras: PinholeCameras, load_photo: LoadPhoto, index: int) -> View:
-    photo, mask = load_photo(index)
-    return prepare_view(cameras, index, photo, mask, atlas.vertices, atlas.faces)
+def _tell_blending(tell: Listener, begun: int, total: int, done: int) -> None:
+    tell(begun + done, total, "blending photos")
+
+
+def _texel_side(atlas: AtlasMesh, count: int) -> float:
+    """Mean side of a texel on the surface, scene units."""
+    corners = atlas.vertices[atlas.faces].astype(np.float64)
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum() / 2
+    return float(np.sqrt(area / count))
+
+
+class _Prepare:
+    """Makes photos ready for sampling, and keeps the first ones for the next pass."""
+
+    def __init__(self, atlas: AtlasMesh, cameras: PinholeCameras, load_photo: LoadPhoto, texel_side: float) -> None:
+        self.atlas, self.cameras, self.load_photo, self.texel_side = atlas, cameras, load_photo, texel_side
+        pixels = np.cumsum(cameras.sizes[:, 0] * cameras.sizes[:, 1])
+        self.keep = int(np.searchsorted(pixels * BYTES_PER_PIXEL, KEPT_BYTES, side="right"))
+        self.kept: dict[int, View] = {}
+
+    def __call__(self, index: int) -> View:
+        if index in self.kept:
+            return self.kept[index]
+        photo, mask = self.load_photo(index)
+        view = prepare_view(self.cameras, index, photo, mask, self.atlas.vertices, self.atlas.faces, self.texel_side)
+        if index < self.keep:
+            self.kept[index] = view
+        return view
 
 
 def _prefetch(pool: ThreadPoolExecutor, prepare: Callable[[int], View], count: int, ahead: int) -> Iterator[View]:
@@ -175,133 +198,68 @@ def _prefetch(pool: ThreadPoolExecutor, prepare: Callable[[int], View], count: i
         yield waiting.pop(0).result()
 
 
-def _gains_and_labels(
-    atlas: AtlasMesh,
-    points: np.ndarray,
-    normals: np.ndarray,
-    num_views: int,
-    prepared: Iterator[View],
-    gain: bool,
-    tell: Listener,
+def _compare(
+    atlas: AtlasMesh, texels: Texels, prepared: Iterator[View], num_views: int, tell: Listener, total: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Gains [N, 3] and the label of each face [F], from face centres and a sample of the texels."""
-    num_faces = len(atlas.faces)
-    thirds = np.full((num_faces, 3), 1 / 3, dtype=np.float32)
-    centers, center_normals = surface_points(atlas, np.arange(num_faces), thirds)
+    """Gains [N, 3] and sharpness [N] of the photos, from a sample of the texels."""
     rng = np.random.default_rng(0)
-    extra = rng.choice(len(points), size=min(GAIN_SAMPLES, len(points)), replace=False)
-    samples = np.concatenate([centers, points[extra]])
-    sample_normals = np.concatenate([center_normals, normals[extra]])
-    weights = np.zeros((num_views, len(samples)), dtype=np.float32)
-    colors = np.zeros((num_views, len(samples), 3), dtype=np.float32)
+    chosen = rng.choice(len(texels), size=min(SAMPLES, len(texels)), replace=False)
+    points, normals = surface_points(atlas, texels.face_ids[chosen], texels.corner[chosen])
+    weights = np.zeros((num_views, len(chosen)), dtype=np.float32)
+    colors = np.zeros((num_views, len(chosen), 3), dtype=np.float32)
+    lows = np.zeros_like(colors)
     for index, view in enumerate(prepared):
-        for part, image in ((slice(None, num_faces), view.low), (slice(num_faces, None), view.photo)):
+        for image, answer in ((view.low, lows), (view.photo, colors)):
             sample_points(
-                samples[part], sample_normals[part], view.matrix, view.center, view.focal,
-                view.inverse_depth, view.confidence, image, weights[index, part], colors[index, part],
+                points, normals, view.matrix, view.center, view.focal, view.inverse_depth, view.confidence, image,
+                weights[index], answer[index],
             )  # fmt: skip
-        tell(index + 1, 2 * num_views, "comparing photos")
-    gains = np.ones((num_views, 3))
-    if gain:
-        # From the photos themselves: their low bands mix neighbouring colours, more so in slanted views.
-        gains = solve_gains(colors[:, num_faces:].transpose(1, 0, 2), weights[:, num_faces:].T)
-    costs = np.empty((num_faces, num_views), dtype=np.float32)
-    # A part of the faces at a time: the steps on the way need several times the memory of the colours.
-    for start in range(0, num_faces, _FACES):
-        part = slice(start, min(start + _FACES, num_faces))
-        part_colors = colors[:, part].transpose(1, 0, 2) * gains.astype(np.float32)
-        costs[part] = label_costs(np.ascontiguousarray(weights[:, part].T), part_colors)
-    del colors, weights
-    labels = choose_labels(costs, face_neighbors(atlas.vertices, atlas.faces), SMOOTHNESS)
-    return gains, labels
-
-
-def label_costs(weights: np.ndarray, colors: np.ndarray) -> np.ndarray:
-    """What it costs to take a face's detail from a photo.
-
-    -log(weight / best weight) + (distance in colour from the face's median over photos /
-    CONSISTENCY_LEVELS)², the latter at most 9.
-
-    Args:
-        weights: [F, N], 0 where not seen.
-        colors: [F, N, 3] 0..255, gains applied.
-
-    Returns:
-        [F, N] float32, inf where not seen.
-    """
-    seen = weights > 0
-    best = weights.max(1, keepdims=True, initial=0)
-    cost = np.full(weights.shape, np.inf, dtype=np.float32)
-    hidden = np.where(seen[..., None], colors, np.nan).astype(np.float32)
-    # nanmedian by sorting (numpy's own is far slower): nan sorts last, the middle of the seen ones is the
-    # median.
-    ordered = np.sort(hidden, axis=1)
-    middle = np.maximum(seen.sum(1) - 1, 0) // 2
-    median = np.take_along_axis(ordered, middle[:, None, None], axis=1)
-    off = np.abs(hidden - median).max(2)[seen] / CONSISTENCY_LEVELS
-    ratio = (weights / np.maximum(best, 1e-20))[seen]
-    cost[seen] = np.minimum(off * off, 9.0) - np.log(np.maximum(ratio, 1e-20))
-    return cost
+        tell(index + 1, total, "comparing photos")
+    # From the photos themselves: their low bands mix neighbouring colours, more so in slanted views.
+    gains = solve_gains(colors.transpose(1, 0, 2), weights.T)
+    return gains, sharpness_of_photos((colors - lows).mean(2).T, weights.T)
 
 
 def _blend(
     pool: ThreadPoolExecutor,
     points: np.ndarray,
     normals: np.ndarray,
-    labels: np.ndarray,
     gains: np.ndarray,
-    detail: bool,
+    sharpness: np.ndarray,
     prepared: Iterator[View],
-    num_views: int,
     keep: int,
-    robust_sigma: float,
-    tell: Listener,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Colours [T, 3] float32 (0..255) and the number of photos that see each texel [T]."""
+    blend: Callable[..., None],
+    colors: np.ndarray,
+    seen_by: np.ndarray,
+    tell: Callable[[int], None],
+) -> None:
+    """Fill colors [T, 3] uint8 and the number of photos that see each texel [T]."""
     count = len(points)
     # One view more than is blended: the others' weights are measured against it.
     best_weights = np.zeros((count, keep + 1), dtype=np.float32)
     best_lows = np.zeros((count, keep + 1, 3), dtype=np.uint16)
-    seen_by = np.zeros(count, dtype=np.uint16)
-    detail_rank = np.zeros(count, dtype=np.float32)
-    details = np.zeros((count, 3), dtype=np.int16)
-    detail_lows = np.zeros((count, 3), dtype=np.uint16)
+    best_highs = np.zeros((count, keep + 1, 3), dtype=np.int16)
     chunks = [slice(start, min(start + _CHUNK, count)) for start in range(0, count, _CHUNK)]
 
     def offer(view: View, index: int, part: slice) -> None:
         gather_texels(
-            points[part], normals[part], labels[part] == index, view.matrix, view.center, view.focal,
-            view.inverse_depth, view.confidence, view.low, view.photo, gains[index],
-            best_weights[part], best_lows[part], seen_by[part],
-            detail_rank[part], details[part], detail_lows[part],
+            points[part], normals[part], view.matrix, view.center, view.focal, view.inverse_depth, view.confidence,
+            view.low, view.photo, gains[index], sharpness[index],
+            best_weights[part], best_lows[part], best_highs[part], seen_by[part],
         )  # fmt: skip
 
     for index, view in enumerate(prepared):
         list(pool.map(partial(offer, view, index), chunks))
-        tell(num_views + index + 1, 2 * num_views, "blending photos")
-    if not detail:
-        details[:] = 0
-    colors = np.zeros((count, 3), dtype=np.float32)
+        tell(index + 1)
 
     def finish(part: slice) -> None:
-        blend_texels(
-            best_weights[part], best_lows[part], details[part], detail_lows[part],
-            robust_sigma, GHOST_LEVELS, colors[part],
-        )  # fmt: skip
+        blend(best_weights[part], best_lows[part], best_highs[part], colors=colors[part])
 
     list(pool.map(finish, chunks))
-    return colors, seen_by
 
 
 def _fill_unseen(
-    colors: np.ndarray,
-    seen: np.ndarray,
-    atlas: AtlasMesh,
-    face_ids: np.ndarray,
-    corner: np.ndarray,
-    points: np.ndarray,
-    normals: np.ndarray,
-    color_field: ColorField,
+    colors: np.ndarray, seen: np.ndarray, atlas: AtlasMesh, texels: Texels, color_field: ColorField
 ) -> None:
     """Give unseen texels the field's colour plus the offset that photos have from the field nearby. In
     place."""
@@ -311,19 +269,24 @@ def _fill_unseen(
     num_faces = len(atlas.faces)
     # A face's known offset: photo minus field at one of its seen texels would be noisy, so compare face
     # means.
-    count = np.bincount(face_ids, minlength=num_faces)
-    count_seen = np.bincount(face_ids[seen], minlength=num_faces)
+    count = np.bincount(texels.face_ids, minlength=num_faces)
+    faces_seen = texels.face_ids[seen]
+    count_seen = np.bincount(faces_seen, minlength=num_faces)
     known = (count_seen > 0) & (2 * count_seen >= count)
     offsets = np.zeros((num_faces, 3))
     if known.any():
-        sums = [np.bincount(face_ids[seen], colors[seen, c], minlength=num_faces) for c in range(3)]
+        sums = [np.bincount(faces_seen, colors[seen, c], minlength=num_faces) for c in range(3)]
         photo_means = np.stack(sums, 1)[known] / count_seen[known, None]
         ids = np.flatnonzero(known)
         centers, center_normals = surface_points(atlas, ids, np.full((len(ids), 3), 1 / 3, dtype=np.float32))
         offsets[ids] = photo_means - 255.0 * color_field(centers, center_normals, -center_normals)
     spread = harmonic_offsets(known, offsets, face_neighbors(atlas.vertices, atlas.faces))
     at_vertices = vertex_means(spread, atlas.vertices, atlas.faces)
-    answer = 255.0 * color_field(points[unseen], normals[unseen], -normals[unseen])
-    for k in range(3):
-        answer = answer + corner[unseen, k, None] * at_vertices[atlas.faces[face_ids[unseen], k]]
-    colors[unseen] = np.clip(answer, 0, 255)
+    for start in range(0, len(unseen), _CHUNK):
+        part = unseen[start : start + _CHUNK]
+        faces, corner = texels.face_ids[part], texels.corner[part]
+        points, normals = surface_points(atlas, faces, corner)
+        answer = 255.0 * color_field(points, normals, -normals)
+        for k in range(3):
+            answer = answer + corner[:, k, None] * at_vertices[atlas.faces[faces, k]]
+        colors[part] = np.clip(answer + 0.5, 0, 255).astype(np.uint8)

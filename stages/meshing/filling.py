@@ -10,6 +10,19 @@ PULL = 2e-3
 _ITERATIONS = 300
 
 
+def face_neighbors(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Pairs [E, 2] of faces that share an edge. Vertices at one position count as one: UV seams do not part
+    faces."""
+    _, merged = np.unique(np.ascontiguousarray(vertices), axis=0, return_inverse=True)
+    corners = merged.reshape(-1)[faces].astype(np.int64)
+    edges = np.sort(np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]]), axis=1)
+    face_ids = np.tile(np.arange(len(faces)), 3)
+    key = edges[:, 0] * (len(vertices) + 1) + edges[:, 1]
+    order = np.argsort(key, kind="stable")
+    same = key[order][1:] == key[order][:-1]
+    return np.stack([face_ids[order[:-1][same]], face_ids[order[1:][same]]], 1)
+
+
 def harmonic_offsets(known: np.ndarray, offsets: np.ndarray, neighbors: np.ndarray) -> np.ndarray:
     """Carry offsets from known faces to the others, smoothly: a screened Laplace equation on the face graph.
 

@@ -17,6 +17,9 @@ STEPS_UNSIGNED = 64.0
 STEPS_SIGNED = 32.0
 # Robust spread (colour levels) never counts as less than this: photo noise.
 NOISE_FLOOR = 3.0
+# What photos count in the mean of either band is a power of their weight. Low: many photos, for sheen moves from one
+# to the next and none of them is right. High: rather those that resolve the most. Measured: docs/benchmarks.md.
+LOW_POWER, HIGH_POWER = 0.5, 1.0
 
 
 @njit(nogil=True, cache=True)
@@ -65,9 +68,9 @@ def _bilinear(image, u, v, c):  # pragma: no cover - compiled
 
 @njit(nogil=True, cache=True)
 def sample_points(
-    points, normals, matrix, center, focal, inverse_depth, confidence, low, weights, colors
+    points, normals, matrix, center, focal, inverse_depth, confidence, image, weights, colors
 ):  # pragma: no cover - compiled
-    """Fill weights [P] and low-band colours [P, 3] of one photo at points [P, 3]."""
+    """Fill weights [P] and bilinear colours [P, 3] of one photo (or a band of it) at points [P, 3]."""
     for i in range(points.shape[0]):
         weight, u, v = observe(
             points[i, 0], points[i, 1], points[i, 2], normals[i, 0], normals[i, 1], normals[i, 2],
@@ -76,19 +79,18 @@ def sample_points(
         weights[i] = weight
         if weight > 0:
             for c in range(3):
-                colors[i, c] = _bilinear(low, u, v, c)
+                colors[i, c] = _bilinear(image, u, v, c)
 
 
 @njit(nogil=True, cache=True)
 def gather_texels(
-    points, normals, preferred, matrix, center, focal, inverse_depth, confidence, low, photo, gain,
-    best_weights, best_lows, seen_by, detail_rank, details, detail_lows,
+    points, normals, matrix, center, focal, inverse_depth, confidence, low, photo, gain, sharpness,
+    best_weights, best_lows, best_highs, seen_by,
 ):  # fmt: skip # pragma: no cover - compiled
     """Offer one photo to texels [T].
 
-    Keeps each texel's best K views in best_weights [T, K] (descending) and best_lows [T, K, 3] uint16,
-    counts views in seen_by [T], and keeps the high band of the preferred view (preferred [T] bool), else of
-    the best one, in details [T, 3] int16 with that view's low band in detail_lows [T, 3] uint16.
+    Keeps each texel's best K views in best_weights [T, K] (descending), their low bands in best_lows [T, K, 3] uint16
+    and high bands in best_highs [T, K, 3] int16, and counts views in seen_by [T].
     """
     keep = best_weights.shape[1]
     for i in range(points.shape[0]):
@@ -96,57 +98,54 @@ def gather_texels(
             points[i, 0], points[i, 1], points[i, 2], normals[i, 0], normals[i, 1], normals[i, 2],
             matrix, center, focal, inverse_depth, confidence,
         )  # fmt: skip
+        weight *= sharpness
         if weight <= 0:
             continue
         seen_by[i] += 1
-        rank = np.inf if preferred[i] else weight
-        takes_detail = rank > detail_rank[i]
-        takes_low = weight > best_weights[i, keep - 1]
-        if not (takes_detail or takes_low):
+        if weight <= best_weights[i, keep - 1]:
             continue
         slot = keep - 1
-        if takes_low:
-            while slot > 0 and best_weights[i, slot - 1] < weight:
-                best_weights[i, slot] = best_weights[i, slot - 1]
-                for c in range(3):
-                    best_lows[i, slot, c] = best_lows[i, slot - 1, c]
-                slot -= 1
-            best_weights[i, slot] = weight
-        if takes_detail:
-            detail_rank[i] = rank
+        while slot > 0 and best_weights[i, slot - 1] < weight:
+            best_weights[i, slot] = best_weights[i, slot - 1]
+            for c in range(3):
+                best_lows[i, slot, c] = best_lows[i, slot - 1, c]
+                best_highs[i, slot, c] = best_highs[i, slot - 1, c]
+            slot -= 1
+        best_weights[i, slot] = weight
         for c in range(3):
             low_value = _bilinear(low, u, v, c)
-            fixed = np.uint16(min(low_value * gain[c], 1020.0) * STEPS_UNSIGNED + 0.5)
-            if takes_low:
-                best_lows[i, slot, c] = fixed
-            if takes_detail:
-                high = (_bilinear(photo, u, v, c) - low_value) * gain[c]
-                details[i, c] = np.int16(min(max(high, -1020.0), 1020.0) * STEPS_SIGNED)
-                detail_lows[i, c] = fixed
+            high = (_bilinear(photo, u, v, c) - low_value) * gain[c]
+            best_lows[i, slot, c] = np.uint16(min(low_value * gain[c], 1020.0) * STEPS_UNSIGNED + 0.5)
+            best_highs[i, slot, c] = np.int16(np.floor(min(max(high, -1020.0), 1020.0) * STEPS_SIGNED + 0.5))
 
 
 @njit(nogil=True, cache=True)
 def blend_texels(
-    best_weights, best_lows, details, detail_lows, robust_sigma, ghost_levels, colors
+    best_weights, best_lows, best_highs, detail, robust_sigma, diffuse, colors
 ):  # pragma: no cover - compiled
-    """Fill colors [T, 3] (0..255 float32) from the buffers of `gather_texels`.
+    """Fill colors [T, 3] uint8 from the buffers of `gather_texels`.
 
-    Low band: mean of all kept views but the last, whose weight is taken off the others', so that a view fades out
-    before it leaves the set and no seam shows where it does. Views at d = robust_sigma · 1.4826 · MAD from the
-    weighted median and beyond count nothing, nearer ones (1 - (·/d)²)² (Tukey's biweight).
+    A view's distance d from the others is that of its low band from their weighted median. Views at d = robust_sigma *
+    1.4826 * MAD and beyond count nothing, nearer ones (1 - (./d)^2)^2 (Tukey's biweight). With `diffuse`, a view
+    that is brighter than the median is twice as far from it: a highlight adds light, and moves from photo to photo.
 
-    The high band is added, faded by exp(-(d / ghost_levels)²) where its view's low band lies d off the robust
-    mean: a highlight or a misplaced surface there, whose detail belongs elsewhere.
+    Low band: mean of the views with weight^LOW_POWER, high band: with weight^HIGH_POWER. The last of the kept views
+    counts nothing and its weight is taken off the others', so that a view fades out before it leaves the set and no
+    seam shows where it does.
     """
     keep = best_weights.shape[1] - 1
     values = np.empty((keep, 3))
     weights = np.empty(keep)
     deviations = np.empty(keep)
+    order = np.empty(keep, dtype=np.int64)
     median = np.empty(3)
+    low = np.empty(3)
+    high = np.empty(3)
     for i in range(best_weights.shape[0]):
         count = 0
         while count < keep and best_weights[i, count] > 0:
-            weights[count] = best_weights[i, count]
+            # A little of each weight stays: with equal ones, nothing would be left.
+            weights[count] = (1.001 * best_weights[i, count] - best_weights[i, keep]) / best_weights[i, 0]
             for c in range(3):
                 values[count, c] = best_lows[i, count, c] / STEPS_UNSIGNED
             count += 1
@@ -154,40 +153,52 @@ def blend_texels(
             continue
         half = 0.5 * weights[:count].sum()
         for c in range(3):
-            median[c] = _weighted_middle(values[:count, c], weights[:count], half)
+            median[c] = _weighted_middle(values[:count, c], weights[:count], half, order)
         for k in range(count):
-            deviations[k] = max(
-                abs(values[k, 0] - median[0]), abs(values[k, 1] - median[1]), abs(values[k, 2] - median[2])
-            )
-        spread = max(1.4826 * _weighted_middle(deviations[:count], weights[:count], half), NOISE_FLOOR)
-        total = 0.0
-        mean0, mean1, mean2 = 0.0, 0.0, 0.0
+            deviations[k] = 0.0
+            for c in range(3):
+                off = values[k, c] - median[c]
+                if off < 0:
+                    off = -off
+                elif diffuse:
+                    off *= 2.0
+                deviations[k] = max(deviations[k], off)
+        spread = max(1.4826 * _weighted_middle(deviations[:count], weights[:count], half, order), NOISE_FLOOR)
+        low[:] = 0.0
+        high[:] = 0.0
+        low_total = high_total = 0.0
         for k in range(count):
             near = 1.0 - (deviations[k] / (robust_sigma * spread)) ** 2
-            if near > 0:
-                # A little of each weight stays: with equal ones, nothing would be left.
-                weight = (1.001 * weights[k] - best_weights[i, keep]) * near * near
-                total += weight
-                mean0 += weight * values[k, 0]
-                mean1 += weight * values[k, 1]
-                mean2 += weight * values[k, 2]
-        if total > 0:
-            median[0], median[1], median[2] = mean0 / total, mean1 / total, mean2 / total
-        off = 0.0
+            if near <= 0:
+                continue
+            low_weight = near * near * weights[k] ** LOW_POWER
+            high_weight = near * near * weights[k] ** HIGH_POWER
+            low_total += low_weight
+            high_total += high_weight
+            for c in range(3):
+                low[c] += low_weight * values[k, c]
+                high[c] += high_weight * best_highs[i, k, c] / STEPS_SIGNED
         for c in range(3):
-            off = max(off, abs(detail_lows[i, c] / STEPS_UNSIGNED - median[c]))
-        share = np.exp(-((off / ghost_levels) ** 2)) / STEPS_SIGNED
-        for c in range(3):
-            colors[i, c] = min(max(median[c] + share * details[i, c], 0.0), 255.0)
+            color = low[c] / low_total if low_total > 0 else median[c]
+            if detail and high_total > 0:
+                color += high[c] / high_total
+            colors[i, c] = np.uint8(min(max(color, 0.0), 255.0) + 0.5)
 
 
 @njit(nogil=True, cache=True)
-def _weighted_middle(values, weights, half):  # pragma: no cover - compiled
-    """Weighted median of a few values, `half` being half of the weights' sum."""
-    order = np.argsort(values)
+def _weighted_middle(values, weights, half, order):  # pragma: no cover - compiled
+    """Weighted median of a few values, `half` being half of the weights' sum. `order` is scratch of their number."""
+    count = values.shape[0]
+    # By insertion: numpy's argsort takes several times as long for so few.
+    for i in range(count):
+        k = i
+        while k > 0 and values[order[k - 1]] > values[i]:
+            order[k] = order[k - 1]
+            k -= 1
+        order[k] = i
     cumulative = 0.0
-    for k in order:
-        cumulative += weights[k]
+    for k in range(count):
+        cumulative += weights[order[k]]
         if cumulative >= half:
-            return values[k]
-    return values[order[-1]]
+            return values[order[k]]
+    return values[order[count - 1]]

@@ -6,6 +6,9 @@ import numpy as np
 
 # Texels around charts that repeat the nearest colour; beyond, the fill is smooth.
 PADDING_REACH = 16
+# The smooth fill is made on a texture this many times smaller: only mip-maps show it, and a float image of a large
+# texture would take gigabytes.
+COARSER = 4
 
 
 def pad_charts(image: np.ndarray, known: np.ndarray, reach: int = PADDING_REACH) -> tuple[np.ndarray, np.ndarray]:
@@ -31,9 +34,24 @@ def pad_charts(image: np.ndarray, known: np.ndarray, reach: int = PADDING_REACH)
     where = np.flatnonzero(known.ravel())
     index_of[nearest.ravel()[where]] = where
     padded = ~known & (distance <= reach)
-    filled = push_pull(image, known)
+    filled = cv2.resize(push_pull(*_shrunk(image, known)), known.shape[::-1], interpolation=cv2.INTER_LINEAR)
+    filled[known] = image[known]
     filled[padded] = image.reshape(-1, 3)[index_of[nearest[padded]]]
     return filled, padded
+
+
+def _shrunk(image: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The mean [s, s, 3] of the known texels in each square of `COARSER` squared, and where there are any [s, s]."""
+    import cv2
+
+    size = (max(1, known.shape[1] // COARSER), max(1, known.shape[0] // COARSER))
+    covered = cv2.resize(known.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+    colors = np.zeros((*covered.shape, 3), dtype=np.uint8)
+    for channel in range(3):
+        values = np.where(known, image[..., channel], 0).astype(np.float32)
+        mean = cv2.resize(values, size, interpolation=cv2.INTER_AREA) / np.maximum(covered, 1e-6)
+        colors[..., channel] = np.clip(mean + 0.5, 0, 255)
+    return colors, covered > 0
 
 
 def push_pull(image: np.ndarray, known: np.ndarray) -> np.ndarray:

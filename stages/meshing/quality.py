@@ -15,7 +15,7 @@ from stages.artifacts import AtlasMesh, VertexQuality
 from stages.geometry.cameras import PinholeCameras
 from stages.meshing.baking import Provenance
 from stages.meshing.observing import sample_points
-from stages.meshing.rasterizing import depth_map, rasterize_atlas
+from stages.meshing.rasterizing import Texels, depth_map
 
 # Keeps the colour covariance invertible where photos are nearly grey: one 8-bit level, squared.
 _COLOR_VARIANCE_FLOOR = 1.0
@@ -23,6 +23,7 @@ _COLOR_VARIANCE_FLOOR = 1.0
 
 def measure_quality(
     atlas: AtlasMesh,
+    texels: Texels,
     cameras: PinholeCameras,
     load_photo: Callable[[int], tuple[np.ndarray, np.ndarray | None]],
     provenance: np.ndarray,
@@ -33,6 +34,7 @@ def measure_quality(
 
     Args:
         atlas: the final mesh, scene frame.
+        texels: its atlas rasterised, see `rasterizing.rasterize_atlas`.
         cameras: N photos that the texture is made from.
         load_photo: camera -> photo [H, W, 3] uint8 and mask [H, W] bool or None.
         provenance: [S, S] uint8 of `baking.Provenance`.
@@ -75,7 +77,7 @@ def measure_quality(
         ambiguity=mean_disagreement(colors, seen, color_precision(moments)),
         photo_density=photo_density,
         texel_density=texel_density(atlas),
-        invented=invented_share(atlas, provenance),
+        invented=invented_share(atlas, texels, provenance),
     )
 
 
@@ -140,12 +142,13 @@ def texel_density(atlas: AtlasMesh) -> np.ndarray:
     return np.sqrt(_sum_around(atlas, texels) / np.maximum(_sum_around(atlas, area), 1e-20)).astype(np.float32)
 
 
-def invented_share(atlas: AtlasMesh, provenance: np.ndarray) -> np.ndarray:
+def invented_share(atlas: AtlasMesh, texels: Texels, provenance: np.ndarray) -> np.ndarray:
     """Part of the texels of the faces around a vertex [V] float32 that no photo saw; 0 where they have no texel."""
-    texels, face_ids, _ = rasterize_atlas(atlas.uvs, atlas.faces, len(provenance))
-    made_up = face_ids[provenance.ravel()[texels] == Provenance.FIELD]
-    made_up, texels = (_sum_around(atlas, np.bincount(ids, minlength=len(atlas.faces))) for ids in (made_up, face_ids))
-    return (made_up / np.maximum(texels, 1)).astype(np.float32)
+    invented = texels.face_ids[provenance.ravel()[texels.index] == Provenance.FIELD]
+    made_up, all_of_them = (
+        _sum_around(atlas, np.bincount(ids, minlength=len(atlas.faces))) for ids in (invented, texels.face_ids)
+    )
+    return (made_up / np.maximum(all_of_them, 1)).astype(np.float32)
 
 
 def _sum_around(atlas: AtlasMesh, per_face: np.ndarray) -> np.ndarray:

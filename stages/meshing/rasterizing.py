@@ -6,6 +6,8 @@ in place of ray casting because it finds the same faces several times faster at 
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numba import njit
 
@@ -16,6 +18,8 @@ NO_FACE = -1
 # Triangles reaching closer to the projection centre than this (scene units; the object's radius is 1) are
 # dropped.
 NEAR = 1e-3
+# Texels worked on at a time.
+_CHUNK = 1 << 20
 
 
 @njit(nogil=True, cache=True)
@@ -132,24 +136,53 @@ def texel_positions(uvs: np.ndarray, size: int) -> np.ndarray:
     return np.stack([uvs[:, 0] * size, (1.0 - uvs[:, 1]) * size], 1)
 
 
-def rasterize_atlas(uvs: np.ndarray, faces: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+@dataclass(frozen=True)
+class Texels:
+    """The texels of a square texture whose centres lie in a chart.
+
+    Attributes:
+        size: side of the texture.
+        index: [T] row-major.
+        face_ids: [T] int32.
+        corner: [T, 3] float32 barycentric weights of the face's corners.
+    """
+
+    size: int
+    index: np.ndarray
+    face_ids: np.ndarray
+    corner: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.index)
+
+    def paint(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """A texture [S, S, C] that holds `values` [T, C], 0 elsewhere, and where it does [S, S] bool."""
+        image = np.zeros((self.size * self.size, values.shape[1]), dtype=values.dtype)
+        image[self.index] = values
+        inside = np.zeros(self.size * self.size, dtype=bool)
+        inside[self.index] = True
+        return image.reshape(self.size, self.size, -1), inside.reshape(self.size, self.size)
+
+
+def rasterize_atlas(uvs: np.ndarray, faces: np.ndarray, size: int) -> Texels:
     """The texels whose centres lie in a chart.
 
     Args:
         uvs: [V, 2] in [0, 1], origin at the bottom-left.
         faces: [F, 3].
         size: side of the texture in texels.
-
-    Returns:
-        row-major texel index [T] int64, face [T] int32, barycentric weights [T, 3] float32.
     """
     xy = texel_positions(uvs, size)
     ones = np.ones(len(xy))
-    face_map, _ = rasterize(xy, ones, faces, size, size)
-    texels = np.flatnonzero(face_map.ravel() != NO_FACE)
-    face_ids = face_map.ravel()[texels]
-    centers = np.stack([texels % size, texels // size], 1) + 0.5
-    return texels, face_ids, corner_weights(xy, ones, faces, face_ids, centers)
+    face_map = rasterize(xy, ones, faces, size, size)[0].ravel()
+    index = np.flatnonzero(face_map != NO_FACE)
+    face_ids = face_map[index]
+    corner = np.empty((len(index), 3), dtype=np.float32)
+    for start in range(0, len(index), _CHUNK):
+        part = slice(start, start + _CHUNK)
+        centers = np.stack([index[part] % size, index[part] // size], 1) + 0.5
+        corner[part] = corner_weights(xy, ones, faces, face_ids[part], centers)
+    return Texels(size, index, face_ids, corner)
 
 
 def surface_points(atlas: AtlasMesh, face_ids: np.ndarray, corner: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -9,7 +9,7 @@ import numpy as np
 from stages.artifacts import AtlasMesh
 from stages.meshing.cleaning import MAX_RAYS, raycaster, vertex_normals
 from stages.meshing.padding import pad_charts
-from stages.meshing.rasterizing import rasterize_atlas, surface_points
+from stages.meshing.rasterizing import Texels, surface_points
 from stages.meshing.tangents import to_tangent_space, vertex_tangents
 
 # The full mesh is looked for within this part of the longest edge of the face: decimation moves a surface by far less.
@@ -22,13 +22,15 @@ MIN_COSINE = 0.1
 LIFT = 0.01
 # Occlusion changes slowly: one sample stands for this many texels in each direction.
 COARSENESS = 4
+# Texels that take their occlusion from the samples at a time.
+SPREAD = 1 << 21
 FLAT = (128, 128, 255)
 Listener = Callable[[float, float], None]
 
 
 # ---------------------------------------------------------------- normals
 def bake_normals(
-    atlas: AtlasMesh, vertices: np.ndarray, faces: np.ndarray, size: int, listener: Listener | None = None
+    atlas: AtlasMesh, texels: Texels, vertices: np.ndarray, faces: np.ndarray, listener: Listener | None = None
 ) -> tuple[np.ndarray, float]:
     """The normals of a full mesh as a tangent-space normal map of the light one.
 
@@ -37,8 +39,8 @@ def bake_normals(
 
     Args:
         atlas: the light mesh.
+        texels: the atlas rasterised.
         vertices, faces: [V, 3], [F, 3], the full one in the same frame.
-        size: side of the map in texels.
         listener: told (done, total).
 
     Returns:
@@ -46,26 +48,23 @@ def bake_normals(
         the share of the charts' texels that met the full mesh.
     """
     tell = listener or (lambda done, total: None)
-    texels, face_ids, corner = rasterize_atlas(atlas.uvs, atlas.faces, size)
     tangents = vertex_tangents(atlas.vertices, atlas.normals, atlas.uvs, atlas.faces)
     corners = atlas.vertices[atlas.faces]
     reach = REACH * np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(1)
     scene, full_normals = raycaster(vertices, faces), vertex_normals(vertices, faces).astype(np.float32)
-    image = np.empty((size * size, 3), dtype=np.uint8)
-    image[:] = FLAT
-    known = np.zeros(size * size, dtype=bool)
-    known[texels] = True
+    colors = np.empty((len(texels), 3), dtype=np.uint8)
+    colors[:] = FLAT
     met = 0
     for begin in range(0, len(texels), MAX_RAYS // 2):
         part = slice(begin, begin + MAX_RAYS // 2)
-        ids, weights = face_ids[part], corner[part]
+        ids, weights = texels.face_ids[part], texels.corner[part]
         points, normals = surface_points(atlas, ids, weights)
         found, normals_there = _normals_near(scene, full_normals, faces, points, normals, reach[ids])
         frame = np.einsum("tk,tkc->tc", weights[found], tangents[atlas.faces[ids[found]]])
-        image[texels[part][found]] = encode(to_tangent_space(normals_there[found], normals[found], frame))
+        colors[part][found] = encode(to_tangent_space(normals_there[found], normals[found], frame))
         met += int(np.count_nonzero(found))
         tell(begin + len(ids), len(texels))
-    filled, _ = pad_charts(image.reshape(size, size, 3), known.reshape(size, size))
+    filled, _ = pad_charts(*texels.paint(colors))
     return filled, met / max(len(texels), 1)
 
 
@@ -101,7 +100,7 @@ def encode(normals: np.ndarray) -> np.ndarray:
 
 # ---------------------------------------------------------------- occlusion
 def bake_occlusion(
-    atlas: AtlasMesh, size: int, rays: int = 64, reach: float = 0.5, listener: Listener | None = None
+    atlas: AtlasMesh, texels: Texels, rays: int = 64, reach: float = 0.5, listener: Listener | None = None
 ) -> np.ndarray:
     """How open each texel is to light from all around: 255 to the whole hemisphere, 0 to none of it.
 
@@ -109,7 +108,7 @@ def bake_occlusion(
 
     Args:
         atlas: the mesh, which hides itself.
-        size: side of the map in texels.
+        texels: the atlas rasterised.
         rays: from each sample.
         reach: what lies further off, in scene units, hides nothing.
         listener: told (done, total).
@@ -117,16 +116,17 @@ def bake_occlusion(
     Returns:
         [size, size] uint8, row 0 at v = 1.
     """
-    texels, face_ids, corner = rasterize_atlas(atlas.uvs, atlas.faces, size)
-    points, normals = surface_points(atlas, face_ids, corner)
-    chosen, cell_of = _one_a_cell(texels, size)
-    openness = sky_seen(atlas.vertices, atlas.faces, points[chosen], normals[chosen], rays, reach, listener)
-    grey = spread_samples(openness, points[chosen], cell_of, texels, points, size)
-    image = np.full((size * size, 3), 255, dtype=np.uint8)
-    image[texels] = np.clip(255 * grey + 0.5, 0, 255).astype(np.uint8)[:, None]
-    known = np.zeros(size * size, dtype=bool)
-    known[texels] = True
-    return pad_charts(image.reshape(size, size, 3), known.reshape(size, size))[0][..., 0].copy()
+    chosen, cell_of = _one_a_cell(texels)
+    points, normals = surface_points(atlas, texels.face_ids[chosen], texels.corner[chosen])
+    openness = sky_seen(atlas.vertices, atlas.faces, points, normals, rays, reach, listener)
+    grey = np.empty((len(texels), 1), dtype=np.uint8)
+    for begin in range(0, len(texels), SPREAD):
+        part = slice(begin, begin + SPREAD)
+        there, _ = surface_points(atlas, texels.face_ids[part], texels.corner[part])
+        spread = spread_samples(openness, points, cell_of, texels.index[part], there, texels.size)
+        grey[part, 0] = np.clip(255 * spread + 0.5, 0, 255)
+    image, inside = texels.paint(np.repeat(grey, 3, axis=1))
+    return pad_charts(image, inside)[0][..., 0].copy()
 
 
 def sky_seen(
@@ -173,10 +173,11 @@ def sky_seen(
     return free
 
 
-def _one_a_cell(texels: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Rows [S] of `texels`, the middlemost of each square of `COARSENESS` texels that has any; and the number of each
+def _one_a_cell(texels: Texels) -> tuple[np.ndarray, np.ndarray]:
+    """Rows [S] of the texels, the middlemost of each square of `COARSENESS` texels that has any; and the number of each
     square's [cells, cells] int32, -1 where it has none."""
-    y, x = texels // size, texels % size
+    size = texels.size
+    y, x = texels.index // size, texels.index % size
     cells = -(-size // COARSENESS)
     cell = (y // COARSENESS) * cells + x // COARSENESS
     middle = (COARSENESS - 1) / 2

@@ -25,6 +25,10 @@ FAINT = 0.01
 # Width in pixels (of a Gaussian of the same variance) of the low-pass that splits a photo in two bands.
 BAND_SIGMA = 8.0
 _BAND_PASSES = 3
+# Photos with more pixels on a texel's side than this are smoothed first, or their finest detail would alias.
+FINER = 1.25
+# What a prepared photo takes.
+BYTES_PER_PIXEL = 23
 
 
 @dataclass(frozen=True)
@@ -57,6 +61,7 @@ def prepare_view(
     mask: np.ndarray | None,
     vertices: np.ndarray,
     faces: np.ndarray,
+    texel_side: float = 0.0,
 ) -> View:
     """Depth, trust and bands of photo `index`.
 
@@ -64,6 +69,7 @@ def prepare_view(
         photo: [H, W, 3] uint8 RGB of the camera's size.
         mask: [H, W] bool, true on the object; None: all of it.
         vertices, faces: the mesh in the scene frame.
+        texel_side: of the texture, in scene units; photos that are finer lose what it cannot hold.
 
     Raises:
         ValueError: the photo or mask is not of the camera's size.
@@ -87,6 +93,11 @@ def prepare_view(
     from_edge = cv2.distanceTransform(interior, cv2.DIST_L2, 3)
     confidence = np.clip((from_edge - UNSAFE_PIXELS) / FADE_PIXELS, FAINT, 1.0)
     confidence[~on_object] = 0
+    pixels_on_texel = texel_side * focal * float(np.median(inverse_depth[on_object])) if on_object.any() else 0.0
+    if pixels_on_texel > FINER:
+        # A texel's square has the variance r^2 / 12 pixels^2, of which sampling brings 1 / 12.
+        smooth = low_pass(photo, linked_left, linked_up, float(np.sqrt((pixels_on_texel**2 - 1) / 12)))
+        photo = np.clip(smooth + 0.5, 0, 255).astype(np.uint8)
     return View(
         matrix=K @ cameras.cam_from_scene[index],
         center=cameras.centers[index],
