@@ -58,7 +58,7 @@ def pack_overlays(quality: VertexQuality) -> list[dict[str, Any]]:
                  max(1.0, _top(several)), "fewer than two photos"),
         _overlay("density", "Texels for each pixel of the closest photo", per_pixel, 0, max(2.0, _top(per_pixel)),
                  "no photo"),
-        _overlay("invented", "Part of its texture that no photo saw", quality.invented, 0, 1, ""),
+        _overlay("invented", "Texture that no photo saw", quality.invented, 0, 1, ""),
     ]  # fmt: skip
 
 
