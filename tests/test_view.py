@@ -107,11 +107,20 @@ def test_where_there_is_nothing_to_see_it_says_what_to_do(workspace, tmp_path):
 def test_the_command_prints_its_address_and_ends_with_ctrl_c(workspace):
     write_report(workspace)
     command = [sys.executable, "-m", "hineus_cli", "view", str(workspace.root), "--no-browser"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as process:
-        assert process.stdout is not None
-        assert get(process.stdout.readline().strip()) == "<p>the report</p>"
-        process.send_signal(signal.SIGINT)
-        assert process.wait(timeout=20) == 0
+
+    def heed_ctrl_c() -> None:  # what runs in the background of a shell inherits that it is ignored
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, preexec_fn=heed_ctrl_c
+    ) as process:
+        try:
+            assert process.stdout is not None
+            assert get(process.stdout.readline().strip()) == "<p>the report</p>"
+            process.send_signal(signal.SIGINT)
+            assert process.wait(timeout=20) == 0
+        finally:
+            process.kill()
 
 
 def test_a_port_that_is_taken_is_refused(workspace):
