@@ -35,7 +35,8 @@ BUILT_IN = {
 PROGRAM = Path(__file__).with_name("builtin_peers.py")
 PLACEHOLDERS = ("photos", "model", "masks", "out")
 MESH, LOG = "mesh.ply", "output.log"
-SAMPLE_EVERY_S = 0.1  # of its memory
+# Seconds between looks at its memory: many at first, for a command that soon ends.
+FIRST_SAMPLE_S, SAMPLE_EVERY_S = 0.002, 0.1
 TOLD = 400  # characters of a failed command's output that are repeated
 
 
@@ -132,12 +133,13 @@ def _call(words: list[str], folder: Path, name: str) -> tuple[int, int]:
             raise ReconstructionError(
                 f"Peer {name} could not be started: {words[0]}: {error.strerror}.", "Name the program's full path."
             ) from error
-        peak_rss = 0
+        peak_rss, pause_s = 0, FIRST_SAMPLE_S
         try:
             while True:
                 peak_rss = max(peak_rss, _held_by(process.pid))
                 with contextlib.suppress(subprocess.TimeoutExpired):
-                    return process.wait(SAMPLE_EVERY_S), peak_rss
+                    return process.wait(pause_s), peak_rss
+                pause_s = min(2 * pause_s, SAMPLE_EVERY_S)
         except BaseException:  # it is not to outlive us
             process.kill()
             process.wait()
