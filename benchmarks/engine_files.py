@@ -23,6 +23,7 @@ from stages.evaluation.surfaces import Surface, Target
 from stages.export import EXPORT
 from stages.meshing.levels import levels_of_detail
 from stages.meshing.view_scores import draw_view, psnr, silhouette
+from stages.reporting.pictures import read_rgb
 
 VIEWS = 6  # photos, evenly spread, from where levels are drawn
 
@@ -37,11 +38,9 @@ def export(workspace: Path, out: Path, **settings: Any) -> tuple[dict[str, Any],
 
 
 def level_rows(workspace: Path, out: Path, count: int) -> list[str]:
-    import cv2
-
     atlas = artifacts.load_atlas(workspace / "atlas")
     cameras = artifacts.load_scene(workspace / "undistort").cameras
-    texture = cv2.imread(str(artifacts.base_color_path(workspace / "bake")))[..., ::-1]
+    texture = read_rgb(artifacts.base_color_path(workspace / "bake"))
     views = np.linspace(0, len(cameras), VIEWS, endpoint=False).astype(int).tolist()
     full = [draw_view(atlas, texture, cameras, view) for view in views]
     masks = [silhouette(atlas.vertices, atlas.faces, cameras, view) for view in views]

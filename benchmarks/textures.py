@@ -38,6 +38,7 @@ from stages import artifacts
 from stages.artifacts import AtlasMesh
 from stages.bake import load_photo
 from stages.geometry.cameras import PinholeCameras
+from stages.meshing.cleaning import face_areas
 from stages.meshing.rasterizing import NO_FACE, Texels, corner_weights, projected, rasterize, rasterize_atlas
 from stages.meshing.rasterizing import surface_points as _surface_points
 from stages.meshing.rendering import sample_texture
@@ -348,11 +349,9 @@ def measure(workspace: Path, data: Path, before: SetResult | None) -> SetResult:
     naive, label = best_view(capture, texels)
     pairs = face_neighbors(atlas.vertices, atlas.faces)
     shared = (atlas.faces[pairs[:, 0], :, None] == atlas.faces[pairs[:, 1], None]).sum((1, 2))
-    pairs, charts = pairs, shared < 2
+    charts = shared < 2
     photos = ~charts & (label[pairs[:, 0]] != label[pairs[:, 1]])
-    corners = atlas.vertices[atlas.faces].astype(np.float64)
-    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum() / 2
-    step = float(np.sqrt(area / len(texels)))
+    step = float(np.sqrt(face_areas(atlas.vertices, atlas.faces).sum() / len(texels)))
 
     def seams(texture: np.ndarray) -> tuple[float, float]:
         inside = ~charts

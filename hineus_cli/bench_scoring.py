@@ -49,29 +49,21 @@ def result_mesh(workspace: Workspace, fresh: set[str], out: Path) -> Path | None
         return None
     vertices, faces = artifacts.load_mesh(workspace.stage_folder("cleanup"))
     scene = artifacts.load_scene(workspace.stage_folder("undistort"))
-    _write(scene.world_from_scene, workspace, (vertices, faces), out)
+    _write(scene.poses_from_world.compose(scene.world_from_scene), (vertices, faces), out)
     return out
 
 
 def posed_mesh(workspace: Workspace, mesh: Path, out: Path) -> Path:
     """Write a mesh that is in the world frame of a workspace, in the frame of its poses, to `out`."""
-    _write(Similarity.identity(), workspace, read_mesh(mesh), out)
+    scene = artifacts.load_scene(workspace.stage_folder("undistort"))
+    _write(scene.poses_from_world, read_mesh(mesh), out)
     return out
 
 
-def _write(
-    world_from_mesh: Similarity, workspace: Workspace, mesh: tuple[np.ndarray, np.ndarray], out: Path
-) -> None:  # fmt: skip
+def _write(poses_from_mesh: Similarity, mesh: tuple[np.ndarray, np.ndarray], out: Path) -> None:
     import trimesh
 
-    poses_from_mesh = _poses_from_world(workspace).compose(world_from_mesh)
     trimesh.Trimesh(poses_from_mesh.apply(mesh[0].astype(np.float64)), mesh[1], process=False).export(out)
-
-
-def _poses_from_world(workspace: Workspace) -> Similarity:
-    """From the world, which GPS or markers may have moved, to the frame of the poses: that of the truth."""
-    place = artifacts.load_scene(workspace.stage_folder("undistort")).place
-    return Similarity.identity() if place is None else place.world_from_model.inverse()
 
 
 def score_surface(truth: Truth, mesh: Path, workspace: Workspace) -> dict[str, Any]:

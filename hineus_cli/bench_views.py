@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -18,9 +18,6 @@ from stages.posing.known import image_size, match_photos
 from stages.posing.reading import read_poses
 from stages.posing.triangulation import fitted_camera
 from stages.undistort import pinhole_camera, pinhole_photo
-
-if TYPE_CHECKING:
-    from stages.neural.drawing import FieldDrawer
 
 log = logging.getLogger(__name__)
 
@@ -55,10 +52,7 @@ class TestPhotos:
             intrinsics=np.stack(intrinsics),
             cam_from_scene=np.stack([known.cam_from_world for known in matched.values()]),
         )
-        poses_from_scene = scene.world_from_scene
-        if scene.place is not None:
-            poses_from_scene = scene.place.world_from_model.inverse().compose(poses_from_scene)
-        self.cameras = into_scene(in_poses, poses_from_scene)
+        self.cameras = into_scene(in_poses, scene.poses_from_world.compose(scene.world_from_scene))
 
     def load(self, index: int) -> tuple[np.ndarray, np.ndarray | None]:
         """Photo [H, W, 3] uint8 (on white, where that is the suite's background) and mask [H, W] bool or None."""
@@ -89,13 +83,13 @@ def score_test_views(photos: TestPhotos, workspace: Workspace, fresh: set[str], 
         {"counted": photos, "mean": {"field": {"object": ..., "whole": ...}, "mesh": ...}, "photos": [...]}, the regions
         and scores as `hineus_cli.evaluating_views.evaluate_views` has them.
     """
-    from hineus_cli.evaluating_views import mean_scores
+    from hineus_cli.evaluating_views import field_drawer, mean_scores
     from stages.evaluation.images import find_lpips
     from stages.evaluation.views import judge
     from stages.meshing.view_scores import draw_view, silhouette
     from stages.reporting.pictures import read_rgb
 
-    drawer = _field_drawer(workspace, device)
+    drawer = field_drawer(workspace, device)
     textured = "bake" in fresh
     if textured:
         atlas = artifacts.load_atlas(workspace.stage_folder("atlas"))
@@ -116,14 +110,3 @@ def score_test_views(photos: TestPhotos, workspace: Workspace, fresh: set[str], 
     kinds = ("field", "mesh") if textured else ("field",)
     means = {kind: mean_scores([photo[kind] for photo in judged]) for kind in kinds}
     return {"counted": len(judged), "mean": means, "photos": judged}
-
-
-def _field_drawer(workspace: Workspace, device: str) -> FieldDrawer:
-    from configs.params import TrainParams
-    from stages.neural.drawing import FieldDrawer
-    from stages.neural.field import load_field
-
-    manifest = workspace.published("train")
-    assert manifest is not None  # the run has just brought it up to date
-    field = load_field(artifacts.field_path(workspace.stage_folder("train")), device)
-    return FieldDrawer(field.fields, TrainParams(**manifest.identity.params), device)

@@ -625,7 +625,7 @@ def make_demo_photos(
             exposure = float(0.5 / np.percentile(radiance, 90))
         picture = Image.fromarray(develop(radiance, rng, exposure))
         name = f"{PHOTOS}/{i:03d}.jpg"
-        picture.save(folder / name, quality=95, exif=_exif(picture, i))
+        picture.save(folder / name, quality=95, exif=photo_exif(picture, i, "Demo camera", FOCAL_35MM))
         frames.append(
             {
                 "file_path": name,
@@ -649,16 +649,16 @@ def make_demo_photos(
     (folder / TRUTH_CAMERAS).write_text(json.dumps(truth, indent=1) + "\n", encoding="utf-8")
 
 
-def _exif(picture: object, index: int) -> object:
-    """What a camera would note: maker, model, time, and the focal length SfM starts from."""
+def photo_exif(picture: object, index: int, model: str, focal_35mm: int) -> object:
+    """What a camera would note: maker, model, time, and the focal length SfM starts from (35 mm equivalent)."""
     from PIL import ExifTags
 
     exif = picture.getexif()  # type: ignore[attr-defined]
     taken = datetime(2025, 6, 1, 12, 0, 0) + timedelta(seconds=5 * index)
     exif[ExifTags.Base.Make] = "HiNeuS"
-    exif[ExifTags.Base.Model] = "Demo camera"
+    exif[ExifTags.Base.Model] = model
     exif[ExifTags.Base.DateTime] = taken.strftime("%Y:%m:%d %H:%M:%S")
     details = exif.get_ifd(ExifTags.IFD.Exif)
-    details[ExifTags.Base.FocalLength] = float(FOCAL_35MM)
-    details[ExifTags.Base.FocalLengthIn35mmFilm] = FOCAL_35MM
+    details[ExifTags.Base.FocalLength] = float(focal_35mm)
+    details[ExifTags.Base.FocalLengthIn35mmFilm] = focal_35mm
     return exif

@@ -11,6 +11,7 @@ from stages.errors import InputError
 
 if TYPE_CHECKING:
     from stages.engine.manifest import Manifest
+    from stages.engine.workspace import Workspace
     from stages.neural.drawing import FieldDrawer
 
 log = logging.getLogger(__name__)
@@ -41,7 +42,8 @@ def evaluate_views(workspace: Path, renders: Path | None = None, device: str = "
     from stages.meshing.view_scores import draw_view, silhouette
     from stages.reporting.pictures import read_rgb
 
-    folders, drawer = _trained(workspace, choose_device(device))
+    opened = _whole(workspace)
+    folders = {stage: opened.stage_folder(stage) for stage in DRAWN_FROM}
     held_out = artifacts.load_held_out(folders["train"])
     if not held_out:
         raise InputError(
@@ -51,6 +53,7 @@ def evaluate_views(workspace: Path, renders: Path | None = None, device: str = "
     cameras = artifacts.load_scene(folders["undistort"]).cameras
     atlas = artifacts.load_atlas(folders["atlas"])
     texture = read_rgb(artifacts.base_color_path(folders["bake"]))
+    drawer = field_drawer(opened, choose_device(device))
     lpips, about_lpips = find_lpips()
     photos: list[dict[str, Any]] = []
     masked = 0
@@ -85,14 +88,10 @@ def evaluate_views(workspace: Path, renders: Path | None = None, device: str = "
     }
 
 
-def _trained(workspace: Path, device: str) -> tuple[dict[str, Path], FieldDrawer]:
-    """Folders of the stages that drawings are made from, and what draws the field."""
-    from configs.params import TrainParams
-    from stages import artifacts
+def _whole(workspace: Path) -> Workspace:
+    """A workspace whose stages that drawings are made from are all there, and of one run."""
     from stages.engine.workspace import Workspace
     from stages.errors import WorkspaceError
-    from stages.neural.drawing import FieldDrawer
-    from stages.neural.field import load_field
 
     opened = Workspace.open(workspace)
     hint = f"Make it: `hineus run --workspace {workspace}`."
@@ -108,10 +107,20 @@ def _trained(workspace: Path, device: str) -> tuple[dict[str, Path], FieldDrawer
                     f"The stage {stage} of {workspace} is of another {before} than the one there.", hint
                 )
         manifests[stage] = manifest
-    folders = {stage: opened.stage_folder(stage) for stage in DRAWN_FROM}
-    params = TrainParams(**manifests["train"].identity.params)
-    field = load_field(artifacts.field_path(folders["train"]), device)
-    return folders, FieldDrawer(field.fields, params, device)
+    return opened
+
+
+def field_drawer(workspace: Workspace, device: str) -> FieldDrawer:
+    """What draws the trained field of a workspace, with the settings it was trained with."""
+    from configs.params import TrainParams
+    from stages import artifacts
+    from stages.neural.drawing import FieldDrawer
+    from stages.neural.field import load_field
+
+    manifest = workspace.published("train")
+    assert manifest is not None  # callers have made sure
+    field = load_field(artifacts.field_path(workspace.stage_folder("train")), device)
+    return FieldDrawer(field.fields, TrainParams(**manifest.identity.params), device)
 
 
 def mean_scores(photos: list[dict[str, Any]]) -> dict[str, Any]:

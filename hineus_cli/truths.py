@@ -16,7 +16,6 @@ from stages.evaluation.dtu import DtuTruth
 from stages.evaluation.surfaces import Surface
 from stages.evaluation.tanks import CropVolume
 from stages.geometry.cameras import PinholeCameras, PosedScene
-from stages.geometry.similarity import Similarity
 
 CLOUDS = (".pcd", ".xyz", ".pts")
 
@@ -44,7 +43,7 @@ def read_prediction(place: Path) -> tuple[Path, Surface]:
     """
     path = mesh_path(place)
     surface = read_surface(path)
-    return path, surface.moved(_poses_from_world(_posed_scene(place)).matrix()) if place.is_dir() else surface
+    return path, surface.moved(_posed_scene(place).poses_from_world.matrix()) if place.is_dir() else surface
 
 
 def _has_faces(path: Path) -> bool:
@@ -124,7 +123,7 @@ def workspace_cameras(workspace: Path) -> Cameras:
         WorkspaceError: there is none, or it has no undistorted photos.
     """
     scene = _posed_scene(workspace)
-    frame, cameras = _poses_from_world(scene).compose(scene.world_from_scene), scene.cameras
+    frame, cameras = scene.poses_from_world.compose(scene.world_from_scene), scene.cameras
     rotation = cameras.cam_from_scene[:, :, :3] @ frame.rotation.T
     translation = -np.einsum("nij,nj->ni", rotation, frame.apply(cameras.centers))
     poses = np.concatenate([rotation, translation[:, :, None]], 2)
@@ -141,11 +140,6 @@ def _posed_scene(workspace: Path) -> PosedScene:
             f"{workspace} has no undistorted photos.", f"Make them: `hineus undistort --workspace {workspace}`."
         )
     return artifacts.load_scene(opened.stage_folder("undistort"))
-
-
-def _poses_from_world(scene: PosedScene) -> Similarity:
-    """From the frame of the results, which GPS or markers may have moved, to that of the poses: the truth's."""
-    return Similarity.identity() if scene.place is None else scene.place.world_from_model.inverse()
 
 
 def read_masks(folder: Path, cameras: PinholeCameras) -> Iterator[tuple[int, np.ndarray]]:

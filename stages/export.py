@@ -190,12 +190,13 @@ def load_textures(baked: Path) -> Textures:
 
 def unit_normals(vertices: np.ndarray, normals: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Vertex normals [V, 3] float64 of length 1: those without a length take an adjoining face's, else +Z."""
+    from stages.meshing.cleaning import face_normals
+
     unit = normals.astype(np.float64)
     lengths = np.linalg.norm(unit, axis=1)
     bad = ~np.isfinite(lengths) | (lengths < 1e-6)
     if bad.any():
-        corners = vertices[faces].astype(np.float64)
-        flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        flat = face_normals(vertices, faces)
         usable = np.linalg.norm(flat, axis=1) > 0
         unit[bad] = (0, 0, 1)
         for k in range(3):

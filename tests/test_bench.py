@@ -18,7 +18,7 @@ from suite_layouts import COUNT, LAYOUTS, cameras, write_suite
 from typer.testing import CliRunner, Result
 
 from hineus_cli import bench as bench_module
-from hineus_cli import bench_views, reconstruct
+from hineus_cli import evaluating_views, reconstruct
 from hineus_cli.app import build_app
 from hineus_cli.bench import load_results
 from hineus_cli.bench_scoring import posed_mesh, result_mesh
@@ -256,7 +256,7 @@ class GreyBall:
 
 def test_views_of_nerf_synthetic_are_whole_photos_on_white(data: Path, monkeypatch: pytest.MonkeyPatch):
     write_suite("nerf-synthetic", data)
-    monkeypatch.setattr(bench_views, "_field_drawer", lambda workspace, device: GreyBall())
+    monkeypatch.setattr(evaluating_views, "field_drawer", lambda workspace, device: GreyBall())
     train = Stage("train", 1, ("undistort",), "train", lambda context: (context.out / "field").write_text("") and {})
     (result,) = results_of("nerf-synthetic", str(data), pipeline=(*PIPELINE[:3], train))
     views = result["scores"]["views"]

@@ -11,7 +11,6 @@ import os
 import shutil
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +20,7 @@ from benchmarks.synthetic import MADE_WITH
 from benchmarks.synthetic.mitsuba_camera import Photographer
 from benchmarks.synthetic.model import Scene
 from benchmarks.synthetic.scenes import RECIPES
+from hineus_cli.demo_scene import photo_exif
 from hineus_cli.scoring import TRUTH_CAMERAS, TRUTH_MESH
 
 SUITE_VERSION = 1  # raise it when the same recipe would give other photos
@@ -83,7 +83,7 @@ def make(order: Order, folder: Path, variant: str, progress: Callable[[int], Non
             radiance = camera.radiance(cam_from_world, order.spp, seed=_noise_seed(order, i, 0))
             developed = develop(radiance * exposures[i], np.random.default_rng([order.seed, i]))
             picture = _picture(developed)
-            _save(photo, picture, quality=JPEG_QUALITY, exif=_exif(picture, i))
+            _save(photo, picture, quality=JPEG_QUALITY, exif=photo_exif(picture, i, "Synthetic camera", FOCAL_35MM))
         progress(i + 1)
     _write_cameras(order, scene, exposures, folder / TRUTH_CAMERAS)
     return True
@@ -182,17 +182,3 @@ def _write_cameras(order: Order, scene: Scene, exposures: np.ndarray, path: Path
     partial = path.with_suffix(".partial")
     partial.write_text(json.dumps(truth, indent=1) + "\n", encoding="utf-8")
     os.replace(partial, path)
-
-
-def _exif(picture: Any, index: int) -> Any:
-    from PIL import ExifTags
-
-    exif = picture.getexif()
-    taken = datetime(2025, 6, 1, 12, 0, 0) + timedelta(seconds=5 * index)
-    exif[ExifTags.Base.Make] = "HiNeuS"
-    exif[ExifTags.Base.Model] = "Synthetic camera"
-    exif[ExifTags.Base.DateTime] = taken.strftime("%Y:%m:%d %H:%M:%S")
-    details = exif.get_ifd(ExifTags.IFD.Exif)
-    details[ExifTags.Base.FocalLength] = float(FOCAL_35MM)
-    details[ExifTags.Base.FocalLengthIn35mmFilm] = FOCAL_35MM
-    return exif

@@ -101,3 +101,8 @@ class PosedScene:
     place: Place | None = None
     ground: Plane | None = None
     box: np.ndarray | None = None
+
+    @property
+    def poses_from_world(self) -> Similarity:
+        """From the frame of the results, which GPS or markers may have moved, to that the poses were given in."""
+        return Similarity.identity() if self.place is None else self.place.world_from_model.inverse()

@@ -21,6 +21,7 @@ import numpy as np
 
 from stages.artifacts import AtlasMesh
 from stages.geometry.cameras import PinholeCameras
+from stages.meshing.cleaning import face_areas
 from stages.meshing.filling import face_neighbors, harmonic_offsets, vertex_means
 from stages.meshing.gains import solve_gains
 from stages.meshing.observing import blend_texels, gather_texels, sample_points
@@ -162,9 +163,7 @@ def _tell_blending(tell: Listener, begun: int, total: int, done: int) -> None:
 
 def _texel_side(atlas: AtlasMesh, count: int) -> float:
     """Mean side of a texel on the surface, scene units."""
-    corners = atlas.vertices[atlas.faces].astype(np.float64)
-    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum() / 2
-    return float(np.sqrt(area / count))
+    return float(np.sqrt(face_areas(atlas.vertices, atlas.faces).sum() / count))
 
 
 class _Prepare:

@@ -25,6 +25,11 @@ def face_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return np.cross(b - a, c - a)
 
 
+def face_areas(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Area [F] float64 of each face."""
+    return np.linalg.norm(face_normals(vertices, faces), axis=1) / 2
+
+
 def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Area-weighted unit normals [V, 3] float64; +z where a vertex has no area around it."""
     normals = face_normals(vertices, faces)
@@ -316,8 +321,7 @@ def fill_small_gaps(vertices: np.ndarray, faces: np.ndarray, chosen: np.ndarray,
     adjacency = face_adjacency(faces)
     same = ~chosen[adjacency].any(1)
     labels = label_pieces(len(faces), adjacency, same)
-    area = np.linalg.norm(face_normals(vertices, faces), axis=1) / 2
-    region_area = np.bincount(labels, area)
+    region_area = np.bincount(labels, face_areas(vertices, faces))
     touches = np.zeros(len(region_area), dtype=bool)
     border = chosen[adjacency[:, 0]] != chosen[adjacency[:, 1]]
     touches[labels[adjacency[border]].ravel()] = True

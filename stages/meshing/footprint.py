@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from stages.geometry.cameras import PinholeCameras
+from stages.meshing.cleaning import face_normals
 from stages.meshing.rasterizing import NO_FACE, depth_map
 
 SMALLEST, LARGEST = 1024, 8192
@@ -19,9 +20,8 @@ def pixels_per_area(vertices: np.ndarray, faces: np.ndarray, cameras: PinholeCam
 
     focal^2 cos(angle) / depth^2 at the face's centre, for the faces that a camera's depth map shows.
     """
-    corners = vertices[faces].astype(np.float64)
-    centers = corners.mean(1)
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    centers = vertices[faces].astype(np.float64).mean(1)
+    normals = face_normals(vertices, faces)
     length = np.linalg.norm(normals, axis=1)
     normals /= np.maximum(length, 1e-30)[:, None]
     best = np.zeros(len(faces))

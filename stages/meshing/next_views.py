@@ -18,7 +18,7 @@ import numpy as np
 
 from stages.artifacts import VertexQuality
 from stages.geometry.cameras import PosedScene
-from stages.meshing.cleaning import raycaster
+from stages.meshing.cleaning import face_areas, raycaster
 
 # From this many photos on a vertex is seen well, if the best of them looks at it within about 60 degrees.
 ENOUGH_PHOTOS = 4
@@ -282,6 +282,4 @@ def _extent(vertices: np.ndarray, scene: PosedScene) -> tuple[float, float]:
 
 def _vertex_areas(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """A third of the area of the faces around each vertex [V]."""
-    corners = vertices[faces].astype(np.float64)
-    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
-    return np.bincount(faces.ravel(), np.repeat(areas / 3, 3), minlength=len(vertices))
+    return np.bincount(faces.ravel(), np.repeat(face_areas(vertices, faces) / 3, 3), minlength=len(vertices))

@@ -14,6 +14,7 @@ from numba import njit
 from stages.artifacts import AtlasMesh, VertexQuality
 from stages.geometry.cameras import PinholeCameras
 from stages.meshing.baking import Provenance
+from stages.meshing.cleaning import face_areas
 from stages.meshing.observing import sample_points
 from stages.meshing.rasterizing import Texels, depth_map
 
@@ -135,11 +136,9 @@ def _mean_of_pairs(colors, seen, whitening, result):  # pragma: no cover - compi
 
 def texel_density(atlas: AtlasMesh) -> np.ndarray:
     """Texels per scene unit [V] float32: root of the texels of the faces around a vertex over their area."""
-    corners, uvs = atlas.vertices[atlas.faces].astype(np.float64), atlas.uvs[atlas.faces].astype(np.float64)
-    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    sides = uvs[:, 1:] - uvs[:, :1]
-    texels = np.abs(sides[:, 0, 0] * sides[:, 1, 1] - sides[:, 0, 1] * sides[:, 1, 0]) * atlas.texture_size**2
-    return np.sqrt(_sum_around(atlas, texels) / np.maximum(_sum_around(atlas, area), 1e-20)).astype(np.float32)
+    areas = face_areas(atlas.vertices, atlas.faces)
+    texels = face_areas(np.pad(atlas.uvs, ((0, 0), (0, 1))), atlas.faces) * atlas.texture_size**2
+    return np.sqrt(_sum_around(atlas, texels) / np.maximum(_sum_around(atlas, areas), 1e-20)).astype(np.float32)
 
 
 def invented_share(atlas: AtlasMesh, texels: Texels, provenance: np.ndarray) -> np.ndarray:
