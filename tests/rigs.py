@@ -6,6 +6,7 @@ import numpy as np
 
 from stages.geometry.cameras import PinholeCameras
 from stages.geometry.normalisation import rotation_onto
+from stages.geometry.region import frames_around
 
 EAST, NORTH, UP = np.eye(3)
 
@@ -111,6 +112,25 @@ def flight(seed: int = 0, tilt_deg: float = 3.0) -> tuple[PinholeCameras, np.nda
     houses = random.uniform([-50, -50, 0], [50, 50, 8], (300, 3))
     horizon = random.uniform([800, -500, 0], [2000, 500, 60], (60, 3))
     return capture(poses, focal=500.0), np.concatenate([ground, houses, horizon])
+
+
+def oblique_flight(seed: int = 0) -> tuple[PinholeCameras, np.ndarray]:
+    """A drone over a town of 200 x 200 amid fields: a grid straight down, then one to each side 42 degrees ahead."""
+    random = np.random.default_rng(seed)
+    poses = []
+    for heading in (None, EAST, NORTH, -EAST, -NORTH):
+        reach, count = (75, 4) if heading is None else (60, 3)
+        for x in np.linspace(-reach, reach, count):
+            for y in np.linspace(-reach, reach, count):
+                target = np.array([x, y, 0.0]) + 3 * random.normal(size=3)
+                ahead = np.zeros(3) if heading is None else np.tan(np.radians(42)) * 190 * heading
+                poses.append(look_at(target - ahead + [0, 0, 190.0], target, NORTH if heading is None else UP))
+    town = random.uniform([-100, -100, 0], [100, 100, 50], (3000, 3))
+    fields = random.uniform([-400, -400, 0], [400, 400, 1], (3000, 3))
+    cameras = capture(poses)
+    places = np.concatenate([town, fields])
+    # structure from motion has points only where two photos overlap
+    return cameras, places[frames_around(cameras, places) > 1]
 
 
 def facade(seed: int = 0) -> tuple[PinholeCameras, np.ndarray]:

@@ -14,6 +14,7 @@ from rigs import (
     flight,
     long_object_on_a_table,
     look_at,
+    oblique_flight,
     ring,
     room,
     room_from_its_walls,
@@ -62,6 +63,13 @@ def test_a_survey_flight_without_its_horizon(tilt_deg: float):
     assert np.linalg.norm(region.center[:2]) < 10
     assert inside(region, points[:3300]) > 0.95
     assert region.radius < 150  # half the diagonal is 125; the horizon reaches 2000
+
+
+def test_a_town_from_an_oblique_flight_though_the_optical_axes_nearly_meet():
+    _, points, region, _, _ = found(oblique_flight())
+    assert region.kind == "forward"
+    assert inside(region, points[np.abs(points[:, :2]).max(1) < 100]) > 0.98  # the town
+    assert region.radius < 2 * 143  # 143 encloses the town; few photos show the fields further off
 
 
 def test_a_facade_without_the_trees_behind():
