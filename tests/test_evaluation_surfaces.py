@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from stages.evaluation import alignment, culling
-from stages.evaluation.scenes import BLENDED_THRESHOLDS, URBAN_THRESHOLDS, blended_score, urban_score
+from stages.evaluation.scenes import BLENDED_THRESHOLDS, blended_score
 from stages.evaluation.surfaces import OneWay, Sampling, Surface, compare_to_points, draw_points, measure, turning
 from stages.evaluation.thinning import one_a_cube, thin
 from stages.geometry.cameras import PinholeCameras
@@ -128,12 +128,10 @@ def test_a_selection_is_drawn_more_densely_and_an_empty_one_is_refused():
         draw_points(square(), Sampling(4000), lambda points: points[:, 0] > 8)
 
 
-def test_scenes_have_their_own_thresholds():
+def test_blended_mvs_has_its_own_thresholds():
     found = blended_score(square(0.03), square(), FEW)
     assert [each.threshold for each in found.f_scores] == pytest.approx([2 * part for part in BLENDED_THRESHOLDS])
-    found = urban_score(square(0.3), square(), FEW)
-    assert [each.threshold for each in found.f_scores] == list(URBAN_THRESHOLDS)
-    assert [each.f_score for each in found.f_scores] == pytest.approx([0, 0, 0, 100])
+    assert [each.f_score for each in found.f_scores] == pytest.approx([0, 0, 100])
 
 
 def test_one_way_has_its_closed_forms():
