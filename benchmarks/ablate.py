@@ -6,7 +6,8 @@ python -m benchmarks.ablate DATA --extra far:all,reflection_reach=0.3       and 
 python -m benchmarks.ablate --table-only                                    only rewrite the table
 
 A truth is a known surface (`gt_mesh.ply`, `transforms.json`), and the score is the distance of the clean mesh to it; or
-known cameras (`cameras_sphere.npz`), and the score is the PSNR of photos that were left out of the training.
+known cameras (`cameras_sphere.npz`, with masks where there are any), and the score is the PSNR of photos that were left
+out of the training.
 
 Photos and poses are made ready once a set and shared by all its runs. A run is the stages train, extract and cleanup,
 called in a process of its own with one thread; as many run side by side as there are cores. Results go to
@@ -34,7 +35,6 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any
 
-from benchmarks.posed_sets import has_cameras, write_posed_set
 from benchmarks.run_sets import (
     NOT_MEASURED,
     OUT,
@@ -42,6 +42,7 @@ from benchmarks.run_sets import (
     RESULTS,
     ROOT,
     find_sets,
+    known_cameras,
     machine,
     markdown_table,
     photos_of,
@@ -243,15 +244,12 @@ def prepare(name: str, data: Path, preset: str) -> None:
     shared = FOLDERS / name / "shared"
     if (shared / SHARED).is_dir():
         return
-    if has_cameras(data / name):
-        partial = shared / f"{SHARED}.partial"
-        shutil.rmtree(partial, ignore_errors=True)
-        write_posed_set(data / name, partial)
-        partial.rename(shared / SHARED)
-        return
-    photos = photos_of(data / name)
-    arguments = ["run", str(photos), "--workspace", str(shared), "--until", SHARED, "--preset", preset, "--json"]
-    run_hineus([*arguments, "--set", "sfm.deterministic=true"])
+    arguments = ["run", str(photos_of(data / name)), "--workspace", str(shared), "--until", SHARED, "--preset", preset]
+    if (cameras := known_cameras(data / name)) is not None:
+        arguments += ["--poses", str(cameras)]
+        if (masks := data / name / "mask").is_dir():
+            arguments += ["--masks", str(masks)]
+    run_hineus([*arguments, "--set", "sfm.deterministic=true", "--json"])
 
 
 def poses_hash(folder: Path) -> str:
@@ -567,7 +565,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         data, preset = arguments.data.resolve(), arguments.preset or default_preset()
         names = find_sets(data, arguments.sets)
         if not arguments.sets:
-            names = [name for name in names if has_truth(data / name) or has_cameras(data / name)]
+            names = [name for name in names if has_truth(data / name) or known_cameras(data / name)]
         sets = {name: 0 if has_truth(data / name) else HOLDOUT for name in names}
         plans = make_plans(sets, variants, arguments.seeds, arguments.steps, preset)
         poses: dict[str, str] = {}

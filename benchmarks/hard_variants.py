@@ -28,7 +28,6 @@ from typing import Any
 import numpy as np
 
 from benchmarks.ablate import score_clean_mesh
-from benchmarks.posed_sets import CAMERAS, decompose, has_cameras
 from benchmarks.run_sets import (
     NOT_MEASURED,
     OUT,
@@ -36,11 +35,13 @@ from benchmarks.run_sets import (
     RESULTS,
     ROOT,
     find_sets,
+    known_cameras,
     machine,
     markdown_table,
     photos_of,
     with_table,
 )
+from stages.posing.neus import decompose
 
 ROWS = RESULTS / "poses"
 FOLDERS = OUT / "poses"
@@ -272,8 +273,8 @@ def true_centers(folder: Path) -> tuple[list[np.ndarray], float] | None:
         known, centers = load_known_surface(folder)
         by_stem = {Path(name).stem: center for name, center in centers.items()}
         return [by_stem[path.stem] for path in sorted(source.iterdir())], known.extent
-    if has_cameras(folder):
-        with np.load(folder / CAMERAS) as cameras:
+    if (path := known_cameras(folder)) is not None:
+        with np.load(path) as cameras:
             count = sum(key.startswith("world_mat_") and "inv" not in key for key in cameras)
             poses = [decompose(cameras[f"world_mat_{i}"][:3])[1] for i in range(count)]
             extent = 2 * float(cameras["scale_mat_0"][0, 0])

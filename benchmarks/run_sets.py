@@ -25,6 +25,7 @@ from typing import Any
 
 from benchmarks.synthetic import MADE_WITH
 from hineus_cli.machine import machine
+from stages.posing import neus
 
 ROOT = Path(__file__).parent.parent
 RESULTS = ROOT / "benchmarks" / "results"
@@ -91,6 +92,12 @@ class Result:
 def photos_of(folder: Path) -> Path | None:
     """The folder of photos of a set."""
     return next((folder / name for name in ("images", "image") if (folder / name).is_dir()), None)
+
+
+def known_cameras(folder: Path) -> Path | None:
+    """The file of a set's cameras in the layout of NeuS, where it comes with them."""
+    path = folder / neus.FILES[0]
+    return path if path.is_file() else None
 
 
 def find_sets(data: Path, names: Sequence[str]) -> list[str]:

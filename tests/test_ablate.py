@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -12,7 +13,6 @@ import pytest
 
 from benchmarks import ablate
 from benchmarks.ablate import BASE, VARIANTS, Plan, Run, ablation_table, load_runs, parse_extra, save_run, settings_of
-from benchmarks.posed_sets import PIXEL_SHIFT, write_posed_set
 from configs.load import load_config
 from stages import artifacts
 from stages.engine.stage import Stage, StageContext
@@ -288,6 +288,19 @@ def test_poses_that_are_there_are_not_made_again(here, monkeypatch):
     (here / "out" / "helmet" / "shared" / "undistort").rmdir()
     ablate.prepare("helmet", here / "data", "cpu")
     assert "undistort" in calls[0]
+    assert "--poses" not in calls[0]
+
+
+def test_known_cameras_and_masks_are_taken(here, monkeypatch):
+    calls = []
+    monkeypatch.setattr(ablate, "run_hineus", calls.append)
+    scan = here / "data" / "scan"
+    (scan / "mask").mkdir()
+    (scan / "cameras_sphere.npz").write_bytes(b"")
+    (here / "out" / "scan" / "shared" / "undistort").rmdir()
+    ablate.prepare("scan", here / "data", "cpu")
+    after = dict(itertools.pairwise(calls[0]))
+    assert (after["--poses"], after["--masks"]) == (str(scan / "cameras_sphere.npz"), str(scan / "mask"))
 
 
 def test_the_mesh_is_scored_in_the_world_frame(here, monkeypatch):
@@ -310,44 +323,6 @@ def test_the_mesh_is_scored_in_the_world_frame(here, monkeypatch):
     assert ablate.score_clean_mesh(folder, here / "shared", truth / "helmet") == {"mean": 1.0}
     assert np.allclose(seen["vertices"], 2 * corners + [1, 0, 0])
     assert seen["model"] == here / "shared" / "sfm" / "model"
-
-
-# ---------------------------------------------------------------- sets with known cameras
-def test_a_set_with_known_cameras_becomes_an_undistort_folder(tmp_path):
-    from sphere_scene import ring_of_cameras
-
-    cameras = ring_of_cameras(4)
-    source, folder = tmp_path / "scan", tmp_path / "undistort"
-    scale, offset = 231.0, np.array([-28.0, -13.0, 641.0])
-    scene_from_world = np.diag([1 / scale] * 3 + [1.0])
-    scene_from_world[:3, 3] = -offset / scale
-    matrices = {}
-    grey = np.zeros((40, 48), np.uint8)
-    for i in range(4):
-        name = f"{i:03d}.png"
-        artifacts.write_png(source / "image" / name, np.full((40, 48, 3), 40 * i, np.uint8))
-        artifacts.write_png(source / "mask" / f"{i}.png", np.where(np.arange(48) > 10 * i, grey + 255, grey))
-        projection = np.eye(4)
-        projection[:3] = -7.0 * cameras.intrinsics[i] @ cameras.cam_from_scene[i]  # of any scale and sign
-        matrices[f"world_mat_{i}"] = projection @ scene_from_world
-        matrices[f"scale_mat_{i}"] = np.linalg.inv(scene_from_world)
-    np.savez(source / "cameras_sphere.npz", **matrices)
-    write_posed_set(source, folder)
-
-    scene = artifacts.load_scene(folder)
-    assert scene.cameras.names == ("000.png", "001.png", "002.png", "003.png")
-    assert np.allclose(scene.cameras.cam_from_scene, cameras.cam_from_scene)
-    points = np.random.default_rng(0).uniform(-0.5, 0.5, (20, 3))
-    for i in range(4):
-        pixels, depth = scene.cameras.project(i, points)
-        expected, expected_depth = cameras.project(i, points)
-        assert np.allclose(pixels, expected + PIXEL_SHIFT)
-        assert np.allclose(depth, expected_depth)
-        assert artifacts.load_image(folder, scene.cameras.names[i])[0, 0, 0] == 40 * i
-        assert np.array_equal(artifacts.load_mask(folder, scene.cameras.names[i])[0] > 0, np.arange(48) > 10 * i)
-    assert np.allclose(scene.world_from_scene.apply(np.zeros(3)), offset)
-    assert (len(scene.points), len(scene.observations)) == (0, 0)
-    assert np.allclose(scene.up, [0, 0, 1])
 
 
 def test_a_scene_without_sparse_points_trains(tmp_path):

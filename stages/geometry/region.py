@@ -27,8 +27,8 @@ MIN_AXIS_SPREAD_DEG = 8.0
 MIN_IN_FRONT = 0.8
 # ... and the axes must pass it within this part of its distance (median): else they do not meet.
 MAX_MISS_RATIO = 0.5
-# They meet in an object only if they also pass through what the photos show of it whole: the median miss is at most this
-# part of the seen-whole radius. On six captures of objects it was 0.004 to 0.18, on an oblique survey flight 1.1.
+# They meet in an object only if they also pass through what the photos show of it whole: the median miss is at most
+# this part of the seen-whole radius. On six captures of objects it was 0.004 to 0.18, on an oblique flight 1.1.
 MAX_MISS_OF_SEEN = 0.5
 # There is something where they meet: of the points in the middle of the photos (half the width and height), this part
 # at least lies at that distance (give or take half of it). Fewer points than this say nothing of the whole.
