@@ -2,13 +2,14 @@
 
 python -m benchmarks.run_sets DATA                  every set in DATA that has no result yet
 python -m benchmarks.run_sets DATA banana viking    these
+python -m benchmarks.run_sets DATA --seeds 2        each with seeds 0 and 1, poses made anew, too
 python -m benchmarks.run_sets --demo                `hineus demo`
 python -m benchmarks.run_sets --table-only          only rewrite the tables of docs/benchmarks.md
 
 A set is a folder with `images/` (or `image/`) and, where the truth is known, `gt_mesh.ply` and `transforms.json`.
-Results go to benchmarks/results/SET.json, those of the scenes that `benchmarks.synthetic` made to results/synthetic/,
-which has a table of its own; workspaces and contact sheets to benchmarks/out/. A set that was cut off
-goes on where it stopped; seconds are those of the stages, as the workspace recorded them when each ran.
+Results go to benchmarks/results/SET.json (SET-seed1.json and so on), those of the scenes that `benchmarks.synthetic`
+made to results/synthetic/, which has a table of its own; workspaces and contact sheets to benchmarks/out/. A set that
+was cut off goes on where it stopped; seconds are those of the stages, as the workspace recorded them when each ran.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 from benchmarks.synthetic import MADE_WITH
@@ -61,6 +63,7 @@ class Result:
         score: distances in percent of the extent, or None without truth; see `stages.meshing.evaluation`.
         validator: counts of the glTF validator's messages, or None where it is not installed.
         glb_bytes: size of the textured model.
+        seed: of the training.
     """
 
     name: str
@@ -70,6 +73,7 @@ class Result:
     score: dict[str, float] | None
     validator: dict[str, int] | None
     glb_bytes: int
+    seed: int = 0
 
     @property
     def wall_s(self) -> float:
@@ -115,14 +119,14 @@ def find_sets(data: Path, names: Sequence[str]) -> list[str]:
     return list(names) or found
 
 
-def run_set(name: str, data: Path | None) -> Result:
+def run_set(name: str, data: Path | None, seed: int = 0) -> Result:
     """Run one set (or the demo, without `data`) in a process of its own, and measure its result.
 
     Raises:
         RuntimeError: `hineus` failed; its message is included.
     """
     OUT.mkdir(parents=True, exist_ok=True)
-    workspace = OUT / name
+    workspace = OUT / _seeded(name, seed)
     if data is None:
         arguments, shown = ["demo", "--workspace", str(workspace)], "hineus demo"
         truth: Path | None = workspace
@@ -132,6 +136,9 @@ def run_set(name: str, data: Path | None) -> Result:
         arguments = ["run", str(photos), "--workspace", str(workspace)]
         shown = f"hineus run DATA/{name}/{photos.name}"
         truth = data / name
+    if seed:
+        chosen = ["--set", f"train.seed={seed}"]
+        arguments, shown = [*arguments, *chosen], " ".join([shown, *chosen])
     answer = run_hineus([*arguments, "--json"])
     stages = tuple(
         StageCost(
@@ -145,8 +152,9 @@ def run_set(name: str, data: Path | None) -> Result:
     )
     folder = Path(answer["workspace"])
     glb = Path(answer["glb"])
-    contact_sheet(folder, OUT / f"{name}.png")
-    return Result(name, shown, machine(), stages, _score(folder, truth), validate(glb), glb.stat().st_size)
+    contact_sheet(folder, OUT / f"{workspace.name}.png")
+    score = _score(folder, truth)
+    return Result(name, shown, machine(), stages, score, validate(glb), glb.stat().st_size, seed)
 
 
 def run_hineus(arguments: Sequence[str]) -> dict[str, Any]:
@@ -215,10 +223,14 @@ def contact_sheet(workspace: Path, path: Path) -> None:
 
 
 # ---------------------------------------------------------------- result files
-def result_path(name: str, data: Path | None) -> Path:
+def result_path(name: str, data: Path | None, seed: int = 0) -> Path:
     """Where the result of a set belongs; `data`: its folder of sets, None for the demo."""
     ours = data is not None and (data / name / MADE_WITH).is_file()
-    return (RESULTS / SYNTHETIC if ours else RESULTS) / f"{name}.json"
+    return (RESULTS / SYNTHETIC if ours else RESULTS) / f"{_seeded(name, seed)}.json"
+
+
+def _seeded(name: str, seed: int) -> str:
+    return f"{name}-seed{seed}" if seed else name
 
 
 def save_result(result: Result, path: Path) -> None:
@@ -227,37 +239,42 @@ def save_result(result: Result, path: Path) -> None:
 
 
 def load_results(folder: Path) -> list[Result]:
-    """All results there are, the demo first, then by name."""
+    """All results there are, the demo first, then by name and seed."""
     results = []
     for path in folder.glob("*.json"):
         data = json.loads(path.read_text(encoding="utf-8"))
         data["stages"] = tuple(StageCost(**stage) for stage in data["stages"])
         results.append(Result(**data))
-    return sorted(results, key=lambda result: (result.name != DEMO, result.name))
+    return sorted(results, key=lambda result: (result.name != DEMO, result.name, result.seed))
 
 
 # ---------------------------------------------------------------- tables
 def summary_table(results: Sequence[Result]) -> str:
-    """One row a set: what was registered, what it cost, how far it is from the truth."""
+    """One row a set: what was registered and what it cost with the first seed, and the mean distances of all seeds."""
     header = [
-        "set", "photos registered", "wall min", "CPU min", "peak GiB", "faces", "GLB MB",
+        "set", "seeds", "photos registered", "wall min", "CPU min", "peak GiB", "faces", "GLB MB",
         "distance %", "accuracy %", "completeness %", "F at 1 %", "glTF errors / warnings",
     ]  # fmt: skip
-    rows = [
-        [
-            result.name,
-            f"{_text(result.number('sfm', 'registered'))} of {_text(result.number('sfm', 'images'))}",
-            f"{result.wall_s / 60:.1f}",
-            f"{result.cpu_s / 60:.1f}",
-            f"{result.peak_rss / GIB:.2f}",
-            _text(result.number("cleanup", "faces")),
-            f"{result.glb_bytes / 1e6:.1f}",
-            *(_score_cell(result, name) for name in ("mean", "accuracy", "completeness", "f_one_percent")),
-            f"{result.validator['errors']} / {result.validator['warnings']}" if result.validator else "-",
-        ]
-        for result in results
+    by_name: dict[str, list[Result]] = {}
+    for result in results:
+        by_name.setdefault(result.name, []).append(result)
+    return markdown_table(header, [_summary_row(seeds) for seeds in by_name.values()])
+
+
+def _summary_row(seeds: Sequence[Result]) -> list[str]:
+    first = seeds[0]
+    return [
+        first.name,
+        str(len(seeds)),
+        f"{_text(first.number('sfm', 'registered'))} of {_text(first.number('sfm', 'images'))}",
+        f"{first.wall_s / 60:.1f}",
+        f"{first.cpu_s / 60:.1f}",
+        f"{first.peak_rss / GIB:.2f}",
+        _text(first.number("cleanup", "faces")),
+        f"{first.glb_bytes / 1e6:.1f}",
+        *(_score_cell(seeds, name) for name in ("mean", "accuracy", "completeness", "f_one_percent")),
+        f"{first.validator['errors']} / {first.validator['warnings']}" if first.validator else "-",
     ]
-    return markdown_table(header, rows)
 
 
 def stage_table(results: Sequence[Result]) -> str:
@@ -305,8 +322,10 @@ def with_tables(page: str, results: Sequence[Result]) -> str:
     Raises:
         ValueError: a marker is missing.
     """
+    first = [result for result in results if result.seed == 0]
     for name, table in TABLES.items():
-        page = with_table(page, name, table(results) if results else NOT_MEASURED)
+        shown = results if table is summary_table else first
+        page = with_table(page, name, table(shown) if shown else NOT_MEASURED)
     return page
 
 
@@ -341,8 +360,13 @@ def markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
-def _score_cell(result: Result, name: str) -> str:
-    return f"{result.score[name]:.2f}" if result.score else "-"
+def _score_cell(seeds: Sequence[Result], name: str) -> str:
+    """The mean over the seeds, and of several seeds' distances the least and the largest."""
+    values = [result.score[name] for result in seeds if result.score]
+    if not values:
+        return "-"
+    several = name == "mean" and len(values) > 1
+    return f"{fmean(values):.2f}" + (f" ({min(values):.2f} to {max(values):.2f})" if several else "")
 
 
 def _text(value: Any) -> str:
@@ -356,6 +380,7 @@ def main() -> int:
     parser.add_argument("data", type=Path, nargs="?", help="folder of sets")
     parser.add_argument("sets", nargs="*", help="names of sets; default: all")
     parser.add_argument("--demo", action="store_true", help="run the demo, too")
+    parser.add_argument("--seeds", type=int, default=1, help="how many seeds, from 0")
     parser.add_argument("--again", action="store_true", help="also sets that have a result")
     parser.add_argument("--table-only", action="store_true", help="run nothing")
     arguments = parser.parse_args()
@@ -365,17 +390,18 @@ def main() -> int:
     if not jobs and not arguments.table_only:
         parser.error("name a folder of sets, or --demo, or --table-only")
     failed = []
-    for name, data in [] if arguments.table_only else jobs:
-        path = result_path(name, data)
+    runs = [(name, data, seed) for seed in range(arguments.seeds) for name, data in jobs]
+    for name, data, seed in [] if arguments.table_only else runs:
+        path = result_path(name, data, seed)
         if path.exists() and not arguments.again:
-            print(f"{name}: has a result (--again measures it anew)", file=sys.stderr)
+            print(f"{path.stem}: has a result (--again measures it anew)", file=sys.stderr)
             continue
-        print(f"{name}: running", file=sys.stderr)
+        print(f"{path.stem}: running", file=sys.stderr)
         try:
-            save_result(run_set(name, data), path)
+            save_result(run_set(name, data, seed), path)
         except RuntimeError as error:
-            print(f"{name}: {error}", file=sys.stderr)
-            failed.append(name)
+            print(f"{path.stem}: {error}", file=sys.stderr)
+            failed.append(path.stem)
     PAGE.write_text(updated_page(PAGE.read_text(encoding="utf-8")), encoding="utf-8")
     return 1 if failed else 0
 

@@ -36,8 +36,21 @@ def test_summary_adds_up_the_stages():
     assert _result().peak_rss == 3 << 30
     table = run_sets.summary_table([_result(score=SCORE)])
     row = [cell.strip() for cell in table.splitlines()[2].strip("|").split("|")]
-    assert row == ["banana", "15 of 16", "4.3", "7.7", "3.00", "99000", "5.2",
+    assert row == ["banana", "1", "15 of 16", "4.3", "7.7", "3.00", "99000", "5.2",
                    "0.66", "0.50", "0.81", "84.00", "0 / 1"]  # fmt: skip
+
+
+def test_seeds_share_a_row_with_their_spread_and_the_other_tables_have_the_first(tmp_path):
+    from dataclasses import replace
+
+    worse = {**SCORE, "mean": 0.765, "accuracy": 0.7}
+    runs = [_result(score=SCORE), replace(_result(score=worse), seed=1)]
+    row = [cell.strip() for cell in run_sets.summary_table(runs).splitlines()[2].strip("|").split("|")]
+    assert (row[1], row[8], row[9]) == ("2", "0.71 (0.66 to 0.77)", "0.60")
+    page = "".join(f"<!-- table {name} -->\n<!-- end {name} -->\n" for name in run_sets.TABLES)
+    assert "| stage | banana |\n" in with_tables(page, runs)
+    paths = [run_sets.result_path("banana", tmp_path, seed).name for seed in (0, 1)]
+    assert paths == ["banana.json", "banana-seed1.json"]
 
 
 def test_sets_without_truth_or_validator_get_a_dash():
