@@ -34,7 +34,8 @@ def score_result(
     if scene.truth is not None and mesh is not None:
         scores["mesh"] = score_surface(scene.truth, mesh, workspace)
     if scene.views is not None and "train" in fresh:
-        scores["views"] = score_test_views(TestPhotos(scene.views, workspace), workspace, fresh, device)
+        photos = TestPhotos(scene.views, workspace, scene.masks)
+        scores["views"] = score_test_views(photos, workspace, fresh, device)
     return scores
 
 

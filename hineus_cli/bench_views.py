@@ -14,6 +14,7 @@ from stages import artifacts
 from stages.engine.workspace import Workspace
 from stages.geometry.cameras import PinholeCameras
 from stages.geometry.normalisation import into_scene
+from stages.ingest import find_masks, read_mask_file
 from stages.posing.known import image_size, match_photos
 from stages.posing.reading import read_poses
 from stages.posing.triangulation import fitted_camera
@@ -34,11 +35,17 @@ class TestPhotos:
 
     __test__ = False  # pytest takes the name for a test
 
-    def __init__(self, views: TestViews, workspace: Workspace) -> None:
-        """Raises InputError where no photo has a pose, or one has another shape than its pose is for."""
+    def __init__(self, views: TestViews, workspace: Workspace, masks: Path | None = None) -> None:
+        """With the folder of the masks that the scene is run with, if it is.
+
+        Raises:
+            InputError: no photo has a pose, or one has another shape than its pose is for.
+        """
         scene = artifacts.load_scene(workspace.stage_folder("undistort"))
-        matched = match_photos(read_poses(views.poses), views.names)
+        poses = read_poses(views.poses)
+        matched = match_photos(poses, views.names)
         self._views = views
+        self._masks = find_masks(list(matched), masks, poses) if masks is not None else {}
         # as large as training saw photos of this scene
         self._max_side = int(scene.cameras.sizes.max())
         self._lenses = {
@@ -58,6 +65,9 @@ class TestPhotos:
         """Photo [H, W, 3] uint8 (on white, where that is the suite's background) and mask [H, W] bool or None."""
         name = self.cameras.names[index]
         pixels, mask = _read(self._views.folder / name, self._views.background == "white")
+        if name in self._masks:
+            size = pixels.shape[1], pixels.shape[0]
+            mask = np.where(read_mask_file(self._masks[name], name, size, size, 1), WHITE, 0).astype(np.uint8)
         pixels, mask = pinhole_photo(self._lenses[name], pixels, mask, self._max_side)
         return pixels, None if mask is None else mask > OPAQUE
 

@@ -78,7 +78,7 @@ def run(context: StageContext) -> dict[str, Any]:
             first_with[digest] = path
             unique.append((path, digest))
 
-    mask_files = _find_masks([path for path, _ in unique], masks_folder, poses) if masks_folder else {}
+    mask_files = find_masks([path for path, _ in unique], masks_folder, poses) if masks_folder else {}
     names = _Names(path for path, _ in unique)
     done = 0
 
@@ -186,13 +186,28 @@ def _by_reason(skipped: list[SkippedImage]) -> dict[str, list[str]]:
     return sources
 
 
-def _find_masks(photos: list[str], folder: Path, poses: KnownPoses | None) -> dict[str, Path]:
+def find_masks(photos: list[str], folder: Path, poses: KnownPoses | None) -> dict[str, Path]:
     """Photo -> its mask file in `folder`; as the poses' format pairs them where it is that format's own folder."""
     if poses is None or {file.parent.resolve() for file in poses.masks.values()} != {folder.resolve()}:
         return match_masks(photos, folder)
     cameras = match_photos(poses, photos)
     named = {photo: poses.masks.get(camera.name) for photo, camera in cameras.items()}
     return {photo: file for photo, file in named.items() if file is not None}
+
+
+def read_mask_file(
+    file: Path, photo: str, size: tuple[int, int], stored_size: tuple[int, int], orientation: int
+) -> np.ndarray:
+    """Mask [H, W] bool of the upright photo, of a picture or of a depth image.
+
+    Raises:
+        InputError: it cannot be read, or is not of the upright photo's size (width, height).
+    """
+    if not file.name.endswith(DEPTH):
+        return read_mask(file, photo, size, stored_size, orientation)
+    mask = read_depth_mask(file)
+    check_size(file, photo, mask.shape[::-1], size)
+    return mask
 
 
 def _first(names: list[str]) -> str:
@@ -276,11 +291,7 @@ def _take_photo(
     photo = read_photo(file)
     rgb, mask = photo.rgb, photo.alpha
     if mask_file is not None:
-        if mask_file.name.endswith(DEPTH):
-            mask = read_depth_mask(mask_file)
-            check_size(mask_file, source, mask.shape[::-1], rgb.size)
-        else:
-            mask = read_mask(mask_file, source, rgb.size, photo.stored_size, photo.orientation)
+        mask = read_mask_file(mask_file, source, rgb.size, photo.stored_size, photo.orientation)
     if mask is not None and not mask.any():
         raise UnusableError(f"its mask is empty ({mask_file.name if mask_file else 'alpha channel'})")
 

@@ -245,6 +245,24 @@ def test_test_photos_show_the_ball_where_the_scene_has_it(data: Path, suite: str
             assert mask is None
 
 
+@pytest.mark.parametrize("suite", ["dtu", "glossy-synthetic", "known"])
+def test_test_photos_have_the_masks_that_the_scene_is_run_with(data: Path, suite: str):
+    write_suite(suite, data)
+    results_of(suite, str(data), "--until", "undistort", "--hold-out", "4", "--masks")
+    scene = find_scenes(SUITES[suite], data, Wanted(masks=True, hold_out=4))[0]
+    assert scene.views is not None
+    workspace = Workspace.open(Path("bench") / suite / scene.name / "tiny-seed0")
+    photos = TestPhotos(scene.views, workspace, scene.masks)
+    world_from_scene = artifacts.load_scene(workspace.stage_folder("undistort")).world_from_scene
+    for index in range(len(photos.cameras)):
+        pixels, mask = photos.load(index)
+        assert mask is not None
+        assert mask.shape == pixels.shape[:2]
+        center, _ = photos.cameras.project(index, world_from_scene.inverse().apply(np.zeros((1, 3))))
+        y, x = np.nonzero(mask)
+        np.testing.assert_allclose([x.mean() + 0.5, y.mean() + 0.5], center[0], atol=1)
+
+
 class GreyBall:
     """Draws a grey ball as a field without a background does: black where nothing is."""
 
