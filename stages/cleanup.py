@@ -26,6 +26,9 @@ GROUND_TILT_DEG, MIN_GROUND_AREA = 15.0, 0.02
 # Pieces that rise above the cut by less than this many tolerances, and have less than this part of the largest one's
 # area, are bumps of the ground.
 BUMP_TOLERANCES, BUMP_AREA = 5.0, 0.05
+# What hangs further under the ground than this many tolerances, further out than this, was made up along the border of
+# the region; unless more than this part of the sparse points lies under the ground, too.
+UNDER_TOLERANCES, BORDER_RADIUS, MAX_UNDER = 2.0, 0.75, 0.01
 # Specks below this part of `min_component` go before anything is measured. The rest waits until the unseen is gone:
 # a background shell may be the largest piece.
 SPECK = 0.1
@@ -70,6 +73,9 @@ def run(context: StageContext) -> dict[str, Any]:
     )
     vertices, faces = _crop(vertices, faces, scene, params)
     numbers["ground_removed"] = params.remove_ground and scene.ground is not None
+    if scene.ground is not None and not params.keep_closed:
+        under = _under_the_border(vertices, scene, UNDER_TOLERANCES * params.ground_tolerance)
+        keep(~under[faces].all(1), "under_ground", "Try `--set undistort.roi_scale=1.5`.")
     selection, numbers["specks_dropped"] = cleaning.large_pieces(faces, SPECK * params.min_component)
     keep(selection, "speck_faces", "Try `--set cleanup.min_component=0`.")
     if params.mask_hull:
@@ -149,6 +155,18 @@ def _crop(vertices: np.ndarray, faces: np.ndarray, scene: PosedScene, params: An
     return vertices, faces
 
 
+def _under_the_border(vertices: np.ndarray, scene: PosedScene, depth: float) -> np.ndarray:
+    """Vertices [V] bool that hang under the ground by more than `depth` along the region's border.
+
+    Photos show the ground going on there and nothing below it, so that training may leave flaps.
+    """
+    assert scene.ground is not None
+    points = scene.points[np.linalg.norm(scene.points, axis=1) < 1]
+    if scene.kind != "object" or (scene.ground.heights(points) < -depth).sum() > MAX_UNDER * len(points):
+        return np.zeros(len(vertices), dtype=bool)
+    return (np.linalg.norm(vertices, axis=1) > BORDER_RADIUS) & (scene.ground.heights(vertices) < -depth)
+
+
 def _without_bumps(
     vertices: np.ndarray, faces: np.ndarray, normal: np.ndarray, offset: float, height: float
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -209,7 +227,7 @@ def _seen_faces(vertices: np.ndarray, faces: np.ndarray, seen: np.ndarray, param
 
 CLEANUP = Stage(
     name="cleanup",
-    version=4,
+    version=5,
     needs=("undistort", "extract"),
     params="cleanup",
     run=run,

@@ -396,6 +396,24 @@ def test_stage_drops_what_closes_the_surface_beyond_the_region(stage):
     assert np.linalg.norm(vertices, axis=1).max() > 0.95
 
 
+@pytest.mark.parametrize("seen_below", [False, True])
+def test_stage_drops_flaps_under_the_ground_at_the_border_unless_points_lie_there(stage, seen_below):
+    ground = Plane(np.array([0.0, 0, 1]), -0.1, 0.01, 0.5)
+    flap = lambda p: np.maximum(np.linalg.norm(p - [0.85, 0, -0.25], axis=1) - 0.1, -p[:, 2] - 0.6)  # noqa: E731
+    pit = lambda p: np.linalg.norm(p - [0.2, 0, -0.25], axis=1) - 0.1  # noqa: E731
+    slab = lambda p: np.abs(p[:, 2] + 0.13) - 0.03  # noqa: E731
+    surface = extract_solid(lambda p: np.minimum(slab(p), np.minimum(flap(p), pit(p))), 64)
+    points = np.random.default_rng(0).uniform([-0.6, -0.6, -0.1], [0.6, 0.6, 0.1], (200, 3))
+    points[: 10 if seen_below else 1, 2] = -0.3
+    numbers, vertices, _ = stage(
+        surface.vertices, surface.faces, scene_extras={"ground": ground, "points": points}, min_views=0
+    )
+    assert (numbers["under_ground"] > 0) != seen_below
+    low = vertices[vertices[:, 2] < -0.2]
+    assert (low[:, 0] < 0.4).any()
+    assert (low[:, 0] > 0.76).any() == seen_below
+
+
 def test_stage_says_when_a_solid_was_wanted_and_is_none(stage, monkeypatch, caplog):
     decimated = "stages.meshing.simplify.decimate"
     monkeypatch.setattr(decimated, lambda vertices, faces, target: (vertices, faces[1:]))
