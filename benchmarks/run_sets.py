@@ -263,6 +263,7 @@ def summary_table(results: Sequence[Result]) -> str:
 
 def _summary_row(seeds: Sequence[Result]) -> list[str]:
     first = seeds[0]
+    validator = next((result.validator for result in seeds if result.validator), None)
     return [
         first.name,
         str(len(seeds)),
@@ -273,7 +274,7 @@ def _summary_row(seeds: Sequence[Result]) -> list[str]:
         _text(first.number("cleanup", "faces")),
         f"{first.glb_bytes / 1e6:.1f}",
         *(_score_cell(seeds, name) for name in ("mean", "accuracy", "completeness", "f_one_percent")),
-        f"{first.validator['errors']} / {first.validator['warnings']}" if first.validator else "-",
+        f"{validator['errors']} / {validator['warnings']}" if validator else "-",
     ]
 
 
