@@ -375,7 +375,7 @@ def _check_seen(region: RegionOfInterest, cameras: PinholeCameras, text: str) ->
 
 UNDISTORT = Stage(
     name="undistort",
-    version=3,
+    version=4,
     needs=("ingest", "sfm"),
     params="undistort",
     run=run,
