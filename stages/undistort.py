@@ -360,10 +360,7 @@ def _find_region(
 def _check_seen(region: RegionOfInterest, cameras: PinholeCameras, text: str) -> None:
     """Raises ConfigError where fewer than two cameras see the given region."""
     places = region.center + region.radius * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
-    seen = 0
-    for i, size in enumerate(cameras.sizes):
-        pixels, depth = cameras.project(i, places)
-        seen += bool(((depth > 0) & (pixels >= 0).all(1) & (pixels < size).all(1)).any())
+    seen = sum(bool(cameras.in_frame(i, places).any()) for i in range(len(cameras)))
     if seen < MIN_SEEING:
         middle = " ".join(f"{value:.4g}" for value in np.median(cameras.centers, axis=0))
         raise ConfigError(

@@ -28,8 +28,7 @@ def seen(
     scene = None if occluder is None else raycaster(occluder[0] - middle, occluder[1])
     for i, center in enumerate(cameras.centers):
         open_points = np.flatnonzero(~found)
-        pixels, depth = cameras.project(i, points[open_points])
-        open_points = open_points[(depth > 0) & (pixels >= 0).all(1) & (pixels < cameras.sizes[i]).all(1)]
+        open_points = open_points[cameras.in_frame(i, points[open_points])]
         if scene is not None and len(open_points):
             # Not normalised: the camera is at distance 1, whatever lies before it hides the point.
             ways = np.concatenate([points[open_points] - middle, center - points[open_points]], 1).astype(np.float32)

@@ -64,6 +64,11 @@ class PinholeCameras:
             [K[0, 0] * pixels[:, 0] + K[0, 1] * pixels[:, 1] + K[0, 2], K[1, 1] * pixels[:, 1] + K[1, 2]], 1
         ), depth
 
+    def in_frame(self, index: int, points: np.ndarray) -> np.ndarray:
+        """[P] bool: which scene points [P, 3] lie before one camera and within its photo, hidden or not."""
+        pixels, depth = self.project(index, points)
+        return (depth > 0) & (pixels >= 0).all(1) & (pixels < self.sizes[index]).all(1)
+
     def rays(self, index: int, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Origins and unit directions [P, 3] in the scene frame of rays through pixel positions [P, 2]."""
         K, rotation = self.intrinsics[index], self.cam_from_scene[index, :, :3]

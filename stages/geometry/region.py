@@ -140,9 +140,8 @@ def seen_whole_radii(cameras: PinholeCameras, center: np.ndarray) -> np.ndarray:
 def frames_around(cameras: PinholeCameras, points: np.ndarray) -> np.ndarray:
     """[P] photos that have each of the points [P, 3] within their frame, hidden or not."""
     frames = np.zeros(len(points), dtype=np.int64)
-    for i, size in enumerate(cameras.sizes):
-        pixels, depth = cameras.project(i, points)
-        frames += (depth > 0) & (pixels >= 0).all(1) & (pixels < size).all(1)
+    for i in range(len(cameras)):
+        frames += cameras.in_frame(i, points)
     return frames
 
 

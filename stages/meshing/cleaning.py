@@ -271,11 +271,9 @@ def count_views(
 
     cosines = np.full((len(vertices), len(cameras)), -1.0, dtype=np.float32)
     for i, center in enumerate(cameras.centers):
-        pixels, depth = cameras.project(i, vertices)
-        inside = (depth > 0) & (pixels >= 0).all(1) & (pixels < cameras.sizes[i]).all(1)
         to_camera = center - vertices
         cosine = np.einsum("vi,vi->v", to_camera, normals) / np.linalg.norm(to_camera, axis=1)
-        cosines[:, i] = np.where(inside, cosine, -1)
+        cosines[:, i] = np.where(cameras.in_frame(i, vertices), cosine, -1)
 
     views = np.zeros(len(vertices), dtype=np.int64)
     open_vertices = np.arange(len(vertices))
