@@ -51,6 +51,7 @@ from benchmarks.run_sets import (
 )
 from stages.engine.stage import Stage, StageContext
 from stages.errors import HineusError
+from stages.posing import neus
 
 BASE = "base"
 # What every variant starts from: colours and the plain Eikonal term. Written out, so that it stays the base whatever
@@ -247,7 +248,7 @@ def prepare(name: str, data: Path, preset: str) -> None:
     arguments = ["run", str(photos_of(data / name)), "--workspace", str(shared), "--until", SHARED, "--preset", preset]
     if (cameras := known_cameras(data / name)) is not None:
         arguments += ["--poses", str(cameras)]
-        if (masks := data / name / "mask").is_dir():
+        if (masks := data / name / neus.MASKS).is_dir():
             arguments += ["--masks", str(masks)]
     run_hineus([*arguments, "--set", "sfm.deterministic=true", "--json"])
 

@@ -41,7 +41,7 @@ from benchmarks.run_sets import (
     photos_of,
     with_table,
 )
-from stages.posing.neus import decompose
+from stages.posing.neus import read_neus
 
 ROWS = RESULTS / "poses"
 FOLDERS = OUT / "poses"
@@ -274,11 +274,10 @@ def true_centers(folder: Path) -> tuple[list[np.ndarray], float] | None:
         by_stem = {Path(name).stem: center for name, center in centers.items()}
         return [by_stem[path.stem] for path in sorted(source.iterdir())], known.extent
     if (path := known_cameras(folder)) is not None:
-        with np.load(path) as cameras:
-            count = sum(key.startswith("world_mat_") and "inv" not in key for key in cameras)
-            poses = [decompose(cameras[f"world_mat_{i}"][:3])[1] for i in range(count)]
-            extent = 2 * float(cameras["scale_mat_0"][0, 0])
-        return [-pose[:, :3].T @ pose[:, 3] for pose in poses], extent
+        stated = read_neus(path)
+        poses = [camera.cam_from_world for camera in stated.cameras]
+        assert stated.region is not None  # the format has one
+        return [-pose[:, :3].T @ pose[:, 3] for pose in poses], 2 * stated.region.radius
     return None
 
 

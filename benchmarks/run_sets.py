@@ -136,9 +136,9 @@ def run_set(name: str, data: Path | None, seed: int = 0) -> Result:
         arguments = ["run", str(photos), "--workspace", str(workspace)]
         shown = f"hineus run DATA/{name}/{photos.name}"
         truth = data / name
-    if seed:
-        chosen = ["--set", f"train.seed={seed}"]
-        arguments, shown = [*arguments, *chosen], " ".join([shown, *chosen])
+        if seed:
+            arguments += ["--set", f"train.seed={seed}"]
+            shown += f" --set train.seed={seed}"
     answer = run_hineus([*arguments, "--json"])
     stages = tuple(
         StageCost(
@@ -391,7 +391,10 @@ def main() -> int:
     if not jobs and not arguments.table_only:
         parser.error("name a folder of sets, or --demo, or --table-only")
     failed = []
-    runs = [(name, data, seed) for seed in range(arguments.seeds) for name, data in jobs]
+    # the demo has one seed
+    runs = [
+        (name, data, seed) for seed in range(arguments.seeds) for name, data in jobs if data is not None or not seed
+    ]
     for name, data, seed in [] if arguments.table_only else runs:
         path = result_path(name, data, seed)
         if path.exists() and not arguments.again:

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -190,20 +191,21 @@ def find_region(
     """
     if len(cameras) < 2:
         raise ValueError(f"got {len(cameras)} cameras, expected at least 2")
-    found = _object_sphere(cameras)
-    if found is not None and len(points) >= MIN_JUDGED and present_share(cameras, points, found[0]) < MIN_PRESENT:
+    found = _where_axes_meet(cameras)
+    enough = len(points) >= MIN_JUDGED
+    if found is not None and enough and present_share(cameras, points, found.point) < MIN_PRESENT:
         found = None
     if found is not None and masks is not None and any(mask is not None for mask in masks):
         # The silhouettes may be larger than what every view shows whole: look in a cube twice as wide.
-        hull = visual_hull_sphere(cameras, masks, found[0], 2.0 * SEEN_WHOLE_MARGIN * found[1])
+        hull = visual_hull_sphere(cameras, masks, found.point, 2.0 * SEEN_WHOLE_MARGIN * found.radius)
         if hull is not None and (stated is None or hull[1] * HULL_MARGIN < stated.radius):
             return RegionOfInterest(hull[0], hull[1] * HULL_MARGIN, "object", "the visual hull of the masks")
     if stated is not None:
         return stated
-    if found is not None and len(points) >= MIN_JUDGED and found[2] > MAX_MISS_OF_SEEN * found[1]:
+    if found is not None and enough and found.miss > MAX_MISS_OF_SEEN * found.radius:
         found = None
     if found is not None:
-        return RegionOfInterest(found[0], SEEN_WHOLE_MARGIN * found[1], "object", FROM_FRUSTA)
+        return RegionOfInterest(found.point, SEEN_WHOLE_MARGIN * found.radius, "object", FROM_FRUSTA)
     if len(points) == 0:
         raise ValueError("got 0 sparse points and optical axes that do not meet, expected either")
     from scipy.spatial import cKDTree
@@ -251,9 +253,16 @@ def given_region(form: str, numbers: Sequence[float], kind: str) -> RegionOfInte
     return RegionOfInterest(box.mean(0), radius, kind, "the given box", box)
 
 
-def _object_sphere(cameras: PinholeCameras) -> tuple[np.ndarray, float, float] | None:
-    """Where the optical axes meet, the sphere about it that the views show whole, and the median miss; None where they
-    do not meet."""
+class _Meeting(NamedTuple):
+    """Where optical axes meet: the point [3], the radius about it that the views show whole, the axes' median miss."""
+
+    point: np.ndarray
+    radius: float
+    miss: float
+
+
+def _where_axes_meet(cameras: PinholeCameras) -> _Meeting | None:
+    """None where they do not."""
     centers, forward = cameras.centers, cameras.forward
     if axis_spread_deg(forward) < MIN_AXIS_SPREAD_DEG:
         return None
@@ -263,4 +272,5 @@ def _object_sphere(cameras: PinholeCameras) -> tuple[np.ndarray, float, float] |
     if in_front.mean() < MIN_IN_FRONT or np.median(misses[in_front] / depths[in_front]) > MAX_MISS_RATIO:
         return None
     seen_whole = float(np.median(seen_whole_radii(cameras, point)))
-    return point, max(seen_whole, MIN_RADIUS_RATIO * float(np.median(depths[in_front]))), float(np.median(misses))
+    radius = max(seen_whole, MIN_RADIUS_RATIO * float(np.median(depths[in_front])))
+    return _Meeting(point, radius, float(np.median(misses)))
