@@ -17,7 +17,7 @@ from stages.geometry.plane import Plane
 from stages.geometry.similarity import Similarity
 from stages.meshing import cleaning
 from stages.meshing.isosurface import extract_isosurface
-from stages.meshing.simplify import decimate
+from stages.meshing.simplify import AGGRESSIVENESS, decimate
 from stages.meshing.solids import extract_solid
 
 SIZE = 160
@@ -230,6 +230,18 @@ def test_decimation_of_a_closed_mesh_leaves_no_hole(monkeypatch):
     monkeypatch.setattr(fast_simplification, "simplify", lambda *a, **k: (vertices, faces[1:]))
     _, kept = decimate(vertices, faces, 400)
     assert len(kept) <= 400
+    assert cleaning.mesh_state(kept) == cleaning.MeshState(0, 0, 0)
+
+
+def test_decimation_reaches_its_target_where_the_fast_one_gives_up():
+    import fast_simplification
+
+    vertices, faces = ball(resolution=48)
+    rough = (vertices * np.random.default_rng(0).normal(1, 0.03, (len(vertices), 1))).astype(np.float32)
+    given_up = fast_simplification.simplify(rough, faces, target_count=1000, agg=AGGRESSIVENESS)[1]
+    assert len(given_up) > 2000
+    _, kept = decimate(rough, faces, 1000)
+    assert 990 <= len(kept) <= 1000
     assert cleaning.mesh_state(kept) == cleaning.MeshState(0, 0, 0)
 
 
