@@ -164,7 +164,7 @@ class Run:
         machine: CPU, cores, versions, device, how many runs went side by side.
         poses: hash of the undistorted photos and poses it started from.
         code: hash of the sources in `stages/neural`.
-        score: distances of the clean mesh, see `stages.meshing.evaluation`; None without a known surface.
+        score: distances of the clean mesh, see `stages.evaluation.known_surface`; None without a known surface.
         psnr: of the training's rays at its end, dB.
         held_out_psnr: of photos left out of the training, dB; None where none were.
         train_wall_s, train_cpu_s: seconds of the training stage.
@@ -270,8 +270,8 @@ def code_hash() -> str:
 # ---------------------------------------------------------------- one run
 def measured_stages(truth: Path) -> list[Stage]:
     """The stages of a run; a mesh that nothing is known of is not made."""
-    from hineus_cli.scoring import has_truth
     from stages.cleanup import CLEANUP
+    from stages.evaluation.known_object import has_truth
     from stages.extract import EXTRACT
     from stages.train import TRAIN
 
@@ -285,7 +285,7 @@ def measure(plan: Plan, data: Path, jobs: int = 1, keep: bool = False) -> Run:
         HineusError: a stage failed, or the mesh cannot be scored.
     """
     from configs.load import load_config
-    from hineus_cli.reconstruct import has_cuda
+    from stages.reconstruct import has_cuda
 
     code = code_hash()
     import stages.neural.trainer  # noqa: F401 - now, so that its seconds are not those of the training
@@ -343,8 +343,8 @@ def score_clean_mesh(
     folder: Path, shared: Path, truth: Path, known_stem: Callable[[str], str] | None = None
 ) -> dict[str, float] | None:
     """Distances of the run's clean mesh to the known surface, None where there is none; see `score_mesh`."""
-    from hineus_cli.scoring import file_stem, has_truth, score_mesh
     from stages import artifacts
+    from stages.evaluation.known_object import file_stem, has_truth, score_mesh
 
     if not has_truth(truth):
         return None
@@ -531,8 +531,8 @@ def write_table() -> None:
 
 # ---------------------------------------------------------------- command
 def main(argv: Sequence[str] | None = None) -> int:
-    from hineus_cli.reconstruct import available_cores, default_preset, has_cuda
-    from hineus_cli.scoring import has_truth
+    from stages.evaluation.known_object import has_truth
+    from stages.reconstruct import available_cores, default_preset, has_cuda
 
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("data", type=Path, nargs="?", help="folder of sets")

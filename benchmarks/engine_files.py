@@ -18,12 +18,12 @@ import numpy as np
 
 from configs.params import ExportParams
 from stages import artifacts
+from stages.drawing.view_scores import draw_view, psnr, silhouette
 from stages.engine.stage import StageContext
 from stages.evaluation.surfaces import Surface, Target
 from stages.export import EXPORT
-from stages.meshing.levels import levels_of_detail
-from stages.meshing.view_scores import draw_view, psnr, silhouette
 from stages.reporting.pictures import read_rgb
+from stages.texture.levels import levels_of_detail
 
 VIEWS = 6  # photos, evenly spread, from where levels are drawn
 

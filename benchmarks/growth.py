@@ -129,8 +129,8 @@ def big_training() -> tuple[float, int]:
     from benchmarks import ball_heap
     from configs.params import TrainParams
     from stages.geometry.cameras import PinholeCameras
-    from stages.neural.photos import Photos
     from stages.neural.trainer import Sightings, Trainer
+    from stages.neural.training_photos import Photos
 
     heap = ball_heap.dome_of_cameras()
     chosen = np.arange(BIG_PHOTOS) % len(heap)

@@ -80,7 +80,7 @@ class Row:
         attempts: what each rung of the ladder did, see `stages.posing.ladder.Step`.
         cpu_s: CPU seconds of the sfm stage, all attempts.
         failure: message and hint of the error that ended the row, or None.
-        score: distances of the clean mesh to the truth, see `stages.meshing.evaluation`; None where it was not made.
+        score: distances of the clean mesh to the truth, see `evaluation.known_surface`; None where it was not made.
         mesh_preset: preset of the training behind that mesh; mesh_settings: what was set over it, SECTION.KEY=VALUE.
     """
 
@@ -266,7 +266,7 @@ def true_centers(folder: Path) -> tuple[list[np.ndarray], float] | None:
 
     The extent of a set in the layout of NeuS is the diameter of its sphere.
     """
-    from hineus_cli.scoring import has_truth, load_known_surface
+    from stages.evaluation.known_object import has_truth, load_known_surface
 
     source = photos_of(folder)
     if source is not None and has_truth(folder):
@@ -309,7 +309,7 @@ def known_stem(source: Path, variant: str) -> Callable[[str], str]:
 
     Frames of a video have their numbers at the end of their names.
     """
-    from hineus_cli.scoring import file_stem
+    from stages.evaluation.known_object import file_stem
 
     if variant != "video":
         return file_stem
@@ -322,7 +322,7 @@ def _stems(source: Path) -> list[str]:
 
 
 def _found_centers(model: Path) -> dict[str, np.ndarray]:
-    from hineus_cli.scoring import load_model_centers
+    from stages.evaluation.known_object import load_model_centers
 
     return load_model_centers(model)
 
@@ -334,8 +334,8 @@ def run_row(row: str, data: Path, mesh: bool, preset: str, settings: Sequence[st
     Raises:
         RuntimeError: `hineus` broke, rather than saying why it cannot.
     """
-    from hineus_cli.scoring import has_truth
     from stages import artifacts
+    from stages.evaluation.known_object import has_truth
 
     photos = make_photos(row, data)
     workspace = FOLDERS / row / "workspace"
@@ -473,7 +473,7 @@ def write_table() -> None:
 
 # ---------------------------------------------------------------- command
 def main(argv: Sequence[str] | None = None) -> int:
-    from hineus_cli.reconstruct import default_preset
+    from stages.reconstruct import default_preset
 
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("data", type=Path, nargs="?", help="folder of sets")

@@ -34,7 +34,7 @@ COLUMNS = (
 
 def measure(workspace: Path) -> dict[str, Any]:
     """One workspace's scores, without what belongs to this machine's folders."""
-    from hineus_cli.evaluating_views import evaluate_views
+    from stages.evaluation.against_photos import evaluate_views
 
     found = evaluate_views(workspace)
     kept = {key: found[key] for key in ("photos", "mean", "done")}

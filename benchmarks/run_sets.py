@@ -26,7 +26,7 @@ from statistics import fmean
 from typing import Any
 
 from benchmarks.synthetic import MADE_WITH
-from hineus_cli.machine import machine
+from stages.evaluation.machine import machine
 from stages.posing import neus
 
 ROOT = Path(__file__).parent.parent
@@ -60,7 +60,7 @@ class Result:
         command: that made it, with DATA for the folder of sets.
         machine: CPU, cores, versions.
         stages: in order.
-        score: distances in percent of the extent, or None without truth; see `stages.meshing.evaluation`.
+        score: distances in percent of the extent, or None without truth; see `stages.evaluation.known_surface`.
         validator: counts of the glTF validator's messages, or None where it is not installed.
         glb_bytes: size of the textured model.
         seed: of the training.
@@ -171,8 +171,8 @@ def run_hineus(arguments: Sequence[str]) -> dict[str, Any]:
 
 
 def _score(workspace: Path, truth: Path | None) -> dict[str, float] | None:
-    from hineus_cli.scoring import has_truth, score_mesh
     from stages import artifacts
+    from stages.evaluation.known_object import has_truth, score_mesh
 
     if truth is None or not has_truth(truth):
         return None
@@ -204,7 +204,7 @@ def contact_sheet(workspace: Path, path: Path) -> None:
     from PIL import Image
 
     from stages import artifacts
-    from stages.meshing.rendering import render_textured, turntable
+    from stages.drawing.rendering import render_textured, turntable
 
     atlas = artifacts.load_atlas(workspace / "atlas")
     scene = artifacts.load_scene(workspace / "undistort")

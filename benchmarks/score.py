@@ -10,8 +10,8 @@ import json
 import sys
 from pathlib import Path
 
-from hineus_cli.scoring import score_mesh
 from stages.errors import HineusError
+from stages.evaluation.known_object import score_mesh
 
 
 def main() -> int:

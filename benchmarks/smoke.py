@@ -125,7 +125,7 @@ def measure(folder: Path) -> dict[str, float]:
     Raises:
         RuntimeError: `hineus` failed.
     """
-    from hineus_cli.demo_scene import PHOTOS, make_demo_photos
+    from stages.scenes.figurine import PHOTOS, make_demo_photos
 
     make_demo_photos(folder, NUM_PHOTOS, SIZE)
     workspace = folder / "workspace"
@@ -142,8 +142,8 @@ def figures(workspace: Path, answer: dict[str, Any], truth: Path) -> dict[str, f
         answer: what `hineus run --json` said.
         truth: folder with the known surface.
     """
-    from hineus_cli.scoring import score_mesh
     from stages import artifacts
+    from stages.evaluation.known_object import score_mesh
 
     numbers = {stage["name"]: stage["numbers"] for stage in answer["stages"]}
     score = score_mesh(artifacts.ply_path(workspace / "export"), artifacts.model_path(workspace / "sfm"), truth)
@@ -187,7 +187,7 @@ def _glb_json(path: Path) -> dict[str, Any]:
 def held_out_drawing(workspace: Path, mesh: AtlasMesh, texture: np.ndarray) -> tuple[float, float]:
     """Mean PSNR in dB and SSIM of the mesh, drawn from where the left-out photos were taken."""
     from stages import artifacts
-    from stages.meshing.view_scores import draw_view, score_views, silhouette
+    from stages.drawing.view_scores import draw_view, score_views, silhouette
 
     cameras = artifacts.load_scene(workspace / "undistort").cameras
     names = artifacts.load_held_out(workspace / "train")

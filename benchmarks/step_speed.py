@@ -37,9 +37,9 @@ from stages.geometry.cameras import PinholeCameras, PosedScene
 from stages.geometry.similarity import Similarity
 from stages.neural import encodings, fields
 from stages.neural.encodings import HashGrid
-from stages.neural.photos import Photos
 from stages.neural.sightings import Sightings
 from stages.neural.trainer import Trainer, field_shape
+from stages.neural.training_photos import Photos
 
 REPETITIONS = 15
 POINTS = {"cpu": 1 << 14, "cuda": 1 << 17}

@@ -37,12 +37,12 @@ from benchmarks.run_sets import GIB, NOT_MEASURED, OUT, PAGE, RESULTS, ROOT, mac
 from stages import artifacts
 from stages.artifacts import AtlasMesh
 from stages.bake import load_photo
+from stages.drawing.rasterizing import NO_FACE, Texels, corner_weights, projected, rasterize, rasterize_atlas
+from stages.drawing.rasterizing import surface_points as _surface_points
+from stages.drawing.rendering import sample_texture
+from stages.drawing.view_scores import SUPERSAMPLE, psnr, ssim
 from stages.geometry.cameras import PinholeCameras
-from stages.meshing.cleaning import face_areas
-from stages.meshing.rasterizing import NO_FACE, Texels, corner_weights, projected, rasterize, rasterize_atlas
-from stages.meshing.rasterizing import surface_points as _surface_points
-from stages.meshing.rendering import sample_texture
-from stages.meshing.view_scores import SUPERSAMPLE, psnr, ssim
+from stages.surface.triangle_mesh import face_areas
 
 FOLDER = RESULTS / "textures"
 SIZES = (2048, 4096, 8192)
@@ -196,15 +196,15 @@ class Look:
 
 # ---------------------------------------------------------------- simpler textures
 def _paint(texels: Texels, colors: np.ndarray) -> np.ndarray:
-    from stages.meshing.padding import pad_charts
+    from stages.texture.padding import pad_charts
 
     return pad_charts(*texels.paint(np.clip(colors + 0.5, 0, 255).astype(np.uint8)))[0]
 
 
 def _observe(capture: Capture, index: int, points: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Weights [P] with which a photo sees points, and their colours [P, 3]."""
-    from stages.meshing.observing import sample_points
-    from stages.meshing.views import prepare_view
+    from stages.texture.observing import sample_points
+    from stages.texture.photo_views import prepare_view
 
     atlas = capture.atlas
     view = prepare_view(
@@ -260,7 +260,7 @@ def held_out_mean(capture: Capture, texels: Texels) -> np.ndarray:
 
     At depth edges no photo is trusted; colours come from a few texels off, as padding's do.
     """
-    from stages.meshing.padding import pad_charts
+    from stages.texture.padding import pad_charts
 
     points, normals = _surface_points(capture.atlas, texels.face_ids, texels.corner)
     total, count = np.zeros((len(texels), 3)), np.zeros((len(texels), 1))
@@ -274,7 +274,7 @@ def held_out_mean(capture: Capture, texels: Texels) -> np.ndarray:
 
 def baked(capture: Capture, texels: Texels, **options: Any) -> np.ndarray:
     """Our texture. Where no photo saw the surface it is grey: no held-out photo is near, either."""
-    from stages.meshing.baking import bake_texture
+    from stages.texture.baking import bake_texture
 
     def load(index: int) -> tuple[np.ndarray, np.ndarray | None]:
         return capture.photos[capture.training[index]], capture.own_masks[capture.training[index]]
@@ -337,8 +337,8 @@ def matched(image: np.ndarray, photo: np.ndarray, counted: np.ndarray) -> np.nda
 
 def measure(workspace: Path, data: Path, before: SetResult | None) -> SetResult:
     """All rows of one set; those of an earlier, interrupted measurement are kept, each is saved when it is done."""
-    from stages.meshing.filling import face_neighbors
-    from stages.meshing.footprint import pixels_per_area, texture_size_for
+    from stages.texture.filling import face_neighbors
+    from stages.texture.footprint import pixels_per_area, texture_size_for
 
     known = {row.name: row for row in before.scores} if before else {}
     costs = before.costs if before else {}

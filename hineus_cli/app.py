@@ -24,7 +24,7 @@ from stages.pipeline import PIPELINE
 
 if TYPE_CHECKING:
     from hineus_cli.console import ProgressDisplay
-    from hineus_cli.reconstruct import Reconstruction, Request
+    from stages.reconstruct import Reconstruction, Request
 
 INTERRUPTED = 130
 
@@ -178,7 +178,7 @@ def run(
     verbose: Verbose = False,
 ) -> None:
     """Photos to a textured asset: run every stage that is not up to date."""
-    from hineus_cli.reconstruct import Request
+    from stages.reconstruct import Request
 
     request = Request(
         photos=photos,
@@ -233,7 +233,7 @@ def stage_command(stage: Stage) -> Callable[..., None]:
         as_json: Json = False,
         verbose: Verbose = False,
     ) -> None:
-        from hineus_cli.reconstruct import Request
+        from stages.reconstruct import Request
 
         request = Request(
             photos=photos,
@@ -262,7 +262,7 @@ def stage_command(stage: Stage) -> Callable[..., None]:
 
 def _run(session: Session, request: Request, as_json: bool, verbose: bool) -> None:
     from hineus_cli.console import ProgressDisplay, set_up_logging, stdout_kept_clean
-    from hineus_cli.reconstruct import choose_folder, reconstruct
+    from stages.reconstruct import choose_folder, reconstruct
 
     session.json = as_json
     session.log_path = choose_folder(request).absolute() / "hineus.log"
@@ -359,8 +359,8 @@ def check(
     from rich.text import Text
 
     from hineus_cli.console import product
-    from hineus_cli.preflight import facts
-    from hineus_cli.reconstruct import Request, check_photos
+    from stages.preflight import facts
+    from stages.reconstruct import Request, check_photos
 
     session: Session = context.obj
     session.json = as_json
@@ -499,8 +499,8 @@ def compare(
     """How far two meshes, or two workspaces' results, are from each other, both ways."""
     from rich.table import Table
 
-    from hineus_cli.comparison import compare as compare_meshes
     from hineus_cli.console import product
+    from stages.evaluation.comparison import compare as compare_meshes
 
     session: Session = context.obj
     session.json = as_json
@@ -569,7 +569,7 @@ def export_transforms(context: typer.Context, workspace: OfWorkspace, out: OutFo
 
 def _export_poses(session: Session, workspace: Path, out: Path, write: Any, as_json: bool) -> None:
     from hineus_cli.console import people
-    from hineus_cli.pose_export import export_poses
+    from stages.evaluation.pose_export import export_poses
 
     session.json = as_json
     numbers = export_poses(workspace, out, write)

@@ -59,13 +59,13 @@ def bench(
     """Run a benchmark's scenes, score them by its protocol, and print them beside the paper's figures."""
     from dataclasses import asdict
 
-    from hineus_cli.bench import BenchRequest, run_bench
     from hineus_cli.bench_tables import tables_of
     from hineus_cli.console import ProgressDisplay, product, set_up_logging, stdout_kept_clean
-    from hineus_cli.peers import parse_peer
-    from hineus_cli.suites.paper import paper_tables
-    from hineus_cli.suites.registry import find_suite
-    from hineus_cli.suites.scene import Wanted
+    from stages.evaluation.peers import parse_peer
+    from stages.evaluation.suite_runs import BenchRequest, run_bench
+    from stages.evaluation.suites.paper import paper_tables
+    from stages.evaluation.suites.registry import find_suite
+    from stages.evaluation.suites.scene import Wanted
 
     session = context.obj
     session.json = as_json

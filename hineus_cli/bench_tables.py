@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from hineus_cli.bench import OURS
-from hineus_cli.suites.paper import PaperTable, paper_tables
-from hineus_cli.suites.registry import Suite
+from stages.evaluation.suite_runs import OURS
+from stages.evaluation.suites.paper import PaperTable, paper_tables
+from stages.evaluation.suites.registry import Suite
 
 GIB = 1 << 30
 NONE = "-"

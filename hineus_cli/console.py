@@ -11,7 +11,6 @@ import os
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
@@ -26,7 +25,6 @@ if TYPE_CHECKING:
 
 OURS = ("hineus_cli", "stages", "configs")
 CONSOLE_HANDLER = "hineus-console"
-TRACEBACKS = "hineus_cli.tracebacks"  # the logger whose records go to the log file only
 
 PLAIN_WIDTH = 160  # columns where the output is a pipe or a file
 PLAIN_EVERY_S = 30.0  # seconds between progress lines there
@@ -61,6 +59,8 @@ def set_up_logging(verbose: bool = False) -> None:
     """Warnings of everybody and what our stages say go to stderr; `verbose` adds our debug lines."""
     from rich.logging import RichHandler
 
+    from stages.engine.run_log import TRACEBACKS
+
     console = people()
     handler: logging.Handler
     if console.is_terminal:
@@ -78,31 +78,6 @@ def set_up_logging(verbose: bool = False) -> None:
     root.setLevel(logging.WARNING)
     for name in OURS:
         logging.getLogger(name).setLevel(logging.DEBUG)
-
-
-class _LogFile(logging.FileHandler):
-    """A log that cannot be written (the disk is full) is no reason to hide the error that says so."""
-
-    def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802 - the name is logging's
-        """Go on without this record."""
-
-
-@contextlib.contextmanager
-def log_to_file(path: Path) -> Iterator[None]:
-    """Everything that is logged inside goes to `path`, too, and the traceback of what is raised."""
-    handler = _LogFile(path, encoding="utf-8")
-    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
-    root = logging.getLogger()
-    root.addHandler(handler)
-    try:
-        yield
-    except Exception:
-        logging.getLogger(TRACEBACKS).error("the run failed", exc_info=True)
-        raise
-    finally:
-        root.removeHandler(handler)
-        with contextlib.suppress(OSError):
-            handler.close()
 
 
 @contextlib.contextmanager

@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from hineus_cli.console import ProgressDisplay, outcome_table, people, progress_of
-from hineus_cli.demo_scene import PHOTOS, make_demo_photos, photos_are_complete
-from hineus_cli.reconstruct import Reconstruction, Request, reconstruct
-from hineus_cli.scoring import score_mesh
 from stages import artifacts
 from stages.errors import InputError
+from stages.evaluation.known_object import score_mesh
+from stages.reconstruct import Reconstruction, Request, reconstruct
+from stages.scenes.figurine import PHOTOS, make_demo_photos, photos_are_complete
 
 log = logging.getLogger(__name__)
 

@@ -13,8 +13,8 @@ from importlib import metadata
 from pathlib import Path
 from typing import Literal
 
-from hineus_cli.reconstruct import available_cores
 from stages.engine.system import SYSTEM_LIBRARIES, apt_line, missing_libraries
+from stages.reconstruct import available_cores
 
 State = Literal["ok", "note", "missing"]
 

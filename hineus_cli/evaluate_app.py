@@ -78,14 +78,14 @@ def evaluate_mesh(
     as_json: Json = False,
 ) -> None:
     """A surface against a true one: accuracy, completeness, Chamfer, F-scores and normals, both ways."""
-    from hineus_cli import evaluating
+    from stages.evaluation import against_truth
 
     def evaluate() -> dict[str, Any]:
-        if icp is not None and icp not in evaluating.MOTIONS:
-            raise ConfigError(f"There is no ICP '{icp}'.", f"Choose {' or '.join(evaluating.MOTIONS)}.")
+        if icp is not None and icp not in against_truth.MOTIONS:
+            raise ConfigError(f"There is no ICP '{icp}'.", f"Choose {' or '.join(against_truth.MOTIONS)}.")
         numbers, parts = _lengths(thresholds, "--thresholds")
         corners, margin = _box(box)
-        options = evaluating.MeshOptions(
+        options = against_truth.MeshOptions(
             thresholds=numbers,
             threshold_parts=parts,
             samples=samples,
@@ -101,7 +101,7 @@ def evaluate_mesh(
             box=corners,
             box_margin=margin,
         )
-        return evaluating.evaluate_mesh(predicted, truth, options)
+        return against_truth.evaluate_mesh(predicted, truth, options)
 
     _run(context, as_json, evaluate, _show_surfaces)
 
@@ -116,9 +116,9 @@ def evaluate_dtu(
     as_json: Json = False,
 ) -> None:
     """DTU's protocol: observed cells, plane cut, distances below 20 mm. DATA has ObsMask/ and Points/stl/."""
-    from hineus_cli import evaluating
+    from stages.evaluation import against_truth
 
-    _run(context, as_json, lambda: evaluating.evaluate_dtu(predicted, data, scan, seed), _show_numbers)
+    _run(context, as_json, lambda: against_truth.evaluate_dtu(predicted, data, scan, seed), _show_numbers)
 
 
 @evaluate_app.command("glossy")
@@ -134,9 +134,9 @@ def evaluate_glossy(
     as_json: Json = False,
 ) -> None:  # fmt: skip
     """GlossySynthetic's protocol: points of what the test views see. DATA is an object's folder, e.g. bell."""
-    from hineus_cli import evaluating
+    from stages.evaluation import against_truth
 
-    _run(context, as_json, lambda: evaluating.evaluate_glossy(predicted, data, split), _show_numbers)
+    _run(context, as_json, lambda: against_truth.evaluate_glossy(predicted, data, split), _show_numbers)
 
 
 @evaluate_app.command("tanks")
@@ -154,12 +154,12 @@ def evaluate_tanks(
     as_json: Json = False,
 ) -> None:
     """Tanks and Temples' protocol: F-score at tau in the crop volume. DATA is a scene's folder, e.g. Ignatius."""
-    from hineus_cli import evaluating
+    from stages.evaluation import against_truth
 
     _run(
         context,
         as_json,
-        lambda: evaluating.evaluate_tanks(predicted, data, cameras, tau, refine, matrix, seed),
+        lambda: against_truth.evaluate_tanks(predicted, data, cameras, tau, refine, matrix, seed),
         _show_numbers,
     )
 
@@ -175,9 +175,9 @@ def evaluate_views(
     as_json: Json = False,
 ) -> None:
     """Photos held back from training, against drawings of the field and of the textured mesh."""
-    from hineus_cli import evaluating_views
+    from stages.evaluation import against_photos
 
-    _run(context, as_json, lambda: evaluating_views.evaluate_views(workspace, renders, device), _show_views)
+    _run(context, as_json, lambda: against_photos.evaluate_views(workspace, renders, device), _show_views)
 
 
 # ---------------------------------------------------------------- running, showing

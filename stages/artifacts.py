@@ -276,7 +276,7 @@ CHECKPOINT = "checkpoint.pt"  # in the stage's scratch folder
 
 
 def field_path(folder: Path) -> Path:
-    """The trained field, see `stages.neural.field.TrainedField`."""
+    """The trained field, see `stages.neural.trained_field.TrainedField`."""
     return folder / FIELD
 
 
@@ -373,7 +373,7 @@ QUALITY = "vertex_quality.npz"
 
 @dataclass(frozen=True)
 class VertexQuality:
-    """How well each vertex of the atlas is known, see `stages.meshing.quality`.
+    """How well each vertex of the atlas is known, see `stages.texture.vertex_quality`.
 
     Attributes:
         seen_by: [V] uint16 photos that see it.
@@ -408,17 +408,17 @@ def base_color_path(folder: Path) -> Path:
 
 
 def provenance_path(folder: Path) -> Path:
-    """8-bit grey, one value a texel, see `stages.meshing.baking.Provenance`."""
+    """8-bit grey, one value a texel, see `stages.texture.baking.Provenance`."""
     return folder / PROVENANCE
 
 
 def normal_map_path(folder: Path) -> Path:
-    """8-bit tangent-space normals, +Y up, see `stages.meshing.relief.bake_normals`. May not exist."""
+    """8-bit tangent-space normals, +Y up, see `stages.texture.relief.bake_normals`. May not exist."""
     return folder / NORMAL_MAP
 
 
 def occlusion_path(folder: Path) -> Path:
-    """8-bit grey, 255 where all is open, see `stages.meshing.relief.bake_occlusion`. May not exist."""
+    """8-bit grey, 255 where all is open, see `stages.texture.relief.bake_occlusion`. May not exist."""
     return folder / OCCLUSION
 
 

@@ -15,7 +15,7 @@ logger = logging.getLogger(__name__)
 
 
 def run(context: StageContext) -> dict[str, Any]:
-    from stages.meshing import atlas
+    from stages.texture import charts
 
     params = context.params
     vertices, faces = artifacts.load_mesh(context.inputs["cleanup"])
@@ -23,12 +23,12 @@ def run(context: StageContext) -> dict[str, Any]:
     context.progress(0, 1, f"charts for {len(faces)} faces")
     method, why = "xatlas", ""
     try:
-        layout = atlas.unwrap_xatlas(vertices, faces, size, params.padding, params.time_limit)
-    except (atlas.AtlasTimeoutError, atlas.AtlasProcessError) as error:
+        layout = charts.unwrap_xatlas(vertices, faces, size, params.padding, params.time_limit)
+    except (charts.AtlasTimeoutError, charts.AtlasProcessError) as error:
         method, why = "projected", str(error)
         logger.warning("%s; projecting along the axes instead", error)
         try:
-            layout = atlas.unwrap_projected(vertices, faces, size, params.padding)
+            layout = charts.unwrap_projected(vertices, faces, size, params.padding)
         except ValueError as misfit:
             raise ReconstructionError(
                 f"The charts do not fit the texture: {misfit}.",
@@ -39,7 +39,7 @@ def run(context: StageContext) -> dict[str, Any]:
         context.out,
         artifacts.AtlasMesh(
             vertices=vertices[layout.source].astype(np.float32),
-            normals=atlas.smooth_normals(vertices, faces, layout.source),
+            normals=charts.smooth_normals(vertices, faces, layout.source),
             uvs=np.clip(uvs, 0, 1).astype(np.float32),
             faces=layout.faces,
             texture_size=size,
@@ -61,7 +61,7 @@ def run(context: StageContext) -> dict[str, Any]:
 
 def _fitting_size(context: StageContext, vertices: np.ndarray, faces: np.ndarray) -> int:
     """The size of texture that the photos can fill."""
-    from stages.meshing.footprint import pixels_per_area, texture_size_for
+    from stages.texture.footprint import pixels_per_area, texture_size_for
 
     cameras = artifacts.load_scene(context.inputs["undistort"]).cameras
     return texture_size_for(*pixels_per_area(vertices, faces, cameras))

@@ -14,12 +14,12 @@ from stages.geometry.cameras import PinholeCameras
 
 
 def run(context: StageContext) -> dict[str, Any]:
-    """Bake the textures. Returns `stages.meshing.baking.Baked.numbers`, and how much of the normal map is known."""
-    from stages.meshing.baking import bake_texture
-    from stages.meshing.quality import measure_quality
-    from stages.meshing.rasterizing import rasterize_atlas
-    from stages.meshing.relief import bake_normals, bake_occlusion
-    from stages.neural.field import load_field
+    """Bake the textures. Returns `stages.texture.baking.Baked.numbers`, and how much of the normal map is known."""
+    from stages.drawing.rasterizing import rasterize_atlas
+    from stages.neural.trained_field import load_field
+    from stages.texture.baking import bake_texture
+    from stages.texture.relief import bake_normals, bake_occlusion
+    from stages.texture.vertex_quality import measure_quality
 
     undistorted = context.inputs["undistort"]
     cameras = artifacts.load_scene(undistorted).cameras

@@ -46,8 +46,8 @@ def _masks(folder: Path, cameras: PinholeCameras, margin: int) -> Iterator[tuple
 
 
 def run(context: StageContext) -> dict[str, Any]:
-    from stages.meshing import cleaning
-    from stages.meshing.simplify import decimate
+    from stages.surface import triangle_mesh
+    from stages.surface.simplify import decimate
 
     params = context.params
     scene = artifacts.load_scene(context.inputs["undistort"])
@@ -62,12 +62,12 @@ def run(context: StageContext) -> dict[str, Any]:
             raise ReconstructionError(
                 f"Nothing of the mesh is left: its last {len(faces)} faces fell under '{what}'.", hint
             )
-        vertices, faces = cleaning.compact(vertices, faces[selection])
+        vertices, faces = triangle_mesh.compact(vertices, faces[selection])
 
     context.progress(0, 5, "region of interest and masks")
-    inside = cleaning.inside_ball(vertices, faces, params.roi_radius)
+    inside = triangle_mesh.inside_ball(vertices, faces, params.roi_radius)
     if params.keep_closed:
-        inside = cleaning.whole_pieces(faces, inside)
+        inside = triangle_mesh.whole_pieces(faces, inside)
     keep(
         inside, "outside_region", "Try `--set undistort.roi_scale=1.5`, or train for longer: `--set train.steps=6000`."
     )
@@ -76,14 +76,14 @@ def run(context: StageContext) -> dict[str, Any]:
     if scene.ground is not None and not params.keep_closed:
         under = _under_the_border(vertices, scene, UNDER_TOLERANCES * params.ground_tolerance)
         keep(~under[faces].all(1), "under_ground", "Try `--set undistort.roi_scale=1.5`.")
-    selection, numbers["specks_dropped"] = cleaning.large_pieces(faces, SPECK * params.min_component)
+    selection, numbers["specks_dropped"] = triangle_mesh.large_pieces(faces, SPECK * params.min_component)
     keep(selection, "speck_faces", "Try `--set cleanup.min_component=0`.")
     if params.mask_hull:
         masks = _masks(context.inputs["undistort"], cameras, params.mask_margin)
-        outside = cleaning.outside_hull(vertices, cameras, masks, params.mask_outside)
+        outside = triangle_mesh.outside_hull(vertices, cameras, masks, params.mask_outside)
         within = np.count_nonzero(outside[faces], axis=1) < 2
         keep(
-            cleaning.whole_pieces(faces, within) if params.keep_closed else within,
+            triangle_mesh.whole_pieces(faces, within) if params.keep_closed else within,
             "outside_masks",
             "Look at the masks (white is the object), or try `--set cleanup.mask_hull=false`.",
         )
@@ -95,7 +95,7 @@ def run(context: StageContext) -> dict[str, Any]:
 
     context.progress(2, 5, "what the cameras see")
     if params.min_views > 0:
-        views = cleaning.count_views(
+        views = triangle_mesh.count_views(
             vertices,
             faces,
             cameras,
@@ -106,12 +106,12 @@ def run(context: StageContext) -> dict[str, Any]:
         keep(_seen_faces(vertices, faces, views >= params.min_views, params), "unseen_faces", hint)
 
     context.progress(3, 5, "pieces")
-    selection, numbers["pieces_dropped"] = cleaning.large_pieces(faces, params.min_component)
+    selection, numbers["pieces_dropped"] = triangle_mesh.large_pieces(faces, params.min_component)
     keep(selection, "piece_faces", "Try `--set cleanup.min_component=0`.")
 
     context.progress(4, 5, "decimating")
-    vertices, faces = decimate(*cleaning.repair_manifold(vertices, faces), params.target_faces)
-    state = cleaning.mesh_state(faces)
+    vertices, faces = decimate(*triangle_mesh.repair_manifold(vertices, faces), params.target_faces)
+    state = triangle_mesh.mesh_state(faces)
     if not state.manifold:
         logger.warning("mesh is not manifold: %d edges, %d vertices", state.bad_edges, state.bad_vertices)
     if params.keep_closed and not state.watertight:
@@ -132,7 +132,7 @@ def _crop(vertices: np.ndarray, faces: np.ndarray, scene: PosedScene, params: An
 
     A mesh that is to be closed ends in lids there, and at the border of the region of interest.
     """
-    from stages.meshing import cleaning, solids
+    from stages.surface import solids, triangle_mesh
 
     if params.keep_closed:
         vertices, faces = solids.cut_to_ball(vertices, faces, params.roi_radius)
@@ -143,7 +143,7 @@ def _crop(vertices: np.ndarray, faces: np.ndarray, scene: PosedScene, params: An
         else:
             sides.append(_cut_above_ground(vertices, faces, scene.ground, params.ground_tolerance))
     for normal, offset in sides:
-        cut = solids.cut_at_plane if params.keep_closed else cleaning.clip
+        cut = solids.cut_at_plane if params.keep_closed else triangle_mesh.clip
         vertices, faces = cut(vertices, faces, normal, offset)
         if not len(faces):
             raise ReconstructionError(
@@ -171,14 +171,14 @@ def _without_bumps(
     vertices: np.ndarray, faces: np.ndarray, normal: np.ndarray, offset: float, height: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """The mesh without what a bumpy ground leaves above its cut: small pieces that rise by less than `height`."""
-    from stages.meshing import cleaning
+    from stages.surface import triangle_mesh
 
-    labels = cleaning.label_pieces(len(faces), cleaning.face_adjacency(faces))
-    areas = np.bincount(labels, np.linalg.norm(cleaning.face_normals(vertices, faces), axis=1))
+    labels = triangle_mesh.label_pieces(len(faces), triangle_mesh.face_adjacency(faces))
+    areas = np.bincount(labels, np.linalg.norm(triangle_mesh.face_normals(vertices, faces), axis=1))
     tops = np.full(len(areas), -np.inf)
     np.maximum.at(tops, labels, (vertices @ normal - offset)[faces].max(1))
     bumps = (tops < height) & (areas < BUMP_AREA * areas.max())
-    return cleaning.compact(vertices, faces[~bumps[labels]])
+    return triangle_mesh.compact(vertices, faces[~bumps[labels]])
 
 
 def box_sides(box: np.ndarray, world_from_scene: Similarity) -> list[tuple[np.ndarray, float]]:
@@ -195,7 +195,7 @@ def _cut_above_ground(
     vertices: np.ndarray, faces: np.ndarray, ground: Plane, tolerance: float
 ) -> tuple[np.ndarray, float]:
     """Plane (normal [3], offset) a tolerance above the ground, which is fitted anew to the mesh where it shows it."""
-    from stages.meshing.cleaning import face_normals
+    from stages.surface.triangle_mesh import face_normals
 
     centers = vertices[faces].mean(1).astype(np.float64)
     normals = face_normals(vertices, faces)
@@ -212,17 +212,17 @@ def _cut_above_ground(
 
 def _seen_faces(vertices: np.ndarray, faces: np.ndarray, seen: np.ndarray, params: Any) -> np.ndarray:
     """Faces [F] bool to keep, given which vertices [V] bool are seen: seen ones, their surroundings, small gaps."""
-    from stages.meshing import cleaning
+    from stages.surface import triangle_mesh
 
     chosen = seen[faces].any(1)
     if params.keep_closed:
-        return cleaning.whole_pieces(faces, chosen)
+        return triangle_mesh.whole_pieces(faces, chosen)
     if not chosen.any():
         return chosen
-    chosen = cleaning.spread(faces, len(vertices), chosen, params.rings)
-    chosen = cleaning.smooth_selection(faces, len(vertices), chosen, params.rings)
-    area = np.linalg.norm(cleaning.face_normals(vertices, faces), axis=1) / 2
-    return cleaning.fill_small_gaps(vertices, faces, chosen, params.max_hidden_area * float(area[chosen].sum()))
+    chosen = triangle_mesh.spread(faces, len(vertices), chosen, params.rings)
+    chosen = triangle_mesh.smooth_selection(faces, len(vertices), chosen, params.rings)
+    area = np.linalg.norm(triangle_mesh.face_normals(vertices, faces), axis=1) / 2
+    return triangle_mesh.fill_small_gaps(vertices, faces, chosen, params.max_hidden_area * float(area[chosen].sum()))
 
 
 CLEANUP = Stage(

@@ -19,7 +19,7 @@ from stages.geometry.orientation import y_up_rotation
 from stages.geometry.similarity import Similarity
 
 if TYPE_CHECKING:
-    from stages.meshing.writing import Textures
+    from stages.files.writing import Textures
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ def _write_glb(asset: Asset) -> int:
 
 
 def _textured_glb(asset: Asset, mesh: artifacts.AtlasMesh, extras: dict[str, Any]) -> bytes:
-    from stages.meshing.writing import glb_bytes
+    from stages.files.writing import glb_bytes
 
     vertices, normals = asset.in_gltf(mesh)
     return glb_bytes(vertices, normals, mesh.uvs, mesh.faces, asset.textures, generator=generator(), extras=extras)
@@ -104,7 +104,7 @@ def _textured_glb(asset: Asset, mesh: artifacts.AtlasMesh, extras: dict[str, Any
 
 def _write_levels(asset: Asset, count: int) -> Iterator[tuple[int, int]]:
     """Faces and bytes of each level of detail."""
-    from stages.meshing.levels import levels_of_detail
+    from stages.texture.levels import levels_of_detail
 
     for level, light in enumerate(levels_of_detail(asset.mesh, count) if count else (), 1):
         data = _textured_glb(asset, light, {**asset.extras, "level_of_detail": level})
@@ -113,8 +113,8 @@ def _write_levels(asset: Asset, count: int) -> Iterator[tuple[int, int]]:
 
 def _write_collision(asset: Asset, count: int) -> tuple[int, int]:
     """Pieces and bytes of the collision shapes."""
-    from stages.meshing.collision import convex_pieces
-    from stages.meshing.writing import shapes_glb_bytes
+    from stages.files.writing import shapes_glb_bytes
+    from stages.surface.collision import convex_pieces
 
     try:
         pieces = convex_pieces(asset.mesh.vertices, asset.mesh.faces, count)
@@ -134,7 +134,7 @@ def _write_collision(asset: Asset, count: int) -> tuple[int, int]:
 
 def _write_usdz(asset: Asset) -> int:
     """Lengths without a known unit are taken for metres, as glTF does with all."""
-    from stages.meshing.usd import usdz_bytes
+    from stages.files.usd import usdz_bytes
 
     vertices, normals = asset.in_gltf(asset.mesh)
     uvs, faces = asset.mesh.uvs, asset.mesh.faces
@@ -150,7 +150,7 @@ def _write_usdz(asset: Asset) -> int:
 
 def _write_obj(asset: Asset) -> int:
     """The OBJ, its material and its images. Returns the bytes of the OBJ."""
-    from stages.meshing.writing import mtl_text, obj_text
+    from stages.files.writing import mtl_text, obj_text
 
     texture_path, mtl = artifacts.obj_texture_path(asset.out), artifacts.mtl_path(asset.out)
     texture_path.write_bytes(asset.textures.base_color)
@@ -165,7 +165,7 @@ def _write_obj(asset: Asset) -> int:
 
 
 def _write_ply(asset: Asset) -> int:
-    from stages.meshing.writing import ply_bytes
+    from stages.files.writing import ply_bytes
 
     colors = vertex_colors(asset.textures.base_color, asset.mesh.uvs)
     data = ply_bytes(*asset.in_world(asset.mesh), colors, asset.mesh.faces, asset.note)
@@ -173,7 +173,7 @@ def _write_ply(asset: Asset) -> int:
 
 
 def _write_stl(asset: Asset) -> int:
-    from stages.meshing.writing import stl_bytes
+    from stages.files.writing import stl_bytes
 
     vertices, _ = asset.in_world(asset.mesh)
     return artifacts.stl_path(asset.out).write_bytes(stl_bytes(vertices, asset.mesh.faces, asset.note))
@@ -181,7 +181,7 @@ def _write_stl(asset: Asset) -> int:
 
 def load_textures(baked: Path) -> Textures:
     """The images that the bake stage left."""
-    from stages.meshing.writing import Textures
+    from stages.files.writing import Textures
 
     optional = (artifacts.normal_map_path(baked), artifacts.occlusion_path(baked))
     normal, occlusion = (path.read_bytes() if path.exists() else None for path in optional)
@@ -190,7 +190,7 @@ def load_textures(baked: Path) -> Textures:
 
 def unit_normals(vertices: np.ndarray, normals: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Vertex normals [V, 3] float64 of length 1: those without a length take an adjoining face's, else +Z."""
-    from stages.meshing.cleaning import face_normals
+    from stages.surface.triangle_mesh import face_normals
 
     unit = normals.astype(np.float64)
     lengths = np.linalg.norm(unit, axis=1)
@@ -210,7 +210,7 @@ def vertex_colors(texture_png: bytes, uvs: np.ndarray) -> np.ndarray:
     """The texture's colours [V, 3] (0..255) at UVs [V, 2]."""
     import cv2
 
-    from stages.meshing.rendering import sample_texture
+    from stages.drawing.rendering import sample_texture
 
     texture = cv2.imdecode(np.frombuffer(texture_png, np.uint8), cv2.IMREAD_COLOR)
     if texture is None:

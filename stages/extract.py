@@ -23,8 +23,8 @@ def supported_resolution(cameras: PinholeCameras) -> int:
 
 
 def run(context: StageContext) -> dict[str, Any]:
-    from stages.meshing.solids import extract_solid
-    from stages.neural.field import load_field
+    from stages.neural.trained_field import load_field
+    from stages.surface.solids import extract_solid
 
     scene = artifacts.load_scene(context.inputs["undistort"])
     field = load_field(artifacts.field_path(context.inputs["train"]), context.device)

@@ -26,7 +26,7 @@ from stages.capture.background import find_background, object_mask
 from stages.capture.exif import ORIENTATION, camera_key, focal_px, gps_position
 from stages.capture.listing import list_captures
 from stages.capture.masks import check_size, match_masks, read_mask, write_mask
-from stages.capture.photos import UnusableError, read_photo, register_formats
+from stages.capture.photo_reading import UnusableError, read_photo, register_formats
 from stages.capture.quality import sharpness
 from stages.capture.video import extract_frames
 from stages.engine.fingerprint import file_sha256

@@ -28,8 +28,8 @@ def run(context: StageContext) -> dict[str, Any]:
     """Write report.html. Returns its size in bytes, and how the final mesh meets photos that were kept back."""
     import jinja2
 
-    from stages.reporting import curves, numbers, photos, pictures
-    from stages.reporting.held_out import compare_held_out
+    from stages.reporting import curves, numbers, photo_table, pictures
+    from stages.reporting.kept_back import compare_held_out
 
     inputs = context.inputs
     scene = artifacts.load_scene(inputs["undistort"])
@@ -50,10 +50,12 @@ def run(context: StageContext) -> dict[str, Any]:
         atlas, texture, scene.cameras, lambda index: load_photo(undistorted, scene.cameras.names[index]), held_out
     )
     context.progress(2, steps, "collecting the photos")
-    results = photos.photo_results(inputs["ingest"], inputs["sfm"], scene.cameras.names, held_out)
-    page |= photos.describe_photos(results, inputs["ingest"], inputs["sfm"], context.params.thumbnails)
+    results = photo_table.photo_results(inputs["ingest"], inputs["sfm"], scene.cameras.names, held_out)
+    page |= photo_table.describe_photos(results, inputs["ingest"], inputs["sfm"], context.params.thumbnails)
     context.progress(3, steps, "packing the 3D view")
-    page |= describe_view(scene, atlas, texture, inputs["bake"], photos.camera_captions(results, scene.cameras.names))
+    page |= describe_view(
+        scene, atlas, texture, inputs["bake"], photo_table.camera_captions(results, scene.cameras.names)
+    )
     context.progress(4, steps, "writing the page")
     page |= {
         "numbers": numbers.headline(scene, atlas, manifests, page["held_out"]),
@@ -89,8 +91,8 @@ def describe_view(
     scene: PosedScene, atlas: AtlasMesh, texture: np.ndarray, bake: Path, captions: list[dict[str, Any]]
 ) -> dict[str, Any]:
     """The 3D view and, where the bake stage left its measures, their colours and the next photos to take."""
-    from stages.meshing.next_views import suggest_views, vertex_needs
     from stages.reporting import view3d
+    from stages.texture.next_views import suggest_views, vertex_needs
 
     try:
         quality = artifacts.load_quality(bake)

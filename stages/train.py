@@ -31,11 +31,11 @@ def run(context: StageContext) -> dict[str, Any]:
     """Train until the budget of steps or minutes is spent; write field.pt, metrics.jsonl and previews."""
     import torch
 
-    from stages.neural.field import field_state
-    from stages.neural.held_out import held_out_psnr, left_out
-    from stages.neural.photos import Photos
+    from stages.neural.held_out_psnr import held_out_psnr, left_out
     from stages.neural.sightings import Sightings
+    from stages.neural.trained_field import field_state
     from stages.neural.trainer import Trainer
+    from stages.neural.training_photos import Photos
 
     _use_threads(context)
     folder, params = context.inputs["undistort"], context.params

@@ -12,9 +12,9 @@ from stages import artifacts
 from stages.atlas import ATLAS
 from stages.engine.stage import StageContext
 from stages.errors import ReconstructionError
-from stages.meshing import atlas
-from stages.meshing.isosurface import extract_isosurface
-from stages.meshing.simplify import decimate
+from stages.surface.isosurface import extract_isosurface
+from stages.surface.simplify import decimate
+from stages.texture import charts
 
 TEXTURE, PADDING = 512, 4
 
@@ -80,8 +80,8 @@ def areas(layout):
 @pytest.fixture(scope="module", params=["xatlas", "projected"])
 def layout(request, mesh):
     if request.param == "xatlas":
-        return atlas.unwrap_xatlas(*mesh, TEXTURE, PADDING, time_limit=120)
-    return atlas.unwrap_projected(*mesh, TEXTURE, PADDING)
+        return charts.unwrap_xatlas(*mesh, TEXTURE, PADDING, time_limit=120)
+    return charts.unwrap_projected(*mesh, TEXTURE, PADDING)
 
 
 def test_every_face_is_there_once_and_in_place(layout, mesh):
@@ -123,25 +123,25 @@ def test_detail_is_spread_evenly(layout, mesh):
 
 
 def test_projected_charts_are_not_mirrored(mesh):
-    assert areas(atlas.unwrap_projected(*mesh, TEXTURE, PADDING)).min() > 0
+    assert areas(charts.unwrap_projected(*mesh, TEXTURE, PADDING)).min() > 0
 
 
 def test_winding_ramp_is_cut_where_it_overlaps_itself():
     vertices, faces = winding_ramp()
-    layout = atlas.unwrap_projected(vertices, faces, TEXTURE, PADDING)
+    layout = charts.unwrap_projected(vertices, faces, TEXTURE, PADDING)
     assert claims(layout, TEXTURE)[0].max() == 1
     assert 3 <= layout.charts.max() + 1 <= 8
 
 
 def test_overlaps_are_found_and_touching_is_none():
     square = np.array([[[0, 0], [1, 0], [1, 1]], [[0, 0], [1, 1], [0, 1]]], dtype=float)
-    assert len(atlas.overlapping_pairs(square)) == 0
+    assert len(charts.overlapping_pairs(square)) == 0
     fold = np.array([[0, 0], [1, 0], [0.5, 0.9]], dtype=float)
-    assert atlas.overlapping_pairs(np.concatenate([square, fold[None]])).tolist() == [[0, 2], [1, 2]]
+    assert charts.overlapping_pairs(np.concatenate([square, fold[None]])).tolist() == [[0, 2], [1, 2]]
     inside = 0.01 * fold + [0.7, 0.2]
-    assert atlas.overlapping_pairs(np.concatenate([square, inside[None]])).tolist() == [[0, 2]]
+    assert charts.overlapping_pairs(np.concatenate([square, inside[None]])).tolist() == [[0, 2]]
     groups = np.array([0, 0, 1])
-    assert len(atlas.overlapping_pairs(np.concatenate([square, fold[None]]), groups)) == 0
+    assert len(charts.overlapping_pairs(np.concatenate([square, fold[None]]), groups)) == 0
 
 
 def test_overlaps_agree_with_a_search_of_all_pairs():
@@ -157,7 +157,7 @@ def test_overlaps_agree_with_a_search_of_all_pairs():
     grid = np.stack(np.meshgrid(np.linspace(-0.5, 1.5, 400), np.linspace(-0.5, 1.5, 400)), axis=2).reshape(-1, 2)
     cover = np.array([contains(t, grid) for t in triangles])
     shared = cover.astype(np.int64) @ cover.T.astype(np.int64)
-    found = {tuple(pair) for pair in atlas.overlapping_pairs(triangles).tolist()}
+    found = {tuple(pair) for pair in charts.overlapping_pairs(triangles).tolist()}
     certain = {(i, j) for i in range(60) for j in range(i + 1, 60) if shared[i, j] > 0}
     assert certain <= found
     # Overlaps too thin for the samples: there are some, but a search that answers "always" would not pass.
@@ -167,18 +167,18 @@ def test_overlaps_agree_with_a_search_of_all_pairs():
 def test_folded_faces_are_moved_to_free_texels():
     square = np.array([[10, 10], [60, 10], [60, 60], [10, 60], [30, 20], [40, 20], [35, 30]], dtype=float)
     faces = np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6]], dtype=np.int32)
-    layout = atlas.UvLayout(np.arange(7), faces, square, np.array([0, 0, 1]))
-    moved = atlas._move_overlaps(layout, atlas.overlapping_pairs(square[faces]), 128, PADDING)
+    layout = charts.UvLayout(np.arange(7), faces, square, np.array([0, 0, 1]))
+    moved = charts._move_overlaps(layout, charts.overlapping_pairs(square[faces]), 128, PADDING)
     count, _ = claims(moved, 128)
     assert count.max() == 1
     np.testing.assert_array_equal(moved.source[moved.faces], faces)
     np.testing.assert_allclose(np.abs(areas(moved)), np.abs(areas(layout)))
-    with pytest.raises(atlas.AtlasProcessError, match="no room"):
-        atlas._move_overlaps(layout, atlas.overlapping_pairs(square[faces]), 62, PADDING)
+    with pytest.raises(charts.AtlasProcessError, match="no room"):
+        charts._move_overlaps(layout, charts.overlapping_pairs(square[faces]), 62, PADDING)
 
 
 def test_normals_do_not_show_the_seams(layout, mesh):
-    normals = atlas.smooth_normals(*mesh, layout.source)
+    normals = charts.smooth_normals(*mesh, layout.source)
     np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-5)
     order = np.argsort(layout.source, kind="stable")
     same = layout.source[order][1:] == layout.source[order][:-1]
@@ -186,22 +186,22 @@ def test_normals_do_not_show_the_seams(layout, mesh):
 
 
 def test_time_limit_stops_xatlas(mesh):
-    with pytest.raises(atlas.AtlasTimeoutError, match=r"more than 0\.01 s"):
-        atlas.unwrap_xatlas(*mesh, TEXTURE, PADDING, time_limit=0.01)
+    with pytest.raises(charts.AtlasTimeoutError, match=r"more than 0\.01 s"):
+        charts.unwrap_xatlas(*mesh, TEXTURE, PADDING, time_limit=0.01)
 
 
 def test_a_crash_of_xatlas_is_told(mesh, monkeypatch):
     crash = subprocess.CompletedProcess([], -11, "", "some\nSegmentation fault\n")
     monkeypatch.setattr(subprocess, "run", lambda *a, **k: crash)
-    with pytest.raises(atlas.AtlasProcessError, match="code -11: Segmentation fault"):
-        atlas.unwrap_xatlas(*mesh, TEXTURE, PADDING, time_limit=10)
+    with pytest.raises(charts.AtlasProcessError, match="code -11: Segmentation fault"):
+        charts.unwrap_xatlas(*mesh, TEXTURE, PADDING, time_limit=10)
 
 
 def test_too_many_charts_for_the_texture():
     rng = np.random.default_rng(0)
     corners = rng.uniform(-1, 1, (400, 1, 3)) + rng.normal(0, 0.01, (400, 3, 3))
     with pytest.raises(ValueError, match="room for 400 charts"):
-        atlas.unwrap_projected(corners.reshape(-1, 3), np.arange(1200).reshape(-1, 3), 64, PADDING)
+        charts.unwrap_projected(corners.reshape(-1, 3), np.arange(1200).reshape(-1, 3), 64, PADDING)
 
 
 def run_stage(tmp_path, mesh, **params):

@@ -9,12 +9,7 @@ import numpy as np
 import pytest
 
 from stages.artifacts import AtlasMesh
-from stages.geometry.cameras import PinholeCameras
-from stages.meshing.baking import Baked, Provenance, bake_texture
-from stages.meshing.filling import face_neighbors, harmonic_offsets
-from stages.meshing.gains import solve_gains
-from stages.meshing.padding import pad_charts
-from stages.meshing.rasterizing import (
+from stages.drawing.rasterizing import (
     NO_FACE,
     corner_weights,
     depth_map,
@@ -22,8 +17,13 @@ from stages.meshing.rasterizing import (
     rasterize,
     rasterize_atlas,
 )
-from stages.meshing.rendering import look_at, render_textured, turntable
-from stages.meshing.views import low_pass, surface_links
+from stages.drawing.rendering import look_at, render_textured, turntable
+from stages.geometry.cameras import PinholeCameras
+from stages.texture.baking import Baked, Provenance, bake_texture
+from stages.texture.filling import face_neighbors, harmonic_offsets
+from stages.texture.gains import solve_gains
+from stages.texture.padding import pad_charts
+from stages.texture.photo_views import low_pass, surface_links
 
 WORKERS = min(2, os.cpu_count() or 1)
 SIZE = 192
@@ -376,9 +376,9 @@ def test_charts_without_texels_are_refused(capture):
 
 
 def test_a_texture_done_in_parts_is_the_same(capture, baked, monkeypatch):
-    monkeypatch.setattr("stages.meshing.baking.BAND_BYTES", 16 * 25 * 3000)
-    monkeypatch.setattr("stages.meshing.baking.KEPT_BYTES", 0)  # and photos are made ready anew for each
-    monkeypatch.setattr("stages.meshing.baking._CHUNK", 1000)
+    monkeypatch.setattr("stages.texture.baking.BAND_BYTES", 16 * 25 * 3000)
+    monkeypatch.setattr("stages.texture.baking.KEPT_BYTES", 0)  # and photos are made ready anew for each
+    monkeypatch.setattr("stages.texture.baking._CHUNK", 1000)
     again = bake(*capture)
     assert (again.base_color == baked.base_color).all()
     assert again.numbers == baked.numbers

@@ -13,12 +13,12 @@ from configs.params import BakeParams
 from stages import artifacts
 from stages.artifacts import AtlasMesh, write_png
 from stages.bake import BAKE, load_photo
+from stages.drawing.rendering import look_at
 from stages.engine.stage import StageContext
 from stages.errors import ReconstructionError, WorkspaceError
 from stages.geometry.cameras import PinholeCameras, PosedScene
 from stages.geometry.similarity import Similarity
-from stages.meshing.baking import Provenance
-from stages.meshing.rendering import look_at
+from stages.texture.baking import Provenance
 
 SKY = np.array([90, 160, 210], np.uint8)
 
@@ -26,11 +26,11 @@ SKY = np.array([90, 160, 210], np.uint8)
 @pytest.fixture
 def context(tmp_path, monkeypatch) -> StageContext:
     """A square seen from the front by two cameras; its back is another square nobody sees."""
-    fake = ModuleType("stages.neural.field")
+    fake = ModuleType("stages.neural.trained_field")
     fake.load_field = lambda path, device: SimpleNamespace(  # type: ignore[attr-defined]
         color=lambda points, normals, view_dirs: np.full(points.shape, 0.5, np.float32)
     )
-    monkeypatch.setitem(sys.modules, "stages.neural.field", fake)
+    monkeypatch.setitem(sys.modules, "stages.neural.trained_field", fake)
     folders = {name: tmp_path / name for name in (*BAKE.needs, "out", "scratch")}
     for folder in folders.values():
         folder.mkdir()

@@ -17,21 +17,21 @@ from sphere_scene import RADIUS, render, ring_of_cameras, sphere_scene
 from suite_layouts import COUNT, LAYOUTS, cameras, write_suite
 from typer.testing import CliRunner, Result
 
-from hineus_cli import bench as bench_module
-from hineus_cli import evaluating_views, reconstruct
 from hineus_cli.app import build_app
-from hineus_cli.bench import load_results
-from hineus_cli.bench_scoring import posed_mesh, result_mesh
 from hineus_cli.bench_tables import score_table, tables_of
-from hineus_cli.bench_views import TestPhotos
-from hineus_cli.comparison import read_mesh
-from hineus_cli.peers import parse_peer, run_peer
-from hineus_cli.suites.registry import SUITES, find_scenes
-from hineus_cli.suites.scene import Wanted
-from stages import artifacts
+from stages import artifacts, reconstruct
 from stages.engine.stage import Stage, StageContext
 from stages.engine.workspace import Workspace
 from stages.errors import ConfigError, InputError, ReconstructionError
+from stages.evaluation import against_photos
+from stages.evaluation import suite_runs as bench_module
+from stages.evaluation.comparison import read_mesh
+from stages.evaluation.peers import parse_peer, run_peer
+from stages.evaluation.suite_runs import load_results
+from stages.evaluation.suite_scores import posed_mesh, result_mesh
+from stages.evaluation.suites.registry import SUITES, find_scenes
+from stages.evaluation.suites.scene import Wanted
+from stages.evaluation.test_photos import TestPhotos
 from stages.geometry.cameras import PinholeCameras
 from stages.geometry.place import Place
 from stages.geometry.similarity import Similarity
@@ -274,7 +274,7 @@ class GreyBall:
 
 def test_views_of_nerf_synthetic_are_whole_photos_on_white(data: Path, monkeypatch: pytest.MonkeyPatch):
     write_suite("nerf-synthetic", data)
-    monkeypatch.setattr(evaluating_views, "field_drawer", lambda workspace, device: GreyBall())
+    monkeypatch.setattr(against_photos, "field_drawer", lambda workspace, device: GreyBall())
     train = Stage("train", 1, ("undistort",), "train", lambda context: (context.out / "field").write_text("") and {})
     (result,) = results_of("nerf-synthetic", str(data), pipeline=(*PIPELINE[:3], train))
     views = result["scores"]["views"]

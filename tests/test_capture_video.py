@@ -11,7 +11,7 @@ import pytest
 
 from configs.params import IngestParams
 from stages import artifacts
-from stages.capture.photos import UnusableError
+from stages.capture.photo_reading import UnusableError
 from stages.capture.video import LOST, Look, choose_frames, extract_frames, motion, video_size
 from stages.engine.stage import StageContext
 from stages.ingest import INGEST

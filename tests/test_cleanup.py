@@ -15,10 +15,10 @@ from stages.errors import ReconstructionError
 from stages.geometry.cameras import PinholeCameras, PosedScene
 from stages.geometry.plane import Plane
 from stages.geometry.similarity import Similarity
-from stages.meshing import cleaning
-from stages.meshing.isosurface import extract_isosurface
-from stages.meshing.simplify import AGGRESSIVENESS, decimate
-from stages.meshing.solids import extract_solid
+from stages.surface import triangle_mesh
+from stages.surface.isosurface import extract_isosurface
+from stages.surface.simplify import AGGRESSIVENESS, decimate
+from stages.surface.solids import extract_solid
 
 SIZE = 160
 
@@ -89,16 +89,16 @@ def stage(tmp_path):
 
 def test_small_pieces_go_and_their_number_is_told():
     vertices, faces = join(ball(), ball(0.06, (0.8, 0, 0)), ball(0.06, (-0.8, 0, 0)))
-    keep, dropped = cleaning.large_pieces(faces, 0.1)
+    keep, dropped = triangle_mesh.large_pieces(faces, 0.1)
     assert dropped == 2
     assert np.linalg.norm(vertices[faces[keep]], axis=2).max() < 0.55
-    assert cleaning.large_pieces(faces, 0.0) == (pytest.approx(np.ones(len(faces), bool)), 0)
+    assert triangle_mesh.large_pieces(faces, 0.0) == (pytest.approx(np.ones(len(faces), bool)), 0)
 
 
 def test_views_of_a_ball_are_those_on_its_near_side():
     vertices, faces = ball()
     cameras = ring_of_cameras(count=1, elevations=(0,))  # at +x
-    seen = cleaning.count_views(vertices, faces, cameras, enough=1) > 0
+    seen = triangle_mesh.count_views(vertices, faces, cameras, enough=1) > 0
     horizon = 0.5**2 / 2.5  # the tangent cone touches the ball at x = r^2 / d
     assert seen[vertices[:, 0] > horizon + 0.06].all()
     assert not seen[vertices[:, 0] < horizon - 0.06].any()
@@ -108,15 +108,15 @@ def test_views_are_counted_up_to_enough():
     vertices, faces = ball()
     cameras = ring_of_cameras()
     top = vertices[:, 2].argmax()
-    assert cleaning.count_views(vertices, faces, cameras, enough=3)[top] == 3
-    assert cleaning.count_views(vertices, faces, cameras, enough=99)[top] == len(cameras)
+    assert triangle_mesh.count_views(vertices, faces, cameras, enough=3)[top] == 3
+    assert triangle_mesh.count_views(vertices, faces, cameras, enough=99)[top] == len(cameras)
 
 
 def test_what_lies_outside_the_image_is_not_seen():
     vertices, faces = ball()
     cameras = ring_of_cameras(count=1, elevations=(0,))
     narrow = PinholeCameras(cameras.names, np.array([[SIZE // 2, SIZE]]), cameras.intrinsics, cameras.cam_from_scene)
-    seen = cleaning.count_views(vertices, faces, narrow, enough=1) > 0
+    seen = triangle_mesh.count_views(vertices, faces, narrow, enough=1) > 0
     pixels, _ = cameras.project(0, vertices)
     assert seen.any()
     assert not seen[pixels[:, 0] >= SIZE // 2].any()
@@ -126,7 +126,7 @@ def test_small_unseen_gaps_are_kept_and_large_ones_dropped():
     vertices, faces = ball()
     middle = vertices[faces].mean(1)
     small, large = middle[:, 2] > 0.48, middle[:, 2] < -0.1
-    keep = cleaning.fill_small_gaps(vertices, faces, ~small & ~large, max_area=0.2)
+    keep = triangle_mesh.fill_small_gaps(vertices, faces, ~small & ~large, max_area=0.2)
     assert keep[small].all()
     assert not keep[large].any()
 
@@ -134,16 +134,16 @@ def test_small_unseen_gaps_are_kept_and_large_ones_dropped():
 def test_unseen_islands_are_not_gaps():
     vertices, faces = join(ball(), ball(0.06, (0.8, 0, 0)))
     island = np.linalg.norm(vertices[faces].mean(1), axis=1) > 0.6
-    assert not cleaning.fill_small_gaps(vertices, faces, ~island, max_area=10)[island].any()
+    assert not triangle_mesh.fill_small_gaps(vertices, faces, ~island, max_area=10)[island].any()
 
 
 def test_smoothing_a_selection_fills_notches_only():
     vertices, faces = ball()
     notch = np.zeros(len(faces), dtype=bool)
     notch[np.flatnonzero(vertices[faces].mean(1)[:, 2] > 0)[0]] = True
-    assert cleaning.smooth_selection(faces, len(vertices), ~notch, 2).all()
+    assert triangle_mesh.smooth_selection(faces, len(vertices), ~notch, 2).all()
     half = vertices[faces].mean(1)[:, 2] > 0
-    smooth = cleaning.smooth_selection(faces, len(vertices), half, 2)
+    smooth = triangle_mesh.smooth_selection(faces, len(vertices), half, 2)
     assert smooth[half].all()
     assert vertices[faces[smooth]].mean(1)[:, 2].min() > -0.15
 
@@ -158,21 +158,21 @@ def bow_tie():
 
 def test_mesh_state_counts_what_is_wrong():
     _, faces = ball()
-    assert cleaning.mesh_state(faces) == cleaning.MeshState(0, 0, 0)
-    assert cleaning.mesh_state(faces[1:]).open_edges == 3
-    assert cleaning.mesh_state(np.concatenate([faces, faces[:1]])).bad_edges == 3
+    assert triangle_mesh.mesh_state(faces) == triangle_mesh.MeshState(0, 0, 0)
+    assert triangle_mesh.mesh_state(faces[1:]).open_edges == 3
+    assert triangle_mesh.mesh_state(np.concatenate([faces, faces[:1]])).bad_edges == 3
     turned = faces.copy()
     turned[0] = turned[0, ::-1]
-    assert cleaning.mesh_state(turned).bad_edges == 3
-    assert cleaning.mesh_state(bow_tie()[1]).bad_vertices == 1
-    assert not cleaning.mesh_state(bow_tie()[1]).manifold
+    assert triangle_mesh.mesh_state(turned).bad_edges == 3
+    assert triangle_mesh.mesh_state(bow_tie()[1]).bad_vertices == 1
+    assert not triangle_mesh.mesh_state(bow_tie()[1]).manifold
 
 
 def test_repair_splits_a_vertex_where_two_fans_meet():
-    vertices, faces = cleaning.repair_manifold(*bow_tie())
+    vertices, faces = triangle_mesh.repair_manifold(*bow_tie())
     assert len(vertices) == 8
     assert len(faces) == 8
-    state = cleaning.mesh_state(faces)
+    state = triangle_mesh.mesh_state(faces)
     assert state.manifold
     assert state.watertight
     np.testing.assert_array_equal(vertices[faces], bow_tie()[0][bow_tie()[1]])
@@ -183,7 +183,7 @@ def test_repair_drops_duplicates_slivers_and_fins_and_leaves_the_rest_alone():
     fin = np.array([[faces[0, 1], faces[0, 0], len(vertices)]])
     point = vertices[faces[0, 0]] + 1e-3
     spoiled = np.concatenate([faces, faces[:2], [[5, 5, 9]], fin])
-    repaired, new_faces = cleaning.repair_manifold(np.concatenate([vertices, point[None]]), spoiled)
+    repaired, new_faces = triangle_mesh.repair_manifold(np.concatenate([vertices, point[None]]), spoiled)
     np.testing.assert_array_equal(new_faces, faces)
     np.testing.assert_array_equal(repaired, vertices)
 
@@ -192,18 +192,18 @@ def test_repair_drops_faces_back_to_back():
     """Alone, one of them would be a hole."""
     vertices, faces = ball()
     pillow = np.array([[5, 90, 200], [90, 5, 200]])  # shares vertices with the ball, but no edges
-    repaired, new_faces = cleaning.repair_manifold(vertices, np.concatenate([faces, pillow]))
+    repaired, new_faces = triangle_mesh.repair_manifold(vertices, np.concatenate([faces, pillow]))
     np.testing.assert_array_equal(new_faces, faces)
     np.testing.assert_array_equal(repaired, vertices)
     thrice = np.concatenate([faces, faces[:1], faces[:1, ::-1]])  # once there and back: the first one stays
-    np.testing.assert_array_equal(cleaning.repair_manifold(vertices, thrice)[1], faces)
+    np.testing.assert_array_equal(triangle_mesh.repair_manifold(vertices, thrice)[1], faces)
 
 
 def test_decimation_keeps_shape_and_closedness():
     vertices, faces = ball(resolution=64)
     light, kept = decimate(vertices, faces, 1000)
     assert 900 <= len(kept) <= 1000
-    state = cleaning.mesh_state(kept)
+    state = triangle_mesh.mesh_state(kept)
     assert state.manifold
     assert state.watertight
     assert np.abs(np.linalg.norm(light, axis=1) - 0.5).max() < 0.01
@@ -219,8 +219,8 @@ def test_decimation_falls_back_where_the_fast_one_breaks_the_mesh(monkeypatch):
     monkeypatch.setattr(fast_simplification, "simplify", lambda *a, **k: (vertices, broken))
     _, kept = decimate(vertices, faces, 400)
     assert len(kept) <= 400
-    assert cleaning.mesh_state(kept).manifold
-    assert cleaning.mesh_state(kept).watertight
+    assert triangle_mesh.mesh_state(kept).manifold
+    assert triangle_mesh.mesh_state(kept).watertight
 
 
 def test_decimation_of_a_closed_mesh_leaves_no_hole(monkeypatch):
@@ -230,7 +230,7 @@ def test_decimation_of_a_closed_mesh_leaves_no_hole(monkeypatch):
     monkeypatch.setattr(fast_simplification, "simplify", lambda *a, **k: (vertices, faces[1:]))
     _, kept = decimate(vertices, faces, 400)
     assert len(kept) <= 400
-    assert cleaning.mesh_state(kept) == cleaning.MeshState(0, 0, 0)
+    assert triangle_mesh.mesh_state(kept) == triangle_mesh.MeshState(0, 0, 0)
 
 
 def test_decimation_reaches_its_target_where_the_fast_one_gives_up():
@@ -242,7 +242,7 @@ def test_decimation_reaches_its_target_where_the_fast_one_gives_up():
     assert len(given_up) > 2000
     _, kept = decimate(rough, faces, 1000)
     assert 990 <= len(kept) <= 1000
-    assert cleaning.mesh_state(kept) == cleaning.MeshState(0, 0, 0)
+    assert triangle_mesh.mesh_state(kept) == triangle_mesh.MeshState(0, 0, 0)
 
 
 def test_decimation_refuses_an_impossible_target():
@@ -254,10 +254,10 @@ def test_hull_drops_what_most_masks_exclude_but_trusts_no_single_mask():
     cameras = ring_of_cameras()
     points = np.array([[0, 0, 0], [0.8, 0, 0.0], [0, 0, 0.3]])
     disk = silhouettes(cameras)
-    assert cleaning.outside_hull(points, cameras, disk, 0.1).tolist() == [False, True, False]
+    assert triangle_mesh.outside_hull(points, cameras, disk, 0.1).tolist() == [False, True, False]
     one_bad = [(i, mask if i else np.zeros_like(mask)) for i, mask in disk]
-    assert cleaning.outside_hull(points, cameras, one_bad, 0.05).tolist() == [False, True, False]
-    assert not cleaning.outside_hull(points, cameras, [], 0.1).any()
+    assert triangle_mesh.outside_hull(points, cameras, one_bad, 0.05).tolist() == [False, True, False]
+    assert not triangle_mesh.outside_hull(points, cameras, [], 0.1).any()
 
 
 def silhouettes(cameras, radius=0.5):
@@ -341,20 +341,20 @@ def test_stage_says_when_nothing_is_left(stage):
 def test_clipping_a_ball_cuts_at_the_plane_and_keeps_the_rest():
     vertices, faces = ball(0.5, resolution=48)
     normal = np.array([0.6, 0.0, 0.8])
-    above, kept = cleaning.clip(vertices, faces, normal, 0.2)
+    above, kept = triangle_mesh.clip(vertices, faces, normal, 0.2)
     heights = above @ normal
     assert heights.min() == pytest.approx(0.2, abs=1e-6)
     assert heights.max() == pytest.approx(0.5, abs=1e-3)
-    state = cleaning.mesh_state(kept)
+    state = triangle_mesh.mesh_state(kept)
     assert state.manifold
     rim = np.abs(heights - 0.2) < 1e-6
     assert 100 < state.open_edges <= rim.sum()
     np.testing.assert_allclose(np.linalg.norm(above[rim], axis=1), 0.5, atol=2e-3)
-    below, rest = cleaning.clip(vertices, faces, -normal, -0.2)
-    area = lambda v, f: np.linalg.norm(cleaning.face_normals(v, f), axis=1).sum()  # noqa: E731
+    below, rest = triangle_mesh.clip(vertices, faces, -normal, -0.2)
+    area = lambda v, f: np.linalg.norm(triangle_mesh.face_normals(v, f), axis=1).sum()  # noqa: E731
     assert area(above, kept) + area(below, rest) == pytest.approx(area(vertices, faces), rel=1e-5)
-    assert len(cleaning.clip(vertices, faces, normal, 0.6)[1]) == 0
-    np.testing.assert_array_equal(cleaning.clip(vertices, faces, normal, -0.6)[1], faces)
+    assert len(triangle_mesh.clip(vertices, faces, normal, 0.6)[1]) == 0
+    np.testing.assert_array_equal(triangle_mesh.clip(vertices, faces, normal, -0.6)[1], faces)
 
 
 def table_with_ball(tilt=0.02):
@@ -427,7 +427,7 @@ def test_stage_drops_flaps_under_the_ground_at_the_border_unless_points_lie_ther
 
 
 def test_stage_says_when_a_solid_was_wanted_and_is_none(stage, monkeypatch, caplog):
-    decimated = "stages.meshing.simplify.decimate"
+    decimated = "stages.surface.simplify.decimate"
     monkeypatch.setattr(decimated, lambda vertices, faces, target: (vertices, faces[1:]))
     numbers, _, _ = stage(*ball(), keep_closed=True)
     assert numbers["open_edges"] > 0

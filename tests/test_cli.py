@@ -15,10 +15,11 @@ from toy_pipeline import TOY, failing, with_stage
 from typer.testing import CliRunner, Result
 
 from configs.load import describe_settings
-from hineus_cli import doctor, reconstruct
+from hineus_cli import doctor
 from hineus_cli.app import build_app
 from hineus_cli.console import key_numbers, outcome_table, status_table
 from hineus_cli.doctor import Finding
+from stages import reconstruct
 from stages.engine.runner import StageOutcome
 from stages.engine.status import StageStatus
 from stages.engine.workspace import Workspace

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stages.meshing.cleaning import MeshState, mesh_state, repair_manifold
-from stages.meshing.collision import _without_holes, convex_pieces, hull
-from stages.meshing.isosurface import extract_isosurface
+from stages.surface.collision import _without_holes, convex_pieces, hull
+from stages.surface.isosurface import extract_isosurface
+from stages.surface.triangle_mesh import MeshState, mesh_state, repair_manifold
 
 RADIUS = 0.15
 

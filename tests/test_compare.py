@@ -53,7 +53,7 @@ def test_the_command_tells_numbers_and_writes_the_map(tmp_path, monkeypatch, cap
 
 
 def test_what_is_no_mesh_is_explained(tmp_path):
-    from hineus_cli.comparison import mesh_path, read_mesh
+    from stages.evaluation.comparison import mesh_path, read_mesh
 
     with pytest.raises(InputError, match=r"holds no exported PLY") as caught:
         mesh_path(tmp_path)

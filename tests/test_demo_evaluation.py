@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from stages.errors import InputError
-from stages.geometry.similarity import Similarity, align_points
-from stages.meshing.evaluation import (
+from stages.evaluation.known_surface import (
     KnownSurface,
     sample_surface,
     score_surface,
     seen_surface,
 )
+from stages.geometry.similarity import Similarity, align_points
 
 trimesh = pytest.importorskip("trimesh")
 
@@ -141,7 +141,7 @@ def test_align_points_refuses_what_does_not_fix_a_frame(source, message):
 def test_score_mesh_reads_files_and_undoes_the_models_frame(tmp_path, known):
     """The mesh lies in the frame of a COLMAP model that is scaled, turned and moved."""
     pycolmap = pytest.importorskip("pycolmap")
-    from hineus_cli.scoring import score_mesh
+    from stages.evaluation.known_object import score_mesh
 
     turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     model_from_world = Similarity(3.0, turn, np.array([1.0, 2, 3]))

@@ -7,7 +7,8 @@ import json
 import numpy as np
 import pytest
 
-from hineus_cli.demo_scene import (
+from stages.evaluation.known_object import TRUTH_CAMERAS
+from stages.scenes.figurine import (
     CLOTH_SIDE,
     FOCAL_35MM,
     ValueNoise,
@@ -19,7 +20,6 @@ from hineus_cli.demo_scene import (
     photos_are_complete,
     render,
 )
-from hineus_cli.scoring import TRUTH_CAMERAS
 
 SIZE = (96, 72)
 FOCAL = FOCAL_35MM / 36 * SIZE[0]

@@ -13,12 +13,12 @@ import trimesh
 from scipy.io import savemat
 from typer.testing import CliRunner
 
-from hineus_cli import truths
 from hineus_cli.app import app
+from stages.drawing.rendering import look_at
 from stages.errors import HineusError, InputError
+from stages.evaluation import truths
 from stages.evaluation.glossy import drawn_depth
 from stages.geometry.cameras import PinholeCameras
-from stages.meshing.rendering import look_at
 
 
 def hineus(*words: object) -> tuple[int, str]:

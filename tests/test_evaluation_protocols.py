@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 import trimesh
 
+from stages.drawing.rendering import look_at
 from stages.evaluation import dtu
 from stages.evaluation.dtu import DtuTruth, dtu_score, lattice
 from stages.evaluation.glossy import VOXEL, drawn_depth, glossy_score, visible_points
 from stages.evaluation.surfaces import Surface
 from stages.evaluation.tanks import TAU, CropVolume, refined, tanks_score
 from stages.geometry.cameras import PinholeCameras
-from stages.meshing.rendering import look_at
 
 
 def flat(height: float, low: float, high: float) -> Surface:

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import trimesh
 
+from stages.drawing.rendering import look_at
 from stages.evaluation import alignment, culling
 from stages.evaluation.scenes import BLENDED_THRESHOLDS, blended_score
 from stages.evaluation.surfaces import OneWay, Sampling, Surface, compare_to_points, draw_points, measure, turning
 from stages.evaluation.thinning import one_a_cube, thin
 from stages.geometry.cameras import PinholeCameras
-from stages.meshing.rendering import look_at
 
 FEW = Sampling(20_000)
 

@@ -26,8 +26,8 @@ from stages.evaluation import images
 from stages.evaluation.images import find_lpips, score_image
 from stages.evaluation.views import judge, laid_on_white
 from stages.neural.drawing import FieldDrawer, FieldDrawing
-from stages.neural.field import field_state
 from stages.neural.fields import Fields
+from stages.neural.trained_field import field_state
 from stages.neural.trainer import field_shape
 
 PARAMS = TrainParams(

@@ -21,11 +21,11 @@ from stages.artifacts import AtlasMesh
 from stages.engine.stage import StageContext
 from stages.errors import ReconstructionError, SystemRequirementError
 from stages.export import EXPORT, unit_normals
+from stages.files.writing import Textures, glb_bytes, obj_text, ply_bytes, shapes_glb_bytes
 from stages.geometry.cameras import PinholeCameras, PosedScene
 from stages.geometry.orientation import y_up_rotation
 from stages.geometry.place import Place
 from stages.geometry.similarity import Similarity
-from stages.meshing.writing import Textures, glb_bytes, obj_text, ply_bytes, shapes_glb_bytes
 
 ROOT = Path(__file__).parents[1]
 # No rotation maps this tetrahedron with its four colours to its mirror image.

@@ -25,9 +25,9 @@ def stage(tmp_path, monkeypatch):
     def run(sdf, **params):
         for folder in (undistort, train, out):
             folder.mkdir()
-        stand_in = types.ModuleType("stages.neural.field")
+        stand_in = types.ModuleType("stages.neural.trained_field")
         stand_in.load_field = lambda path, device: types.SimpleNamespace(sdf=sdf)
-        monkeypatch.setitem(sys.modules, "stages.neural.field", stand_in)
+        monkeypatch.setitem(sys.modules, "stages.neural.trained_field", stand_in)
         empty = np.zeros((0, 2), dtype=np.int32)
         up = np.array([0, 0, 1.0])
         scene = PosedScene(ring_of_cameras(), Similarity.identity(), np.zeros((0, 3)), np.zeros(0), empty, up)

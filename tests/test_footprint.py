@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stages.meshing.footprint import CHARTS_FILL, LARGEST, SMALLEST, pixels_per_area, texture_size_for
-from stages.meshing.rendering import look_at
+from stages.drawing.rendering import look_at
+from stages.texture.footprint import CHARTS_FILL, LARGEST, SMALLEST, pixels_per_area, texture_size_for
 
 
 def test_a_square_seen_from_the_front_has_the_density_of_its_pixels():

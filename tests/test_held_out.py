@@ -13,8 +13,8 @@ from configs.params import TrainParams
 from stages import artifacts, train
 from stages.engine.stage import StageContext
 from stages.errors import ConfigError
-from stages.neural.held_out import held_out_psnr, left_out, photo_psnr
-from stages.neural.photos import Photos
+from stages.neural.held_out_psnr import held_out_psnr, left_out, photo_psnr
+from stages.neural.training_photos import Photos
 
 TINY = TrainParams(
     steps=50, rays=64, samples=8, levels=2, log2_rows=9, coarsest=8, finest=16, sdf_width=8, radiance_width=8,
@@ -101,7 +101,7 @@ def test_what_lies_off_the_mask_does_not_count():
 
 
 def test_large_photos_are_judged_on_a_grid_of_pixels(monkeypatch):
-    monkeypatch.setattr("stages.neural.held_out.PIXELS", 200)
+    monkeypatch.setattr("stages.neural.held_out_psnr.PIXELS", 200)
     rays = []
     photo_psnr(make_photos(), 2, lambda batch: (rays.extend(batch.drawn), batch.colors)[1])
     assert 100 < len(rays) <= 200

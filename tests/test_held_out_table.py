@@ -32,10 +32,10 @@ def test_the_page_s_table_is_that_of_the_result_files():
 
 
 def test_a_measurement_keeps_no_folder_of_the_machine(tmp_path, monkeypatch):
-    from hineus_cli import evaluating_views
+    from stages.evaluation import against_photos
 
     found = {"workspace": str(tmp_path), "renders": None, "photos": [], "mean": {}, "done": ["photos: 1 of 2"]}
-    monkeypatch.setattr(evaluating_views, "evaluate_views", lambda workspace: found)
+    monkeypatch.setattr(against_photos, "evaluate_views", lambda workspace: found)
     result = held_out.measure(tmp_path / "ball")
     assert result["name"] == "ball"
     assert str(tmp_path) not in json.dumps(result)

@@ -15,7 +15,7 @@ from configs.params import IngestParams
 from stages import artifacts
 from stages.artifacts import ImageSet
 from stages.capture.exif import DIAGONAL_35MM
-from stages.capture.photos import register_formats
+from stages.capture.photo_reading import register_formats
 from stages.engine.stage import StageContext
 from stages.errors import InputError
 from stages.ingest import INGEST

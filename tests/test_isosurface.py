@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stages.meshing.cleaning import face_adjacency, face_normals, label_pieces, mesh_state
-from stages.meshing.isosurface import CORNERS, EDGES, cube_tables, extract_isosurface
+from stages.surface.isosurface import CORNERS, EDGES, cube_tables, extract_isosurface
+from stages.surface.triangle_mesh import face_adjacency, face_normals, label_pieces, mesh_state
 
 
 def sphere(points):

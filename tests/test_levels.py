@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from stages.artifacts import AtlasMesh
-from stages.meshing.levels import levels_of_detail
+from stages.texture.levels import levels_of_detail
 
 
 def globe(rows: int = 48) -> AtlasMesh:
     """A unit ball as two charts, cut along the circle x = 0: each half is laid flat by (y, z)."""
-    from stages.meshing.solids import cut_at_plane, cut_to_ball, extract_solid
+    from stages.surface.solids import cut_at_plane, cut_to_ball, extract_solid
 
     parts = []
     surface = extract_solid(lambda p: np.linalg.norm(p, axis=1) - 0.5, rows)

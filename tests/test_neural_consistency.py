@@ -11,7 +11,7 @@ from test_neural_terms import gradients_of, rough_trainer
 from stages.geometry.cameras import PinholeCameras
 from stages.neural import consistency
 from stages.neural.consistency import NO_PATCH, mean_of_best, patch_errors, patch_trust, slide_to_surface, views_beside
-from stages.neural.photos import Photos
+from stages.neural.training_photos import Photos
 
 UP = torch.tensor([[0.0, 0, 1]])
 

@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from stages.neural.encodings import Frequencies, HashGrid
-from stages.neural.field import field_state, load_field
 from stages.neural.fields import BEND, Fields, FieldShape, SdfNetwork, smooth_relu, smooth_relu_reference
+from stages.neural.trained_field import field_state, load_field
 
 GRID = HashGrid(levels=4, features=4, log2_rows=10, coarsest=4, finest=24)
 SHAPE = FieldShape(

@@ -7,8 +7,8 @@ import torch
 from test_train import TINY, assert_finds_the_ball, make_trainer
 
 from stages.neural.acceleration import is_mixed, short_products
-from stages.neural.field import field_state, load_field
 from stages.neural.mlp import mlp
+from stages.neural.trained_field import field_state, load_field
 
 EVERYTHING = {"reflection": "stable", "reflection_from": 0.0, "sampler": "proposal"}
 

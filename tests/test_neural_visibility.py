@@ -13,8 +13,8 @@ from sphere_scene import render, ring_of_cameras
 
 from stages.errors import ReconstructionError, SystemRequirementError
 from stages.neural import visibility as vis
-from stages.neural.photos import Photos
 from stages.neural.sampling import SdfCache, free_outside
+from stages.neural.training_photos import Photos
 
 
 @lru_cache

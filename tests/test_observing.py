@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from stages.meshing.observing import STEPS_SIGNED, STEPS_UNSIGNED, blend_texels
+from stages.texture.observing import STEPS_SIGNED, STEPS_UNSIGNED, blend_texels
 
 
 def _blend(weights: list[float], lows: list[float], highs: list[float], **options: object) -> np.ndarray:

@@ -15,11 +15,11 @@ from PIL import Image, ImageFilter
 from typer.testing import CliRunner, Result
 
 from configs.load import load_config
-from hineus_cli import preflight as module
-from hineus_cli import reconstruct
 from hineus_cli.app import app
-from hineus_cli.preflight import GIB, estimate, preflight
+from stages import preflight as module
+from stages import reconstruct
 from stages.capture.preflight import Inspection, Video, glance, inspect
+from stages.preflight import GIB, estimate, preflight
 
 SIZE = (320, 240)
 

@@ -10,15 +10,15 @@ import trimesh
 from sphere_scene import RADIUS, render, ring_of_cameras
 
 from stages.artifacts import AtlasMesh
-from stages.meshing.baking import Provenance
-from stages.meshing.quality import (
+from stages.drawing.rasterizing import Texels, rasterize_atlas
+from stages.texture.baking import Provenance
+from stages.texture.vertex_quality import (
     color_precision,
     invented_share,
     mean_disagreement,
     measure_quality,
     texel_density,
 )
-from stages.meshing.rasterizing import Texels, rasterize_atlas
 
 
 def ball() -> AtlasMesh:

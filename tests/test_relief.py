@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from stages.artifacts import AtlasMesh
-from stages.meshing.rasterizing import Texels, rasterize_atlas
-from stages.meshing.relief import FLAT, bake_normals, bake_occlusion, sky_seen, spread_samples
-from stages.meshing.tangents import to_tangent_space, vertex_tangents
+from stages.drawing.rasterizing import Texels, rasterize_atlas
+from stages.files.tangents import to_tangent_space, vertex_tangents
+from stages.texture.relief import FLAT, bake_normals, bake_occlusion, sky_seen, spread_samples
 
 SIZE = 64
 QUAD = np.array([[0, 1, 2], [0, 2, 3]], np.int32)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stages.meshing.sharpness import LEAST, sharpness_of_photos
+from stages.texture.sharpness import LEAST, sharpness_of_photos
 
 
 def _highs(points: int = 400, photos: int = 5) -> np.ndarray:

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stages.meshing import cleaning
-from stages.meshing.isosurface import extract_isosurface
-from stages.meshing.solids import cut_at_plane, cut_to_ball, extract_solid
+from stages.surface import triangle_mesh
+from stages.surface.isosurface import extract_isosurface
+from stages.surface.solids import cut_at_plane, cut_to_ball, extract_solid
 
-CLOSED = cleaning.MeshState(0, 0, 0)
+CLOSED = triangle_mesh.MeshState(0, 0, 0)
 
 
 def beam(points: np.ndarray) -> np.ndarray:
@@ -34,9 +34,9 @@ def pipe_in_ball(radius: float) -> float:
 
 def test_a_surface_that_leaves_the_ball_is_closed_beyond_it():
     surface = extract_solid(beam, 48, block=16)
-    assert cleaning.mesh_state(surface.faces) == CLOSED
+    assert triangle_mesh.mesh_state(surface.faces) == CLOSED
     assert volume(surface.vertices, surface.faces) > 0
-    inside = cleaning.inside_ball(surface.vertices, surface.faces, 1.0)
+    inside = triangle_mesh.inside_ball(surface.vertices, surface.faces, 1.0)
     open_one = extract_isosurface(beam, 48, block=16)
     middles = lambda vertices, faces: np.sort(vertices[faces].mean(1), axis=0)  # noqa: E731
     np.testing.assert_allclose(
@@ -55,7 +55,7 @@ def test_the_field_is_asked_inside_the_ball_only():
 @pytest.mark.parametrize("radius", [0.98, 0.7])
 def test_a_solid_cut_to_a_ball_is_a_solid(radius):
     vertices, faces = cut_to_ball(*solid(pipe), radius)
-    assert cleaning.mesh_state(faces) == CLOSED
+    assert triangle_mesh.mesh_state(faces) == CLOSED
     assert np.linalg.norm(vertices, axis=1).max() < radius + 1e-5
     assert volume(vertices, faces) == pytest.approx(pipe_in_ball(radius), rel=0.01)
 
@@ -70,7 +70,7 @@ def test_a_cut_across_a_pipe_ends_in_a_ring():
     normal = np.array([0.0, 0.0, 1.0])
     above, kept = cut_at_plane(vertices, faces, normal, 0.1)
     below, rest = cut_at_plane(vertices, faces, -normal, -0.1)
-    assert cleaning.mesh_state(kept) == cleaning.mesh_state(rest) == CLOSED
+    assert triangle_mesh.mesh_state(kept) == triangle_mesh.mesh_state(rest) == CLOSED
     assert above[:, 2].min() == pytest.approx(0.1, abs=1e-5)
     assert volume(above, kept) + volume(below, rest) == pytest.approx(volume(vertices, faces), rel=1e-4)
     lid = above[kept][(np.abs(above[kept][:, :, 2] - 0.1) < 1e-5).all(1)]

@@ -9,11 +9,11 @@ import pytest
 from sphere_scene import RADIUS
 from suite_layouts import COUNT, LAYOUTS, write_mipnerf360, write_neus, write_suite, write_urban_photos
 
-from hineus_cli.suites.depth_maps import true_points
-from hineus_cli.suites.paper import paper_tables
-from hineus_cli.suites.registry import SUITES, find_scenes, find_suite
-from hineus_cli.suites.scene import SuiteScene, Wanted
 from stages.errors import InputError
+from stages.evaluation.suites.depth_maps import true_points
+from stages.evaluation.suites.paper import paper_tables
+from stages.evaluation.suites.registry import SUITES, find_scenes, find_suite
+from stages.evaluation.suites.scene import SuiteScene, Wanted
 from stages.posing.known import match_photos
 from stages.posing.reading import read_poses
 

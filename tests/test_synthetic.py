@@ -11,8 +11,8 @@ from benchmarks.synthetic import capture, city, implicit, objects, scenes
 from benchmarks.synthetic.capture import Order, develop, make
 from benchmarks.synthetic.check import check
 from benchmarks.synthetic.model import Ground, Part, Scene, plain
-from hineus_cli.demo_scene import ValueNoise, camera_ring
-from hineus_cli.scoring import has_truth, load_known_surface
+from stages.evaluation.known_object import has_truth, load_known_surface
+from stages.scenes.figurine import ValueNoise, camera_ring
 
 SIZE = (96, 72)
 
@@ -130,7 +130,7 @@ def _write_cast_masks(folder, shift=0.0):
     import open3d as o3d
     import trimesh
 
-    from stages.meshing.cleaning import raycaster
+    from stages.surface.triangle_mesh import raycaster
 
     order = Order("plain", 6, SIZE, 4, 0)
     scene = _small_scene(np.random.default_rng(1), 6)

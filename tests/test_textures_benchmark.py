@@ -7,9 +7,9 @@ import pytest
 
 from benchmarks.textures import BOUND, NAIVE, OURS, VERTEX, Look, Score, SetResult, matched, seam, with_tables
 from stages.artifacts import AtlasMesh
-from stages.meshing.filling import face_neighbors
-from stages.meshing.rendering import look_at
-from stages.meshing.view_scores import draw_view
+from stages.drawing.rendering import look_at
+from stages.drawing.view_scores import draw_view
+from stages.texture.filling import face_neighbors
 
 
 @pytest.fixture

@@ -19,11 +19,11 @@ from stages.errors import InputError
 from stages.geometry.hull import hull_distances
 from stages.neural import acceleration, encodings
 from stages.neural import fields as fields_module
-from stages.neural.field import load_field
 from stages.neural.fields import contract
-from stages.neural.photos import Photos
 from stages.neural.sightings import Sightings
+from stages.neural.trained_field import load_field
 from stages.neural.trainer import Trainer
+from stages.neural.training_photos import Photos
 
 TINY = TrainParams(
     steps=60, rays=128, samples=12, levels=4, log2_rows=10, coarsest=8, finest=32, sdf_width=16,

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from stages.artifacts import AtlasMesh
+from stages.drawing.rendering import look_at
+from stages.drawing.view_scores import draw_view, psnr, score_views, silhouette, ssim
 from stages.geometry.cameras import PinholeCameras
-from stages.meshing.rendering import look_at
-from stages.meshing.view_scores import draw_view, psnr, score_views, silhouette, ssim
 
 MASK = np.zeros((32, 32), bool)
 MASK[8:24, 8:24] = True

@@ -1,7 +1,8 @@
 """From radiance to files: what a camera does to a picture, and the folder of a scene.
 
-A folder: `images/000.jpg` ..., `masks/000.png` ..., `gt_mesh.ply`, and, last, `transforms.json` as `hineus_cli.scoring`
-reads it. `made_with.json` says what is being made: photos of another recipe are removed, finished ones are kept.
+A folder: `images/000.jpg` ..., `masks/000.png` ..., `gt_mesh.ply`, and, last, `transforms.json` as
+`stages.evaluation.known_object` reads it. `made_with.json` says what is being made: photos of another recipe are
+removed, finished ones are kept.
 """
 
 from __future__ import annotations
@@ -20,8 +21,8 @@ from benchmarks.synthetic import MADE_WITH
 from benchmarks.synthetic.mitsuba_camera import Photographer
 from benchmarks.synthetic.model import Scene
 from benchmarks.synthetic.scenes import RECIPES
-from hineus_cli.demo_scene import photo_exif
-from hineus_cli.scoring import TRUTH_CAMERAS, TRUTH_MESH
+from stages.evaluation.known_object import TRUTH_CAMERAS, TRUTH_MESH
+from stages.scenes.figurine import photo_exif
 
 SUITE_VERSION = 1  # raise it when the same recipe would give other photos
 IMAGES, MASKS = "images", "masks"

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from hineus_cli.scoring import load_known_surface
-from stages.meshing.cleaning import raycaster
+from stages.evaluation.known_object import load_known_surface
+from stages.surface.triangle_mesh import raycaster
 
 # A camera that is half a pixel off is far beyond these. An outline that runs along a row of pixels, as the city's does
 # in photos straight down, falls to either side of their centres as a whole, which is a tenth of a pixel or so.

@@ -6,7 +6,7 @@ import numpy as np
 
 from benchmarks.synthetic.implicit import box, cylinder, ellipsoid, mesh_of, profile, tube, union, without
 from benchmarks.synthetic.model import Paint, Part, plain
-from hineus_cli.demo_scene import ValueNoise, make_figurine
+from stages.scenes.figurine import ValueNoise, make_figurine
 
 CELL = 1 / 240  # of the grid that shapes are meshed from: about one and a half pixels of the photos
 GRAIN = 0.02  # longest painted edge of rods

@@ -9,9 +9,9 @@ import numpy as np
 
 from benchmarks.synthetic import city, objects
 from benchmarks.synthetic.model import Ground, Part, Scene
-from hineus_cli.demo_scene import CLOTH_SIDE, camera_ring, make_cloth, make_environment
+from stages.drawing.rendering import look_at
 from stages.geometry.cameras import PinholeCameras
-from stages.meshing.rendering import look_at
+from stages.scenes.figurine import CLOTH_SIDE, camera_ring, make_cloth, make_environment
 
 GROUND_GAP = 1e-4  # under the object: two surfaces in one plane would mix
 SKY_HEIGHT = 512

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from stages.artifacts import SkippedImage
-from stages.capture.photos import PHOTO_SUFFIXES, RAW_SUFFIXES
+from stages.capture.photo_reading import PHOTO_SUFFIXES, RAW_SUFFIXES
 from stages.errors import InputError
 
 VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".avi", ".mkv", ".m4v", ".webm", ".mts", ".3gp"})

@@ -7,7 +7,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from stages.capture.exif import ORIENTATION
-from stages.capture.photos import PHOTO_SUFFIXES
+from stages.capture.photo_reading import PHOTO_SUFFIXES
 from stages.errors import InputError
 
 

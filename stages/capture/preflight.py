@@ -18,7 +18,7 @@ from stages.artifacts import SkippedImage
 from stages.capture.background import find_background
 from stages.capture.exif import ORIENTATION, camera_key, focal_px
 from stages.capture.listing import list_captures
-from stages.capture.photos import MIN_SIDE, RAW_SUFFIXES, UnusableError, read_photo, register_formats, unreadable
+from stages.capture.photo_reading import MIN_SIDE, RAW_SUFFIXES, UnusableError, read_photo, register_formats, unreadable
 from stages.capture.quality import sharpness
 from stages.capture.video import video_size
 

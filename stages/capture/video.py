@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from stages.capture.photos import UnusableError
+from stages.capture.photo_reading import UnusableError
 
 LOOKS_PER_S = 10.0  # frames looked at; hand-held blur comes and goes within some tenths of a second
 TRACK_SIDE = 320  # longest side of the thumbnails that motion is followed on, pixels

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from stages.drawing.rasterizing import depth_map
 from stages.evaluation.surfaces import Surface, Target
 from stages.evaluation.thinning import one_a_cube
 from stages.geometry.cameras import PinholeCameras
-from stages.meshing.rasterizing import depth_map
 
 VOXEL = 0.01
 

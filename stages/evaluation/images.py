@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from stages.meshing.view_scores import psnr, ssim
+from stages.drawing.view_scores import psnr, ssim
 
 Lpips = Callable[[np.ndarray, np.ndarray], float]
 

@@ -17,8 +17,8 @@ from typing import Any
 
 import numpy as np
 
-from stages.meshing.cleaning import face_normals, raycaster
-from stages.meshing.evaluation import f_score, sample_faces
+from stages.evaluation.known_surface import f_score, sample_faces
+from stages.surface.triangle_mesh import face_normals, raycaster
 
 SAMPLES = 200_000
 # A selection that leaves few of the points is drawn again from this many times the points at most.

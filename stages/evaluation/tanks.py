@@ -8,7 +8,7 @@ import numpy as np
 
 from stages.evaluation.surfaces import Sampling, Surface, Target, draw_points, score_at
 from stages.evaluation.thinning import one_a_cube
-from stages.meshing.cleaning import face_normals
+from stages.surface.triangle_mesh import face_normals
 
 # Metres; the toolbox's own, by scene.
 TAU = {

@@ -13,7 +13,7 @@ from __future__ import annotations
 import torch
 
 from stages.neural.acceleration import takes_kernel
-from stages.neural.photos import Photos
+from stages.neural.training_photos import Photos
 
 # A patch is 7 x 7 pixels: this many steps to either side.
 HALF = 3

@@ -10,9 +10,9 @@ import torch
 from configs.params import TrainParams
 from stages.geometry.cameras import PinholeCameras
 from stages.neural.fields import Fields, points_at_a_time
-from stages.neural.photos import RayBatch
 from stages.neural.renderer import Renderer
 from stages.neural.sampling import SdfCache, intersect_unit_sphere
+from stages.neural.training_photos import RayBatch
 
 _RAYS = 4096  # rendered at a time
 

@@ -14,11 +14,11 @@ from configs.params import TrainParams
 from stages.neural import reflection, schedules
 from stages.neural.acceleration import fixed_shapes
 from stages.neural.fields import BackgroundNetwork, Fields
-from stages.neural.photos import RayBatch
 from stages.neural.proposal import proposal_distances
 from stages.neural.rendering import composite, rendering_weights, weights_from_optical_depth
 from stages.neural.sampling import SdfCache, importance_distances, stratified
 from stages.neural.schedules import Moment
+from stages.neural.training_photos import RayBatch
 
 # Samples that weigh less than this get no colour: together they change a pixel by less than one grey level.
 _COLOR_THRESHOLD = 2e-4

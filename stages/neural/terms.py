@@ -17,10 +17,10 @@ from configs.params import TrainParams
 from stages.neural import consistency, losses, schedules, visibility
 from stages.neural.acceleration import first_rows
 from stages.neural.fields import Fields, points_at_a_time
-from stages.neural.photos import Photos
 from stages.neural.renderer import OPAQUE, Rendered
 from stages.neural.sampling import SdfCache
 from stages.neural.schedules import Moment
+from stages.neural.training_photos import Photos
 
 # Samples that weigh more than this count as near the surface for the relaxed Eikonal term.
 _NEAR_SURFACE_WEIGHT = 0.01

@@ -15,13 +15,13 @@ from stages.neural import losses, schedules
 from stages.neural.acceleration import is_mixed, short_products
 from stages.neural.encodings import Frequencies, HashGrid
 from stages.neural.fields import Fields, FieldShape, points_at_a_time
-from stages.neural.photos import Photos, RayBatch
 from stages.neural.proposal import interlevel_loss, sample_edges, updates_now
 from stages.neural.renderer import Rendered, Renderer
 from stages.neural.sampling import SdfCache
 from stages.neural.schedules import Moment
 from stages.neural.sightings import Sightings, sighting_loss
 from stages.neural.terms import Terms
+from stages.neural.training_photos import Photos, RayBatch
 
 # The regression to a hull before training: long enough for an error of about a cell of its grid.
 HULL_STEPS, HULL_POINTS = 200, 2048

@@ -16,8 +16,8 @@ import torch
 
 from stages.errors import ReconstructionError, SystemRequirementError
 from stages.neural.acceleration import takes_kernel
-from stages.neural.photos import Photos
 from stages.neural.sampling import SdfCache, free_outside
+from stages.neural.training_photos import Photos
 
 # Paper: sharpness of the sigmoid in eq. sdf_visibility, per scene unit, and the visibility from which a view counts.
 SHARPNESS = 100.0

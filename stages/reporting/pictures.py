@@ -49,7 +49,7 @@ def jpeg_uri(image: np.ndarray, quality: int = 85) -> str:
 
 def draw_stills(atlas: AtlasMesh, texture: np.ndarray, up: np.ndarray) -> list[np.ndarray]:
     """The model from four sides: with its texture, then its shape alone."""
-    from stages.meshing.rendering import render_textured, turntable
+    from stages.drawing.rendering import render_textured, turntable
 
     views = turntable(atlas.vertices, up, 4, STILL_SIDE, STILL_SIDE)
     grey = np.full((1, 1, 3), 205, dtype=np.uint8)
@@ -62,7 +62,7 @@ def describe_provenance(path: Path) -> dict[str, Any] | None:
     """The provenance map in colours and the shares of the charts' texels; None where it is missing."""
     import cv2
 
-    from stages.meshing.baking import Provenance
+    from stages.texture.baking import Provenance
 
     kinds = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) if path.exists() else None
     if kinds is None:

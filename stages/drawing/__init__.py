@@ -1,0 +1,1 @@
+"""Meshes to pixels: rasteriser, pictures, and how they meet photos. Arrays in, arrays out."""

@@ -1,0 +1,118 @@
+"""A small software renderer, to look at textured meshes: turntable stills for reports, documentation and
+tests."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from stages.drawing.rasterizing import NO_FACE, corner_weights, projected, rasterize
+from stages.geometry.cameras import PinholeCameras
+
+BACKGROUND = (255, 255, 255)
+
+
+def look_at(
+    eye: np.ndarray, target: np.ndarray, up: np.ndarray, width: int, height: int, fov_deg: float = 35.0
+) -> PinholeCameras:
+    """One camera at `eye` looking at `target`; `fov_deg` is the vertical field of view."""
+    forward = (target - eye) / np.linalg.norm(target - eye)
+    right = np.cross(forward, up)
+    if np.linalg.norm(right) < 1e-6:  # looking straight up or down: any right will do
+        right = np.cross(forward, np.eye(3)[np.argmin(np.abs(forward))])
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    focal = 0.5 * height / np.tan(np.radians(fov_deg) / 2)
+    return PinholeCameras(
+        names=("view",),
+        sizes=np.array([[width, height]]),
+        intrinsics=np.array([[[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]], dtype=np.float64),
+        cam_from_scene=np.concatenate([rotation, -(rotation @ eye)[:, None]], 1)[None],
+    )
+
+
+def turntable(
+    vertices: np.ndarray,
+    up: np.ndarray,
+    count: int = 4,
+    width: int = 480,
+    height: int = 480,
+    elevation_deg: float = 20.0,
+    fov_deg: float = 35.0,
+) -> list[PinholeCameras]:
+    """`count` cameras around the vertices' bounding sphere, evenly spaced about `up`, each seeing all of
+    it."""
+    up = up / np.linalg.norm(up)
+    center = (vertices.min(0) + vertices.max(0)) / 2
+    radius = max(float(np.linalg.norm(vertices - center, axis=1).max()), 1e-9)
+    side = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
+    side /= np.linalg.norm(side)
+    ahead = np.cross(up, side)
+    distance = 1.03 * radius / np.sin(np.radians(fov_deg) / 2) * max(1.0, height / width)
+    elevation = np.radians(elevation_deg)
+    views = []
+    for angle in np.linspace(0, 2 * np.pi, count, endpoint=False):
+        direction = np.cos(elevation) * (np.cos(angle) * side + np.sin(angle) * ahead) + np.sin(elevation) * up
+        views.append(look_at(center + distance * direction, center, up, width, height, fov_deg))
+    return views
+
+
+def sample_texture(texture: np.ndarray, uvs: np.ndarray) -> np.ndarray:
+    """Bilinear colours [P, C] float32 of `texture` [H, W, C] at UVs [P, 2] (origin bottom-left, clamped at
+    the border)."""
+    height, width = texture.shape[:2]
+    x = np.clip(uvs[:, 0] * width - 0.5, 0, width - 1)
+    y = np.clip((1.0 - uvs[:, 1]) * height - 0.5, 0, height - 1)
+    x0, y0 = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
+    x1, y1 = np.minimum(x0 + 1, width - 1), np.minimum(y0 + 1, height - 1)
+    fx, fy = (x - x0)[:, None].astype(np.float32), (y - y0)[:, None].astype(np.float32)
+    top = texture[y0, x0] * (1 - fx) + texture[y0, x1] * fx
+    bottom = texture[y1, x0] * (1 - fx) + texture[y1, x1] * fx
+    return (top * (1 - fy) + bottom * fy).astype(np.float32)
+
+
+def render_textured(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    uvs: np.ndarray,
+    texture: np.ndarray,
+    camera: PinholeCameras,
+    normals: np.ndarray | None = None,
+    supersample: int = 2,
+    background: tuple[int, int, int] = BACKGROUND,
+) -> np.ndarray:
+    """Draw a textured mesh.
+
+    Args:
+        vertices, faces, uvs: [V, 3], [F, 3], [V, 2].
+        texture: [S, S, 3] uint8, row 0 at v = 1. A [1, 1, 3] texture with `normals` gives a plain shaded
+            view.
+        camera: one camera (the first is used).
+        normals: [V, 3]; where given, a headlight shades the colours. Otherwise the texture is shown as it is.
+        supersample: samples along a pixel's side.
+
+    Returns:
+        [H, W, 3] uint8.
+    """
+    width, height = (int(side) * supersample for side in camera.sizes[0])
+    xy, inverse_depth = projected(camera, 0, vertices)
+    xy = xy * supersample
+    face_map, _ = rasterize(xy, inverse_depth, faces, width, height)
+    image = np.empty((height * width, 3), dtype=np.float32)
+    image[:] = background
+    hit = np.flatnonzero(face_map.ravel() != NO_FACE)
+    if len(hit):
+        face_ids = face_map.ravel()[hit]
+        centers = np.stack([hit % width, hit // width], 1) + 0.5
+        weights = corner_weights(xy, inverse_depth, faces, face_ids, centers)
+        corners = faces[face_ids]
+        colors = sample_texture(texture, np.einsum("pc,pcd->pd", weights, uvs[corners]))
+        if normals is not None:
+            shading = np.einsum("pc,pcd->pd", weights, normals[corners])
+            shading /= np.maximum(np.linalg.norm(shading, axis=1, keepdims=True), 1e-12)
+            towards = camera.centers[0] - np.einsum("pc,pcd->pd", weights, vertices[corners])
+            towards /= np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-12)
+            facing = np.abs((shading * towards).sum(1, keepdims=True))
+            colors = colors * (0.35 + 0.65 * facing)
+        image[hit] = colors
+    image = image.reshape(height // supersample, supersample, width // supersample, supersample, 3).mean((1, 3))
+    return np.clip(image + 0.5, 0, 255).astype(np.uint8)

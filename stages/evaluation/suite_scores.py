@@ -1,0 +1,97 @@
+"""Scores of one benchmark result, by the protocol of its suite: the mesh against the truth, drawings against photos."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from stages import artifacts
+from stages.engine.workspace import Workspace
+from stages.evaluation import against_truth
+from stages.evaluation.comparison import read_mesh
+from stages.evaluation.known_object import score_mesh
+from stages.evaluation.suites.scene import SuiteScene, Truth
+from stages.evaluation.test_photos import TestPhotos, score_test_views
+from stages.geometry.similarity import Similarity
+
+
+def score_result(
+    scene: SuiteScene, workspace: Workspace, mesh: Path | None, fresh: set[str], device: str
+) -> dict[str, Any]:
+    """All that can be scored of a scene: {"mesh": ..., "views": ...}, each only where there is something to score by.
+
+    Args:
+        mesh: in the frame of the poses; None: there is none.
+        fresh: stages of the workspace that are up to date; what a peer made has none.
+        device: to draw on.
+
+    Raises:
+        InputError: the truth cannot be read, or the mesh not be scored.
+    """
+    scores = {}
+    if scene.truth is not None and mesh is not None:
+        scores["mesh"] = score_surface(scene.truth, mesh, workspace)
+    if scene.views is not None and "train" in fresh:
+        photos = TestPhotos(scene.views, workspace, scene.masks)
+        scores["views"] = score_test_views(photos, workspace, fresh, device)
+    return scores
+
+
+# ---------------------------------------------------------------- the mesh
+def result_mesh(workspace: Workspace, fresh: set[str], out: Path) -> Path | None:
+    """Write the clean mesh of a workspace, in the frame of its poses, to `out`; None where that stage was not run.
+
+    Args:
+        fresh: stages that are up to date.
+    """
+    if "cleanup" not in fresh:
+        return None
+    vertices, faces = artifacts.load_mesh(workspace.stage_folder("cleanup"))
+    scene = artifacts.load_scene(workspace.stage_folder("undistort"))
+    _write(scene.poses_from_world.compose(scene.world_from_scene), (vertices, faces), out)
+    return out
+
+
+def posed_mesh(workspace: Workspace, mesh: Path, out: Path) -> Path:
+    """Write a mesh that is in the world frame of a workspace, in the frame of its poses, to `out`."""
+    scene = artifacts.load_scene(workspace.stage_folder("undistort"))
+    _write(scene.poses_from_world, read_mesh(mesh), out)
+    return out
+
+
+def _write(poses_from_mesh: Similarity, mesh: tuple[np.ndarray, np.ndarray], out: Path) -> None:
+    import trimesh
+
+    trimesh.Trimesh(poses_from_mesh.apply(mesh[0].astype(np.float64)), mesh[1], process=False).export(out)
+
+
+def score_surface(truth: Truth, mesh: Path, workspace: Workspace) -> dict[str, Any]:
+    """The numbers of a mesh (in the frame of the poses) by the protocol of `truth`.
+
+    Raises:
+        InputError: the truth cannot be read, or the mesh not be scored.
+    """
+    if truth.protocol == "known":
+        return dict(score_mesh(mesh, artifacts.model_path(workspace.stage_folder("sfm")), truth.folder))
+    if truth.protocol == "dtu":
+        return _without_paths(against_truth.evaluate_dtu(mesh, truth.folder, truth.scan))
+    if truth.protocol == "glossy":
+        return _without_paths(against_truth.evaluate_glossy(mesh, truth.folder, truth.split))
+    return _score_depth_maps(mesh, truth.folder)
+
+
+def _without_paths(found: dict[str, Any]) -> dict[str, Any]:
+    """Only what was measured: results are passed on, and folders here mean nothing elsewhere."""
+    return {key: value for key, value in found.items() if key not in ("predicted", "truth", "done")}
+
+
+def _score_depth_maps(mesh: Path, folder: Path) -> dict[str, Any]:
+    """Against the points of BlendedMVS' rendered depth maps; distances also in percent of their extent."""
+    from stages.evaluation.scenes import blended_score
+    from stages.evaluation.suites.depth_maps import true_points
+    from stages.evaluation.surfaces import Surface
+
+    scores = blended_score(Surface(*read_mesh(mesh)), Surface(true_points(folder)))
+    return {**scores.as_dict(), "chamfer_percent": 100 * scores.chamfer / scores.extent}

@@ -1,0 +1,103 @@
+"""What a suite says of a scene: its photos, poses and masks, the photos to judge by, and the truth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from stages.capture.photo_reading import PHOTO_SUFFIXES
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """How the user wants scenes to be read.
+
+    Attributes:
+        masks: whether to use the masks that come with the photos; most papers' figures are without. An alpha channel
+            is a mask in any case.
+        hold_out: keep every n-th photo back where the suite has no test photos of its own; 0: none.
+        truth: folder of the evaluation data, where it does not lie with the photos.
+    """
+
+    masks: bool = False
+    hold_out: int = 0
+    truth: Path | None = None
+
+
+@dataclass(frozen=True)
+class TestViews:
+    """Photos to judge by, which no stage sees.
+
+    Attributes:
+        folder: of the photos. names: relative to it, posix.
+        poses: what `stages.posing.reading.read_poses` takes.
+        background: how the suite's PSNR counts what is not the object: "white", or as "photo" shows it.
+    """
+
+    __test__ = False  # pytest takes the name for a test
+
+    folder: Path
+    names: tuple[str, ...]
+    poses: Path
+    background: Literal["white", "photo"] = "photo"
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What the mesh is held against.
+
+    Attributes:
+        protocol: by which a suite's papers score, see `stages.evaluation.suite_scores`.
+        folder: that the protocol reads.
+        scan: the number DTU gives the scene.
+        split: NeRO's file that names the test views; None: all are.
+    """
+
+    protocol: Literal["known", "dtu", "glossy", "depth maps"]
+    folder: Path
+    scan: int = 0
+    split: Path | None = None
+
+
+@dataclass(frozen=True)
+class SuiteScene:
+    """One scene.
+
+    Attributes:
+        name: as the paper's tables call it, for those they have.
+        photos: folder. poses, masks: None where they are found or not used.
+        left_out: photos (relative to `photos`) that no stage sees.
+        views, truth: what can be scored.
+        lacking: what cannot be scored and why, a sentence each.
+    """
+
+    name: str
+    photos: Path
+    poses: Path | None = None
+    masks: Path | None = None
+    left_out: tuple[str, ...] = ()
+    views: TestViews | None = None
+    truth: Truth | None = None
+    lacking: tuple[str, ...] = ()
+
+
+def photo_names(folder: Path) -> list[str]:
+    """Photos directly in `folder`, sorted."""
+    return sorted(
+        path.name
+        for path in folder.iterdir()
+        if path.suffix.lower() in PHOTO_SUFFIXES and path.is_file() and not path.name.startswith(".")
+    )
+
+
+def every_nth(folder: Path, names: list[str], poses: Path, every: int) -> TestViews | None:
+    """Every n-th photo from the first, as Mip-NeRF 360 and LLFF do, as test views; None where `every` is 0."""
+    return TestViews(folder, tuple(names[::every]), poses) if every else None
+
+
+def folders_with(folder: Path, *needed: str) -> list[Path]:
+    """`folder` itself where it has all of the files or folders `needed`, else those of its folders that have."""
+    places = [folder, *sorted(path for path in folder.iterdir() if path.is_dir())]
+    found = [place for place in places if all((place / name).exists() for name in needed)]
+    return found[:1] if folder in found else found

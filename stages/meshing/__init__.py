@@ -1,1 +1,0 @@
-"""Meshes as arrays and fields as callables: isosurface, cleaning, atlas, baking. No stage, no path."""

@@ -1,0 +1,59 @@
+"""How well photos that were left out of the training are met.
+
+Shapes: I photos, R rays.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from math import ceil, sqrt
+
+import torch
+
+from stages.neural.training_photos import Photos, RayBatch
+
+PIXELS = 20_000  # of a photo at most; its PSNR barely moves with more
+_RAYS = 4096  # rendered at a time
+_SMALLEST_ERROR = 1e-10  # a photo met exactly has 100 dB
+
+
+def left_out(num_photos: int, every: int) -> torch.Tensor:
+    """Which photos [I] bool are left out: i % every == every // 2, none where `every` is 0."""
+    if every == 0:
+        return torch.zeros(num_photos, dtype=torch.bool)
+    return torch.arange(num_photos) % every == every // 2
+
+
+@torch.no_grad()
+def photo_psnr(photos: Photos, image: int, render: Callable[[RayBatch], torch.Tensor]) -> float | None:
+    """PSNR in dB of one photo: -10 log10 of the mean squared error over pixels and channels.
+
+    Counted are pixels on a regular grid whose rays cross the region of interest, on the mask where there is one.
+
+    Args:
+        render: gives the colours [R, 3] of rays.
+
+    Returns:
+        None where no pixel counts.
+    """
+    width, height = photos.sizes[image].tolist()
+    stride = max(1, ceil(sqrt(width * height / PIXELS)))
+    y, x = torch.meshgrid(
+        torch.arange(stride // 2, height, stride), torch.arange(stride // 2, width, stride), indexing="ij"
+    )
+    grid = torch.stack([x, y], 2).view(-1, 2).to(photos.device)
+    if photos.masks is not None:
+        grid = grid[photos.masks[photos.first[image] + grid[:, 1] * width + grid[:, 0]] > 127]
+    total, count = 0.0, 0
+    for pixels in grid.float().split(_RAYS):
+        batch = photos.rays(torch.full((len(pixels),), image, device=photos.device), pixels)
+        error = ((render(batch).clamp(0, 1) - batch.colors) ** 2).mean(1)
+        total, count = total + float(error.sum()), count + len(error)
+    return -10 * float(torch.tensor(max(total / count, _SMALLEST_ERROR)).log10()) if count else None
+
+
+def held_out_psnr(photos: Photos, render: Callable[[RayBatch], torch.Tensor]) -> float | None:
+    """Mean PSNR in dB of the photos that are not for training, None where there are none. See `photo_psnr`."""
+    held_out = torch.nonzero(~photos.training).squeeze(1).tolist()
+    values = [value for image in held_out if (value := photo_psnr(photos, image, render)) is not None]
+    return sum(values) / len(values) if values else None

@@ -1,0 +1,316 @@
+"""From what the user said to a finished workspace: which folder, photos, settings and device, then the run."""
+
+from __future__ import annotations
+
+import ctypes
+import logging
+import os
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from configs.load import load_config
+from configs.params import Config
+from stages import artifacts
+from stages.capture.listing import is_video
+from stages.engine.run_log import log_to_file
+from stages.engine.runner import Listener, StageOutcome, run_pipeline
+from stages.engine.stage import Stage
+from stages.engine.workspace import Workspace
+from stages.errors import ConfigError, InputError, SystemRequirementError
+from stages.posing.reading import locate_poses, masks_beside
+from stages.preflight import Preflight, in_short, preflight
+
+log = logging.getLogger(__name__)
+
+_TIME = re.compile(r"^(?:(?P<h>[\d.]+)h)?(?:(?P<m>[\d.]+)m(?:in)?)?(?:(?P<s>[\d.]+)s)?$")
+
+
+@dataclass(frozen=True)
+class Request:
+    """What the user asked for; None is "not said".
+
+    Attributes:
+        photos: folder of photos, or a video; a workspace that was run before knows its own.
+        workspace: folder; default `<photos' name>_hineus` here.
+        masks: folder of masks; kept from the last run while the photos are the same, unless `no_masks`.
+        poses: file or folder of known poses; kept like the masks, unless `no_poses`.
+        preset, config, sets: layers of settings. With neither preset nor config, a workspace keeps its own.
+        from_stage, until, force: see `run_pipeline`.
+        device: "auto", "cpu" or "cuda".
+        workers: CPU threads; default all that this process may use.
+        time: training budget, for example "5m".
+        hold_out: percent of the photos to keep back from training and texture.
+        no_ground: cut off the ground; "not said" leaves the settings as they are.
+        watertight: a closed mesh; "not said" leaves the settings as they are.
+    """
+
+    photos: Path | None = None
+    workspace: Path | None = None
+    masks: Path | None = None
+    no_masks: bool = False
+    poses: Path | None = None
+    no_poses: bool = False
+    preset: str | None = None
+    config: Path | None = None
+    sets: Sequence[str] = ()
+    from_stage: str | None = None
+    until: str | None = None
+    force: Sequence[str] = ()
+    device: str = "auto"
+    workers: int | None = None
+    time: str | None = None
+    hold_out: float | None = None
+    no_ground: bool = False
+    watertight: bool = False
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """A finished run: where it lies, what each stage did, and what it was done with."""
+
+    workspace: Workspace
+    config: Config
+    preset: str | None
+    device: str
+    workers: int
+    outcomes: tuple[StageOutcome, ...]
+
+    @property
+    def glb(self) -> Path | None:
+        return _existing(artifacts.glb_path(self.workspace.stage_folder("export")))
+
+    @property
+    def report(self) -> Path | None:
+        return _existing(artifacts.report_path(self.workspace.stage_folder("report")))
+
+
+def reconstruct(request: Request, pipeline: Sequence[Stage], listener: Listener | None = None) -> Reconstruction:
+    """Do what was asked.
+
+    Raises:
+        HineusError: a child by what the user can do.
+    """
+    if request.workers is not None:
+        # Read when the heavy libraries load, which is inside the stages.
+        os.environ["OMP_NUM_THREADS"] = str(request.workers)
+    workspace = Workspace.open(choose_folder(request), create=True)
+    sources = choose_sources(request, workspace)
+    preset, config = choose_config(request, workspace)
+    device = choose_device(request.device)
+    workers = request.workers or available_cores()
+    with workspace.lock(), log_to_file(workspace.log_path):
+        photos = sources["photos"]
+        if photos is not None and not workspace.stage_folder("ingest").exists():
+            _tell_preflight(preflight(photos, sources["masks"], workspace.root, config, device, workers))
+        log.debug("preset %s, device %s, %d workers, %s", preset, device, workers, sources)
+        outcomes = run_pipeline(
+            pipeline,
+            workspace,
+            config,
+            sources,
+            device=device,
+            workers=workers,
+            from_stage=request.from_stage,
+            until=request.until,
+            force=request.force,
+            listener=listener,
+            preset=preset,
+        )
+    return Reconstruction(workspace, config, preset, device, workers, tuple(outcomes))
+
+
+def check_photos(request: Request) -> Preflight:
+    """Look at the photos of a run that is not started.
+
+    Raises:
+        HineusError: a child by what the user can do.
+    """
+    photos = request.photos
+    assert photos is not None, "the command line demands it"
+    sets = [*request.sets, *([f"train.minutes={minutes(request.time)}"] if request.time else [])]
+    config = load_config(request.preset or default_preset(), request.config, sets)
+    workers = request.workers or available_cores()
+    return preflight(photos, request.masks, choose_folder(request), config, choose_device(request.device), workers)
+
+
+def _tell_preflight(done: Preflight) -> None:
+    """In short. A no-go does not stop the run: estimates may be wrong, and the stages say what they need."""
+    log.info("%s", in_short(done))
+    for line in (*done.refusals, *done.shortages, *done.warnings):
+        log.warning("%s", line)
+
+
+def choose_folder(request: Request) -> Path:
+    """The workspace's folder: the one named, or one named after the photos, or here if here is one.
+
+    Raises:
+        ConfigError: nothing says which.
+    """
+    if request.workspace is not None:
+        return request.workspace
+    if request.photos is not None:
+        photos = request.photos.resolve()
+        return Path.cwd() / f"{photos.stem if is_video(photos) else photos.name}_hineus"
+    if (Path.cwd() / "workspace.json").exists():
+        return Path.cwd()
+    raise ConfigError(
+        "Neither a folder of photos nor a workspace is given.",
+        "Try `hineus run PHOTOS`, or `--workspace DIR` for one that exists.",
+    )
+
+
+def choose_sources(request: Request, workspace: Workspace) -> dict[str, Path | None]:
+    """Photos, masks and poses: those given, else those the workspace was last run with.
+
+    Masks that the poses' format comes with are used, too.
+
+    Raises:
+        InputError: there are none, a given one is no folder, or the workspace lies inside the photos.
+    """
+    known = workspace.record.sources
+    for name, given in (("photos", request.photos), ("masks", request.masks)):
+        if given is not None and not given.exists():
+            raise InputError(f"There is no {name} folder {given}.", "Check the path with `ls`.")
+        if given is not None and not given.is_dir() and not (name == "photos" and is_video(given)):
+            raise InputError(
+                f"{given} is a file; a folder of {name}{' or a video' if name == 'photos' else ''} is needed.",
+                f"Name the folder it is in: {given.absolute().parent}",
+            )
+    recorded = known.get("photos")
+    photos = request.photos.resolve() if request.photos else Path(recorded) if recorded else None
+    if photos is None:
+        raise InputError(
+            f"The workspace {workspace.root} does not know its photos yet.",
+            f"Name them: `hineus run PHOTOS --workspace {workspace.root}`.",
+        )
+    if workspace.root == photos or photos in workspace.root.parents:
+        raise InputError(
+            f"The workspace {workspace.root} lies inside the photo folder {photos}, so it would be read as photos.",
+            "Choose a folder outside with `--workspace DIR`.",
+        )
+    masks = request.masks.resolve() if request.masks else None
+    poses = locate_poses(request.poses).resolve() if request.poses else None
+    if str(photos) == recorded:
+        masks = masks or _remembered(known.get("masks"), request.no_masks)
+        poses = poses or _remembered(known.get("poses"), request.no_poses)
+    if masks is None and request.poses and poses is not None and not request.no_masks:
+        masks = masks_beside(poses)
+    return {"photos": photos, "masks": masks, "poses": poses}
+
+
+def _remembered(path: str | None, forget: bool) -> Path | None:
+    return Path(path) if path and not forget else None
+
+
+def choose_config(request: Request, workspace: Workspace) -> tuple[str | None, Config]:
+    """The preset's name and the settings.
+
+    A workspace goes on with the settings it was last run with, `--set` on top, until a preset or a file is named.
+
+    Raises:
+        ConfigError: see `load_config`.
+    """
+    sets = list(request.sets)
+    if request.time is not None:
+        sets.append(f"train.minutes={minutes(request.time)}")
+    if request.hold_out is not None:
+        sets.append(f"train.holdout={every_nth(request.hold_out)}")
+    if request.no_ground:
+        sets.append("cleanup.remove_ground=true")
+    if request.watertight:
+        sets.append("cleanup.keep_closed=true")
+    kept = request.preset is None and request.config is None and workspace.config_path.exists()
+    if not kept:
+        named = request.preset or default_preset()
+        return named, load_config(named, request.config, sets)
+    preset = workspace.record.preset
+    log.info("settings: those of the last run (preset %s); name a --preset to start anew", preset or "none")
+    try:
+        return preset, load_config(None, workspace.config_path, sets)
+    except ConfigError as error:
+        if str(workspace.config_path) not in error.message:
+            raise
+        raise ConfigError(
+            error.message, "These are the settings of the last run. Name a preset to start anew: `--preset cpu`."
+        ) from error
+
+
+def choose_device(name: str) -> str:
+    """ "cpu" or "cuda".
+
+    Raises:
+        ConfigError: it is neither of these nor "auto".
+        SystemRequirementError: CUDA was asked for and is not there.
+    """
+    if name not in ("auto", "cpu", "cuda"):
+        raise ConfigError(f"There is no device '{name}'.", "Choose `--device auto`, `cpu` or `cuda`.")
+    if name == "cuda" and not has_cuda():
+        raise SystemRequirementError(
+            "No CUDA device can be used here.", "Run `hineus doctor` to see why, or use `--device cpu`."
+        )
+    return "cuda" if name == "cuda" or (name == "auto" and has_cuda()) else "cpu"
+
+
+def default_preset() -> str:
+    return "gpu" if has_cuda() else "cpu"
+
+
+def has_cuda() -> bool:
+    """Whether PyTorch can use a CUDA device; quick where there is no driver."""
+    try:
+        ctypes.CDLL("libcuda.so.1")
+    except OSError:
+        return False
+    import torch
+
+    return bool(torch.cuda.is_available())
+
+
+def available_cores() -> int:
+    """CPU cores this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def minutes(text: str) -> float:
+    """ "90s", "5m", "1h30m" or "5" (minutes) as minutes.
+
+    Raises:
+        ConfigError: it is none of these, or not positive.
+    """
+    refusal = ConfigError(f"--time {text} is no length of time.", "Try `--time 5m`, `--time 90s` or `--time 1h30m`.")
+    found = _TIME.match(text.strip())
+    try:
+        if found and any(found.groups()):
+            hours, mins, seconds = (float(found[unit] or 0) for unit in "hms")
+            total = 60 * hours + mins + seconds / 60
+        else:
+            total = float(text)
+    except ValueError:
+        raise refusal from None
+    if not 0 < total < float("inf"):
+        raise refusal
+    return total
+
+
+def every_nth(percent: float) -> int:
+    """Which photos are kept back, for `train.holdout`: 5 percent is every 20th; 0 is none.
+
+    Raises:
+        ConfigError: it is neither 0 nor from 1 to 50.
+    """
+    if percent == 0:
+        return 0
+    if not 1 <= percent <= 50:
+        raise ConfigError(
+            f"--hold-out {percent:g}: the part of the photos must be from 1 to 50 percent, or 0 for none.",
+            "Try `--hold-out 5`, which is every 20th photo.",
+        )
+    return round(100 / percent)
+
+
+def _existing(path: Path) -> Path | None:
+    return path if path.exists() else None

@@ -1,0 +1,1 @@
+"""The shape: from a field to triangles, and what is done to triangles. Arrays and callables; no stage, no path."""

@@ -1,0 +1,291 @@
+"""Photos to texture: visibility, gains, a robust mean in two bands, and what no photo saw.
+
+1. Each photo gets a depth map of the mesh, a trust map that fades near depth edges, and two bands (`views`).
+2. A sample of texels, seen by several photos, gives the gains (`gains`) and tells blurred photos (`sharpness`).
+3. Each texel collects its best views (`observing`): low band = robust mean of many, high band = robust mean of those
+   that resolve the most. Weights change smoothly over the surface and fade out before a view leaves the set, so
+   there are no borders between photos, and no seams to level.
+4. Texels no photo saw take the colour field's answer, shifted to meet the photos (`filling`); then the
+   charts are padded (`padding`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from enum import IntEnum
+from functools import partial
+
+import numpy as np
+
+from stages.artifacts import AtlasMesh
+from stages.drawing.rasterizing import Texels, surface_points
+from stages.geometry.cameras import PinholeCameras
+from stages.surface.triangle_mesh import face_areas
+from stages.texture.filling import face_neighbors, harmonic_offsets, vertex_means
+from stages.texture.gains import solve_gains
+from stages.texture.observing import blend_texels, gather_texels, sample_points
+from stages.texture.padding import pad_charts
+from stages.texture.photo_views import BYTES_PER_PIXEL, View, prepare_view
+from stages.texture.sharpness import BLURRED, sharpness_of_photos
+
+# (photo index) -> [H, W, 3] uint8 RGB and [H, W] bool mask or None.
+LoadPhoto = Callable[[int], tuple[np.ndarray, np.ndarray | None]]
+# (points [P, 3], normals [P, 3], unit view directions [P, 3] from camera to point) -> [P, 3] sRGB in [0, 1].
+ColorField = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
+Listener = Callable[[float, float, str], None]
+
+# Texels that take part in comparing photos.
+SAMPLES = 20_000
+# Texels blended at a time: the buffers take 16 bytes a texel and kept view. More texels go over the photos again.
+BAND_BYTES = 1 << 30
+# Prepared photos that stay in memory for the next pass; the others are made again.
+KEPT_BYTES = 1 << 30
+# Texels handed to a thread at a time.
+_CHUNK = 250_000
+# Photos made ready ahead of use.
+_MAX_AHEAD = 8
+
+
+class Provenance(IntEnum):
+    """Where a texel's colour came from; the values make a readable grey image."""
+
+    OUTSIDE = 0
+    PADDING = 64
+    FIELD = 128
+    PHOTO = 255
+
+
+@dataclass(frozen=True)
+class Baked:
+    """A texture and what is known about it.
+
+    Attributes:
+        base_color: [S, S, 3] uint8 sRGB, row 0 at v = 1.
+        provenance: [S, S] uint8 of `Provenance`.
+        gains: [N, 3] factor applied to each photo's channels.
+        numbers: counts and shares for people.
+    """
+
+    base_color: np.ndarray
+    provenance: np.ndarray
+    gains: np.ndarray
+    numbers: dict[str, float | int]
+
+
+def bake_texture(
+    atlas: AtlasMesh,
+    texels: Texels,
+    cameras: PinholeCameras,
+    load_photo: LoadPhoto,
+    color_field: ColorField,
+    views: int = 24,
+    detail: bool = True,
+    gain: bool = True,
+    diffuse: bool = False,
+    robust_sigma: float = 6.0,
+    workers: int = 1,
+    listener: Listener | None = None,
+) -> Baked:
+    """Bake photos into the texture of an atlas.
+
+    Args:
+        atlas: mesh with UVs, scene frame.
+        texels: the atlas rasterised, see `rasterizing.rasterize_atlas`.
+        cameras: N posed photos.
+        load_photo: gives photo and mask of a camera.
+        color_field: answers where no photo saw the surface.
+        views: photos that make a texel, the best ones.
+        detail: add the high band.
+        gain: compensate gains.
+        diffuse: count views that are brighter than the others less: see `observing.blend_texels`.
+        robust_sigma: colours further than this many robust standard deviations are rejected.
+        workers: threads.
+        listener: told (done, total, note).
+
+    Raises:
+        ValueError: the atlas covers no texel, or a photo is not of its camera's size.
+    """
+    tell = listener or (lambda done, total, note: None)
+    size, count, num_views = texels.size, len(texels), len(cameras)
+    if not count:
+        raise ValueError(f"expected charts covering texels of a {size}² texture, got none")
+    colors = np.zeros((count, 3), dtype=np.uint8)
+    seen_by = np.zeros(count, dtype=np.uint16)
+    per_band = max(BAND_BYTES // (16 * (views + 1)), _CHUNK)
+    bands = [slice(start, min(start + per_band, count)) for start in range(0, count, per_band)]
+    total = num_views * (1 + len(bands))
+    with ThreadPoolExecutor(max_workers=max(1, workers)) as pool:
+        prepare = _Prepare(atlas, cameras, load_photo, _texel_side(atlas, count))
+        gains, sharpness = _compare(atlas, texels, _prefetch(pool, prepare, num_views, workers), num_views, tell, total)
+        if not gain:
+            gains = np.ones((num_views, 3))
+        blend = partial(blend_texels, detail=detail, robust_sigma=robust_sigma, diffuse=diffuse)
+        for number, band in enumerate(bands):
+            begun = num_views * (1 + number)
+            _blend(
+                pool, *surface_points(atlas, texels.face_ids[band], texels.corner[band]), gains, sharpness,
+                _prefetch(pool, prepare, num_views, workers), views, blend, colors[band], seen_by[band],
+                partial(_tell_blending, tell, begun, total),
+            )  # fmt: skip
+        prepare.kept.clear()
+
+    seen = seen_by > 0
+    _fill_unseen(colors, seen, atlas, texels, color_field)
+    image, inside = texels.paint(colors)
+    filled, padded = pad_charts(image, inside)
+    origin = np.where(seen, Provenance.PHOTO, Provenance.FIELD).astype(np.uint8)
+    provenance = texels.paint(origin[:, None])[0][..., 0]
+    provenance[padded] = Provenance.PADDING
+    tell(total, total, "done")
+    return Baked(
+        base_color=filled,
+        provenance=provenance,
+        gains=gains,
+        numbers={
+            "texture_size": size,
+            "texels": count,
+            "coverage": round(count / size**2, 4),
+            "seen_share": round(float(seen.mean()), 4),
+            "filled_share": round(float(1 - seen.mean()), 4),
+            "mean_views": round(float(seen_by[seen].mean()), 2) if seen.any() else 0.0,
+            "gain_min": round(float(gains.min(initial=1.0)), 4),
+            "gain_max": round(float(gains.max(initial=1.0)), 4),
+            "blurred_photos": int((sharpness < BLURRED).sum()),
+        },
+    )
+
+
+def _tell_blending(tell: Listener, begun: int, total: int, done: int) -> None:
+    tell(begun + done, total, "blending photos")
+
+
+def _texel_side(atlas: AtlasMesh, count: int) -> float:
+    """Mean side of a texel on the surface, scene units."""
+    return float(np.sqrt(face_areas(atlas.vertices, atlas.faces).sum() / count))
+
+
+class _Prepare:
+    """Makes photos ready for sampling, and keeps the first ones for the next pass."""
+
+    def __init__(self, atlas: AtlasMesh, cameras: PinholeCameras, load_photo: LoadPhoto, texel_side: float) -> None:
+        self.atlas, self.cameras, self.load_photo, self.texel_side = atlas, cameras, load_photo, texel_side
+        pixels = np.cumsum(cameras.sizes[:, 0] * cameras.sizes[:, 1])
+        self.keep = int(np.searchsorted(pixels * BYTES_PER_PIXEL, KEPT_BYTES, side="right"))
+        self.kept: dict[int, View] = {}
+
+    def __call__(self, index: int) -> View:
+        if index in self.kept:
+            return self.kept[index]
+        photo, mask = self.load_photo(index)
+        view = prepare_view(self.cameras, index, photo, mask, self.atlas.vertices, self.atlas.faces, self.texel_side)
+        if index < self.keep:
+            self.kept[index] = view
+        return view
+
+
+def _prefetch(pool: ThreadPoolExecutor, prepare: Callable[[int], View], count: int, ahead: int) -> Iterator[View]:
+    """Views 0..count-1 in order, `ahead` of them (at most `_MAX_AHEAD`) being made in the background."""
+    waiting: list[Future[View]] = []
+    ahead = min(ahead, _MAX_AHEAD)
+    submitted = 0
+    for _ in range(count):
+        while submitted < count and len(waiting) <= ahead:
+            waiting.append(pool.submit(prepare, submitted))
+            submitted += 1
+        yield waiting.pop(0).result()
+
+
+def _compare(
+    atlas: AtlasMesh, texels: Texels, prepared: Iterator[View], num_views: int, tell: Listener, total: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Gains [N, 3] and sharpness [N] of the photos, from a sample of the texels."""
+    rng = np.random.default_rng(0)
+    chosen = rng.choice(len(texels), size=min(SAMPLES, len(texels)), replace=False)
+    points, normals = surface_points(atlas, texels.face_ids[chosen], texels.corner[chosen])
+    weights = np.zeros((num_views, len(chosen)), dtype=np.float32)
+    colors = np.zeros((num_views, len(chosen), 3), dtype=np.float32)
+    lows = np.zeros_like(colors)
+    for index, view in enumerate(prepared):
+        for image, answer in ((view.low, lows), (view.photo, colors)):
+            sample_points(
+                points, normals, view.matrix, view.center, view.focal, view.inverse_depth, view.confidence, image,
+                weights[index], answer[index],
+            )  # fmt: skip
+        tell(index + 1, total, "comparing photos")
+    # From the photos themselves: their low bands mix neighbouring colours, more so in slanted views.
+    gains = solve_gains(colors.transpose(1, 0, 2), weights.T)
+    return gains, sharpness_of_photos((colors - lows).mean(2).T, weights.T)
+
+
+def _blend(
+    pool: ThreadPoolExecutor,
+    points: np.ndarray,
+    normals: np.ndarray,
+    gains: np.ndarray,
+    sharpness: np.ndarray,
+    prepared: Iterator[View],
+    keep: int,
+    blend: Callable[..., None],
+    colors: np.ndarray,
+    seen_by: np.ndarray,
+    tell: Callable[[int], None],
+) -> None:
+    """Fill colors [T, 3] uint8 and the number of photos that see each texel [T]."""
+    count = len(points)
+    # One view more than is blended: the others' weights are measured against it.
+    best_weights = np.zeros((count, keep + 1), dtype=np.float32)
+    best_lows = np.zeros((count, keep + 1, 3), dtype=np.uint16)
+    best_highs = np.zeros((count, keep + 1, 3), dtype=np.int16)
+    chunks = [slice(start, min(start + _CHUNK, count)) for start in range(0, count, _CHUNK)]
+
+    def offer(view: View, index: int, part: slice) -> None:
+        gather_texels(
+            points[part], normals[part], view.matrix, view.center, view.focal, view.inverse_depth, view.confidence,
+            view.low, view.photo, gains[index], sharpness[index],
+            best_weights[part], best_lows[part], best_highs[part], seen_by[part],
+        )  # fmt: skip
+
+    for index, view in enumerate(prepared):
+        list(pool.map(partial(offer, view, index), chunks))
+        tell(index + 1)
+
+    def finish(part: slice) -> None:
+        blend(best_weights[part], best_lows[part], best_highs[part], colors=colors[part])
+
+    list(pool.map(finish, chunks))
+
+
+def _fill_unseen(
+    colors: np.ndarray, seen: np.ndarray, atlas: AtlasMesh, texels: Texels, color_field: ColorField
+) -> None:
+    """Give unseen texels the field's colour plus the offset that photos have from the field nearby. In
+    place."""
+    unseen = np.flatnonzero(~seen)
+    if not len(unseen):
+        return
+    num_faces = len(atlas.faces)
+    # A face's known offset: photo minus field at one of its seen texels would be noisy, so compare face
+    # means.
+    count = np.bincount(texels.face_ids, minlength=num_faces)
+    faces_seen = texels.face_ids[seen]
+    count_seen = np.bincount(faces_seen, minlength=num_faces)
+    known = (count_seen > 0) & (2 * count_seen >= count)
+    offsets = np.zeros((num_faces, 3))
+    if known.any():
+        sums = [np.bincount(faces_seen, colors[seen, c], minlength=num_faces) for c in range(3)]
+        photo_means = np.stack(sums, 1)[known] / count_seen[known, None]
+        ids = np.flatnonzero(known)
+        centers, center_normals = surface_points(atlas, ids, np.full((len(ids), 3), 1 / 3, dtype=np.float32))
+        offsets[ids] = photo_means - 255.0 * color_field(centers, center_normals, -center_normals)
+    spread = harmonic_offsets(known, offsets, face_neighbors(atlas.vertices, atlas.faces))
+    at_vertices = vertex_means(spread, atlas.vertices, atlas.faces)
+    for start in range(0, len(unseen), _CHUNK):
+        part = unseen[start : start + _CHUNK]
+        faces, corner = texels.face_ids[part], texels.corner[part]
+        points, normals = surface_points(atlas, faces, corner)
+        answer = 255.0 * color_field(points, normals, -normals)
+        for k in range(3):
+            answer = answer + corner[:, k, None] * at_vertices[atlas.faces[faces, k]]
+        colors[part] = np.clip(answer + 0.5, 0, 255).astype(np.uint8)

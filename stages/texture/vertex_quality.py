@@ -1,0 +1,155 @@
+"""How well each vertex of a textured mesh is known: seen by how many photos, how squarely, in how much detail, how
+far their colours disagree, and how much of the texture around it no photo saw.
+
+Shapes: V vertices, N photos.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numba import njit
+
+from stages.artifacts import AtlasMesh, VertexQuality
+from stages.drawing.rasterizing import Texels, depth_map
+from stages.geometry.cameras import PinholeCameras
+from stages.surface.triangle_mesh import face_areas
+from stages.texture.baking import Provenance
+from stages.texture.observing import sample_points
+
+# Keeps the colour covariance invertible where photos are nearly grey: one 8-bit level, squared.
+_COLOR_VARIANCE_FLOOR = 1.0
+
+
+def measure_quality(
+    atlas: AtlasMesh,
+    texels: Texels,
+    cameras: PinholeCameras,
+    load_photo: Callable[[int], tuple[np.ndarray, np.ndarray | None]],
+    provenance: np.ndarray,
+    gains: np.ndarray,
+    listener: Callable[[float, float], None] | None = None,
+) -> VertexQuality:
+    """Measures of each vertex over the photos that see it, with the visibility of the texture itself.
+
+    Args:
+        atlas: the final mesh, scene frame.
+        texels: its atlas rasterised, see `rasterizing.rasterize_atlas`.
+        cameras: N photos that the texture is made from.
+        load_photo: camera -> photo [H, W, 3] uint8 and mask [H, W] bool or None.
+        provenance: [S, S] uint8 of `baking.Provenance`.
+        gains: [N, 3] factors that make the photos agree.
+        listener: told (photos done, photos).
+    """
+    count, num_photos = len(atlas.vertices), len(cameras)
+    seen = np.zeros((num_photos, count), dtype=np.bool_)
+    colors = np.zeros((num_photos, count, 3), dtype=np.uint8)
+    facing = np.zeros(count, dtype=np.float32)
+    photo_density = np.zeros(count, dtype=np.float32)
+    moments = np.zeros((4, 4))  # of (1, r, g, b)
+    weights, sampled = np.zeros(count, dtype=np.float32), np.zeros((count, 3), dtype=np.float32)
+    for index in range(num_photos):
+        photo, mask = load_photo(index)
+        _, inverse_depth = depth_map(cameras, index, atlas.vertices, atlas.faces)
+        on_object = inverse_depth > 0 if mask is None else (inverse_depth > 0) & mask
+        K, center = cameras.intrinsics[index], cameras.centers[index]
+        matrix, focal = K @ cameras.cam_from_scene[index], float(np.sqrt(K[0, 0] * K[1, 1]))
+        sample_points(
+            atlas.vertices, atlas.normals, matrix, center, focal,
+            inverse_depth, on_object.astype(np.float32), np.ascontiguousarray(photo), weights, sampled,
+        )  # fmt: skip
+        hit = np.flatnonzero(weights > 0)
+        seen[index, hit] = True
+        even = np.clip(sampled[hit] * gains[index], 0, 255)
+        colors[index, hit] = np.round(even)
+        ones = np.concatenate([np.ones((len(even), 1)), even], 1)
+        moments += ones.T @ ones
+        to_camera = center - atlas.vertices[hit]
+        cos = (atlas.normals[hit] * to_camera).sum(1) / np.linalg.norm(to_camera, axis=1)
+        depth = atlas.vertices[hit] @ matrix[2, :3] + matrix[2, 3]
+        facing[hit] = np.maximum(facing[hit], cos)
+        photo_density[hit] = np.maximum(photo_density[hit], focal * cos / depth)
+        if listener:
+            listener(index + 1, num_photos)
+    return VertexQuality(
+        seen_by=seen.sum(0).astype(np.uint16),
+        facing=facing,
+        ambiguity=mean_disagreement(colors, seen, color_precision(moments)),
+        photo_density=photo_density,
+        texel_density=texel_density(atlas),
+        invented=invented_share(atlas, texels, provenance),
+    )
+
+
+def color_precision(moments: np.ndarray) -> np.ndarray:
+    """Inverse [3, 3] of the colours' covariance from their moments, the sum [4, 4] of (1, r, g, b)^T (1, r, g, b).
+
+    The paper's Sigma^-1 (eq. ambiguity_factor), over what the photos show of the mesh. Each channel's variance gets a
+    floor of one 8-bit level.
+    """
+    mean = moments[0, 1:] / max(moments[0, 0], 1)
+    covariance = moments[1:, 1:] / max(moments[0, 0], 1) - np.outer(mean, mean)
+    return np.linalg.inv(covariance + _COLOR_VARIANCE_FLOOR * np.eye(3))
+
+
+def mean_disagreement(colors: np.ndarray, seen: np.ndarray, precision: np.ndarray) -> np.ndarray:
+    """The paper's ambiguity lambda [V] float32 on the final mesh, averaged over the photos that see a vertex.
+
+    lambda_i = mean over the other photos j that see it of D_M(C_i, C_j), the Mahalanobis distance of their colours (eq.
+    ambiguity_factor with V_j 0 or 1). The mean over i is that over pairs. 0 where fewer than two photos see it.
+
+    Args:
+        colors: [N, V, 3] uint8.
+        seen: [N, V] bool.
+        precision: [3, 3] inverse colour covariance.
+    """
+    whitening = np.linalg.cholesky(precision).astype(np.float32)  # distances of c @ whitening are D_M
+    result = np.zeros(seen.shape[1], dtype=np.float32)
+    _mean_of_pairs(np.ascontiguousarray(colors), seen, whitening, result)
+    return result
+
+
+@njit(nogil=True, cache=True)
+def _mean_of_pairs(colors, seen, whitening, result):  # pragma: no cover - compiled
+    num_photos, count = seen.shape
+    white = np.empty((num_photos, 3), dtype=np.float32)
+    for v in range(count):
+        used = 0
+        for i in range(num_photos):
+            if seen[i, v]:
+                for c in range(3):
+                    white[used, c] = (
+                        colors[i, v, 0] * whitening[0, c]
+                        + colors[i, v, 1] * whitening[1, c]
+                        + colors[i, v, 2] * whitening[2, c]
+                    )
+                used += 1
+        total = 0.0
+        for i in range(used):
+            for j in range(i):
+                dx, dy, dz = white[i, 0] - white[j, 0], white[i, 1] - white[j, 1], white[i, 2] - white[j, 2]
+                total += np.sqrt(dx * dx + dy * dy + dz * dz)
+        if used > 1:
+            result[v] = 2 * total / (used * (used - 1))
+
+
+def texel_density(atlas: AtlasMesh) -> np.ndarray:
+    """Texels per scene unit [V] float32: root of the texels of the faces around a vertex over their area."""
+    areas = face_areas(atlas.vertices, atlas.faces)
+    texels = face_areas(np.pad(atlas.uvs, ((0, 0), (0, 1))), atlas.faces) * atlas.texture_size**2
+    return np.sqrt(_sum_around(atlas, texels) / np.maximum(_sum_around(atlas, areas), 1e-20)).astype(np.float32)
+
+
+def invented_share(atlas: AtlasMesh, texels: Texels, provenance: np.ndarray) -> np.ndarray:
+    """Part of the texels of the faces around a vertex [V] float32 that no photo saw; 0 where they have no texel."""
+    invented = texels.face_ids[provenance.ravel()[texels.index] == Provenance.FIELD]
+    made_up, all_of_them = (
+        _sum_around(atlas, np.bincount(ids, minlength=len(atlas.faces))) for ids in (invented, texels.face_ids)
+    )
+    return (made_up / np.maximum(all_of_them, 1)).astype(np.float32)
+
+
+def _sum_around(atlas: AtlasMesh, per_face: np.ndarray) -> np.ndarray:
+    """Sum [V] over the faces around each vertex of values [F]."""
+    return np.bincount(atlas.faces.ravel(), np.repeat(per_face, 3), minlength=len(atlas.vertices))
