@@ -216,6 +216,7 @@ def test_the_overview_shows_each_camera_from_both_sides(full):
     assert len(views[1].findall("{*}path")) == len(views[0].findall("{*}path")) + 1  # the ground
 
 
+@pytest.mark.slow
 def test_the_size_is_told_in_metres_where_they_are_known(full):
     sized = full.inputs["export"] / "manifest.json"
     sized.write_text(manifest("export", extent=[0.31234, 0.2, 12.0], units="metres"))
