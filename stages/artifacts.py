@@ -248,11 +248,16 @@ def load_scene(folder: Path) -> PosedScene:
         world_from_scene=_similarity(data["world_from_scene"]),
         up=np.array(data["up"]),
         kind=data["kind"],
-        place=place and Place(**{**place, "world_from_model": _similarity(place["world_from_model"])}),
+        place=place and _place(place),
         ground=ground and Plane(**{**ground, "normal": np.array(ground["normal"])}),
         box=None if box is None else np.array(box),
         **sparse,
     )
+
+
+def _place(data: dict[str, Any]) -> Place:
+    origin = data["origin"] and tuple(data["origin"])
+    return Place(**{**data, "world_from_model": _similarity(data["world_from_model"]), "origin": origin})
 
 
 def _plain_similarity(similarity: Similarity) -> dict[str, Any]:

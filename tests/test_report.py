@@ -12,13 +12,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rigs import scene_without_points
 
 from configs.load import config_yaml, load_config
 from configs.params import ReportParams
 from stages import artifacts
 from stages.artifacts import AtlasMesh, ImageRecord, ImageSet, SkippedImage, VertexQuality, write_png
 from stages.engine.stage import StageContext
-from stages.geometry.cameras import PinholeCameras, PosedScene
+from stages.geometry.cameras import PinholeCameras
 from stages.geometry.orientation import y_up_rotation
 from stages.geometry.overview import overview_svg
 from stages.geometry.place import Place
@@ -66,8 +67,7 @@ def context(tmp_path) -> StageContext:
     pose = np.concatenate([np.eye(3), [[0], [0], [3]]], 1)[None]
     K = np.array([[24.0, 0, 8], [0, 24, 8], [0, 0, 1]])
     cameras = PinholeCameras(("a.png",), np.array([[16, 16]]), K[None], pose)
-    scene = PosedScene(cameras, Similarity.identity(), np.zeros((1, 3)), np.zeros(1), np.zeros((1, 2)), UP)
-    artifacts.save_scene(folders["undistort"], scene)
+    artifacts.save_scene(folders["undistort"], scene_without_points(cameras))
     artifacts.save_atlas(folders["atlas"], pyramid())
     texture = np.zeros((16, 16, 3), np.uint8)
     texture[:8], texture[8:] = (230, 40, 40), (40, 70, 220)
@@ -112,7 +112,8 @@ def full(context) -> StageContext:
     random = np.random.default_rng(0)
     scene = replace(
         artifacts.load_scene(inputs["undistort"]),
-        points=random.normal(size=(300, 3)),
+        points=random.normal(size=(300, 3)).astype(np.float32),
+        point_errors=np.full(300, 0.5, np.float32),
         place=Place(Similarity.identity(), True, "2 markers (8 sides)", 0.0042),
         ground=Plane(UP, -0.2, 0.01, 0.5),
         box=np.array([[-0.5, -0.5, -0.2], [0.5, 0.5, 0.6]]),

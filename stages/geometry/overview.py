@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from stages.geometry.cameras import PosedScene
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
 
 SIDE = 360  # of each view, drawing units
 MAX_POINTS = 2500
@@ -38,12 +43,12 @@ def overview_svg(scene: PosedScene) -> str:
     )
 
 
-def _on_page(points: np.ndarray, axis: int, reach: float) -> np.ndarray:
-    """Drawing positions [P, 2] of scene points [P, 3]: x to the right, coordinate `axis` up."""
+def _on_page(points: Float[np.ndarray, "p 3"], axis: int, reach: float) -> Float[np.ndarray, "p 2"]:
+    """Drawing positions of scene points: x to the right, coordinate `axis` up."""
     return SIDE / 2 * (1 + points[:, (0, axis)] / reach * (1, -1))
 
 
-def _points(points: np.ndarray, axis: int, reach: float) -> str:
+def _points(points: Float[np.ndarray, "p 3"], axis: int, reach: float) -> str:
     """Dots, those inside the region in their own colour; each set is one path of short strokes."""
     inside = np.linalg.norm(points, axis=1) < 1
     paths = []
@@ -55,7 +60,7 @@ def _points(points: np.ndarray, axis: int, reach: float) -> str:
     return "".join(paths)
 
 
-def _region(box_corners: np.ndarray | None, axis: int, reach: float) -> str:
+def _region(box_corners: Float[np.ndarray, "8 3"] | None, axis: int, reach: float) -> str:
     """The unit sphere, and the box where there is one."""
     middle, stroke = SIDE / 2, f'fill="none" stroke="{COLORS["region"]}" stroke-width="1.5"'
     shapes = f'<circle cx="{middle}" cy="{middle}" r="{SIDE / 2 / reach:.1f}" {stroke}/>'
@@ -67,8 +72,8 @@ def _region(box_corners: np.ndarray | None, axis: int, reach: float) -> str:
     return shapes
 
 
-def _box_corners(scene: PosedScene) -> np.ndarray:
-    """[8, 3] corners of the box in the scene frame; bit k of a corner's number is its side of axis k."""
+def _box_corners(scene: PosedScene) -> Float[np.ndarray, "8 3"]:
+    """Corners of the box in the scene frame; bit k of a corner's number is its side of axis k."""
     assert scene.box is not None
     picks = np.array([[i >> k & 1 for k in range(3)] for i in range(8)])
     return scene.world_from_scene.inverse().apply(np.take_along_axis(scene.box, picks, axis=0))
@@ -88,7 +93,7 @@ def _ground(scene: PosedScene, reach: float) -> str:
     )
 
 
-def _cameras(centers: np.ndarray, forward: np.ndarray, axis: int, reach: float) -> str:
+def _cameras(centers: Float[np.ndarray, "n 3"], forward: Float[np.ndarray, "n 3"], axis: int, reach: float) -> str:
     """A dot for each camera with a stroke to where it looks."""
     start, end = (_on_page(points, axis, reach) for points in (centers, centers + 0.08 * reach * forward))
     shapes = [

@@ -7,10 +7,14 @@ photos by it, and that is what makes the cameras' own up worth something.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from stages.geometry.cameras import PinholeCameras
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
 
 IRLS_STEPS = 30
 TINY = 1e-12  # keeps divisions finite; far below any length that occurs
@@ -25,12 +29,12 @@ MAX_GPS_TILT_DEG = 2.0
 @dataclass(frozen=True)
 class Up:
     """Attributes:
-    direction: [3] unit.
+    direction: unit.
     source: what it was found from, in words.
     sure: whether the cameras were held level in enough directions to tell (of the cameras' estimate).
     """
 
-    direction: np.ndarray
+    direction: Float[np.ndarray, " 3"]
     source: str
     sure: bool = True
 
@@ -56,13 +60,15 @@ def estimate_up(cameras: PinholeCameras) -> Up:
     return Up(up if up @ mean_up > 0 else -up, "level cameras")
 
 
-def choose_up(cameras: Up, ground: np.ndarray | None, gps: np.ndarray | None, gps_tilt_deg: float) -> Up:
+def choose_up(
+    cameras: Up, ground: Float[np.ndarray, " 3"] | None, gps: Float[np.ndarray, " 3"] | None, gps_tilt_deg: float
+) -> Up:
     """Which to believe: GPS where it is sure, then level ground, then the cameras.
 
     Args:
         cameras: see `estimate_up`.
-        ground: [3] unit normal of the ground's plane, or None.
-        gps: [3] unit direction away from the Earth, or None.
+        ground: unit normal of the ground's plane, or None.
+        gps: unit direction away from the Earth, or None.
         gps_tilt_deg: standard error of `gps`, degrees.
     """
     if gps is not None and gps_tilt_deg <= MAX_GPS_TILT_DEG:
@@ -72,6 +78,6 @@ def choose_up(cameras: Up, ground: np.ndarray | None, gps: np.ndarray | None, gp
     return cameras
 
 
-def angle_deg(a: np.ndarray, b: np.ndarray) -> float:
-    """Angle in degrees between unit vectors [3]."""
+def angle_deg(a: Float[np.ndarray, " 3"], b: Float[np.ndarray, " 3"]) -> float:
+    """Angle in degrees between unit vectors."""
     return float(np.degrees(np.arccos(np.clip(a @ b, -1, 1))))

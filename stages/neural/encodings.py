@@ -21,7 +21,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, cached_property, partial
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -117,6 +117,7 @@ Encoding = HashGrid | Frequencies
 Vjp = Callable[[torch.Tensor], torch.Tensor]
 
 
+@runtime_checkable
 class EncodingKernels(Protocol):
     """What `encode` asks of the kernels of a hash grid on a device: `encoding_cpu` (numba), `encoding_cuda` (Triton).
 
