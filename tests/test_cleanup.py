@@ -417,9 +417,7 @@ def test_stage_drops_flaps_under_the_ground_at_the_border_unless_points_lie_ther
     points = np.random.default_rng(0).uniform([-0.6, -0.6, -0.1], [0.6, 0.6, 0.1], (200, 3))
     points[: 10 if seen_below else 1, 2] = -0.3
     seen = {"points": points.astype(np.float32), "point_errors": np.zeros(200, np.float32)}
-    numbers, vertices, _ = stage(
-        surface.vertices, surface.faces, scene_extras={"ground": ground, **seen}, min_views=0
-    )
+    numbers, vertices, _ = stage(surface.vertices, surface.faces, scene_extras={"ground": ground, **seen}, min_views=0)
     assert (numbers["under_ground"] > 0) != seen_below
     low = vertices[vertices[:, 2] < -0.2]
     assert (low[:, 0] < 0.4).any()
