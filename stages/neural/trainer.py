@@ -13,7 +13,7 @@ import torch
 from configs.params import TrainParams
 from stages.neural import losses, schedules
 from stages.neural.acceleration import is_mixed, short_products
-from stages.neural.encodings import Frequencies, HashGrid
+from stages.neural.encoding_shapes import Frequencies, HashGrid
 from stages.neural.fields import Fields, FieldShape, points_at_a_time
 from stages.neural.proposal import interlevel_loss, sample_edges, updates_now
 from stages.neural.renderer import Rendered, Renderer
