@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import builtins
 from pathlib import Path
 
 import pytest
@@ -12,13 +11,7 @@ from hypothesis import settings
 settings.register_profile("project", deadline=None, derandomize=True)
 settings.load_profile("project")
 
-ROOT = Path(__file__).parents[1]
-DATA = ROOT.parent / "shared" / "data"
-
-# numba and Triton compile these, and take no wrapped functions.
-COMPILED = ("kernels", "encoding_cuda")
-NEURAL = sorted(path.stem for path in (ROOT / "stages" / "neural").glob("*.py") if path.stem not in COMPILED)
-SHAPED = ("stages.geometry", *(f"stages.neural.{module}" for module in NEURAL))
+DATA = Path(__file__).parents[2] / "shared" / "data"
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -26,16 +19,11 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Install the checks before any test imports what they check."""
-    if not config.getoption("--check-shapes"):
-        return
-    import jaxtyping
+    """Before any test imports what is checked."""
+    if config.getoption("--check-shapes"):
+        from shape_checks import install
 
-    # The modules import these names for the type checker only: annotations, which are strings, find them here.
-    names = ("Bool", "Float", "Float32", "Float64", "Int", "Integer", "Shaped", "UInt8")
-    vars(builtins).update({name: getattr(jaxtyping, name) for name in names})
-    # With the numeric tower of PEP 484: an int may be given for a float.
-    jaxtyping.install_import_hook(SHAPED, "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))")
+        install()
 
 
 @pytest.fixture(scope="session")

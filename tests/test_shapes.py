@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import importlib
 import inspect
-import pkgutil
 import typing
 
 import numpy as np
 import pytest
+import torch
+from shape_checks import checked_modules
 
-import stages.geometry
 from stages.geometry.cameras import PinholeCameras
 from stages.geometry.plane import Plane, fit_plane
 from stages.geometry.region import meeting_point
 from stages.geometry.similarity import Similarity
+from stages.neural.rendering import composite
+from stages.neural.sampling import invert_cdf
 
 
 @pytest.fixture(autouse=True)
@@ -43,8 +45,9 @@ def cameras(count: int) -> dict:
         lambda: meeting_point(np.zeros((4, 3)), np.ones((5, 3))),
         lambda: fit_plane(np.zeros((4, 3)), np.array([0.0, 0, 1]), np.ones(5)),
         lambda: Plane(np.array([0.0, 0, 1, 0]), 0.0, 0.0, 1.0),
+        lambda: composite(torch.zeros(4, 5), torch.zeros(4, 6, 3)),
+        lambda: invert_cdf(torch.zeros(4, 6), torch.zeros(4, 6), torch.zeros(4, 3)),
     ],
-    ids=["points", "field", "rank", "dtype", "one record", "two arguments", "optional", "record"],
 )
 def test_a_wrong_shape_fails(call):
     with pytest.raises(TypeError, match="Type-check error"):
@@ -58,10 +61,9 @@ def test_a_wrong_shape_that_comes_back_fails(monkeypatch: pytest.MonkeyPatch):
 
 
 def annotated() -> list:
-    """All functions, methods and records of the geometry, and of what is typed so far of the networks."""
-    names = [module.name for module in pkgutil.iter_modules(stages.geometry.__path__, "stages.geometry.")]
+    """All functions, methods and records that are checked."""
     found = []
-    for name in names:
+    for name in checked_modules():
         module = importlib.import_module(name)
         members = [one for one in vars(module).values() if getattr(one, "__module__", None) == name]
         for member in members:
@@ -74,6 +76,6 @@ def annotated() -> list:
 
 def test_every_annotation_can_be_read():
     """One that cannot be is passed over in silence."""
-    assert len(annotated()) > 60
+    assert len(annotated()) > 200
     for member in annotated():
         typing.get_type_hints(member)
