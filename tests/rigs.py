@@ -34,7 +34,7 @@ def capture(poses: list[np.ndarray], size: tuple[int, int] = (640, 480), focal: 
 
 
 def scene_without_points(
-    cameras: PinholeCameras, world_from_scene: Similarity | None = None, **more: Any
+    cameras: PinholeCameras, poses_from_scene: Similarity | None = None, **more: Any
 ) -> PosedScene:
     """Posed photos and nothing else; +z is up."""
     none = {
@@ -42,7 +42,7 @@ def scene_without_points(
         "point_errors": np.zeros(0, np.float32),
         "observations": np.zeros((0, 2), np.int32),
     }
-    return PosedScene(cameras, world_from_scene or Similarity.identity(), **none, up=UP, **more)
+    return PosedScene(cameras, poses_from_scene or Similarity.identity(), **none, up=UP, **more)
 
 
 def ring(
