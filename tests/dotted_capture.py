@@ -23,7 +23,7 @@ NUM_CAMERAS = 8
 NOT_MOVED = np.zeros(3)
 
 
-def cam_from_world(index: int, shift: np.ndarray) -> np.ndarray:
+def cam_from_world(index: int, shift: np.ndarray = NOT_MOVED) -> np.ndarray:
     angle = 2 * np.pi * index / NUM_CAMERAS
     offset = np.array([3.0 * np.cos(angle), -1.2, 3.0 * np.sin(angle)])
     z = -offset / np.linalg.norm(offset)
