@@ -174,7 +174,8 @@ def _under_the_border(vertices: np.ndarray, scene: PosedScene, depth: float) -> 
     points = scene.points[np.linalg.norm(scene.points, axis=1) < 1]
     if scene.kind != "object" or (scene.ground.heights(points) < -depth).sum() > MAX_UNDER * len(points):
         return np.zeros(len(vertices), dtype=bool)
-    return (np.linalg.norm(vertices, axis=1) > BORDER_RADIUS) & (scene.ground.heights(vertices) < -depth)
+    under: np.ndarray = scene.ground.heights(vertices) < -depth
+    return under & (np.linalg.norm(vertices, axis=1) > BORDER_RADIUS)
 
 
 def _without_bumps(
@@ -231,7 +232,7 @@ def _seen_faces(vertices: np.ndarray, faces: np.ndarray, seen: np.ndarray, param
     """Faces [F] bool to keep, given which vertices [V] bool are seen: seen ones, their surroundings, small gaps."""
     from stages.surface import triangle_mesh
 
-    chosen = seen[faces].any(1)
+    chosen: np.ndarray = seen[faces].any(1)
     if params.keep_closed:
         return triangle_mesh.whole_pieces(faces, chosen)
     if not chosen.any():

@@ -208,7 +208,8 @@ def unit_normals(vertices: np.ndarray, normals: np.ndarray, faces: np.ndarray) -
             takes = usable & bad[faces[:, k]]
             unit[faces[takes, k]] = flat[takes]
         lengths = np.linalg.norm(unit, axis=1)
-    return unit / lengths[:, None]
+    unit /= lengths[:, None]
+    return unit
 
 
 def vertex_colors(texture_png: bytes, uvs: np.ndarray) -> np.ndarray:
