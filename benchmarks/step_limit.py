@@ -49,7 +49,7 @@ from configs.load import load_config
 from configs.params import TrainParams
 from stages.neural import encodings, losses
 from stages.neural.acceleration import short_products
-from stages.neural.encodings import HashGrid
+from stages.neural.encoding_shapes import HashGrid
 from stages.neural.fields import Fields, FieldShape
 from stages.neural.trainer import field_shape
 

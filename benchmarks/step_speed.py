@@ -36,7 +36,7 @@ from configs.params import TrainParams
 from stages.geometry.cameras import PinholeCameras, PosedScene
 from stages.geometry.similarity import Similarity
 from stages.neural import encodings, fields
-from stages.neural.encodings import HashGrid
+from stages.neural.encoding_shapes import HashGrid
 from stages.neural.sightings import Sightings
 from stages.neural.trainer import Trainer, field_shape
 from stages.neural.training_photos import Photos

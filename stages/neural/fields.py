@@ -13,7 +13,8 @@ from torch import nn
 
 from stages.neural.acceleration import short_products, takes_kernel
 from stages.neural.appearance import FeatureMlp
-from stages.neural.encodings import Encoding, Frequencies, HashGrid, encode, encode_features
+from stages.neural.encoding_shapes import Encoding, Frequencies, HashGrid
+from stages.neural.encodings import encode, encode_features
 from stages.neural.mlp import Mlp, kaiming_uniform, mlp, spherical_harmonics
 from stages.neural.proposal import ProposalNetwork
 from stages.neural.reflection import ReflectionNetwork

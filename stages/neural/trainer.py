@@ -13,7 +13,7 @@ import torch
 from configs.params import TrainParams
 from stages.neural import losses, schedules
 from stages.neural.acceleration import is_mixed, short_products
-from stages.neural.encodings import Frequencies, HashGrid
+from stages.neural.encoding_shapes import Frequencies, HashGrid
 from stages.neural.fields import Fields, FieldShape, points_at_a_time
 from stages.neural.proposal import interlevel_loss, sample_edges, updates_now
 from stages.neural.renderer import Rendered, Renderer
@@ -143,16 +143,11 @@ class Trainer:
         sparse_loss = sighting_loss(rendered.extra_sdf[: len(places)], sparse_weights, params)
         exposure_loss = losses.exposure_error(self.fields.log_gains).mean()
         proposal_loss = self._proposal_loss(rendered)
-        consistency_loss = self.terms.consistency_loss(rendered, moment)
 
-        eikonal_weight = params.weight_eikonal * schedules.exponential(
-            progress, params.eikonal_start, params.eikonal_end
-        )
         loss = (
             rgb_loss
-            + eikonal_weight * eikonal_loss
+            + params.weight_eikonal * eikonal_loss
             + params.weight_planar * planar_loss
-            + params.weight_consistency * consistency_loss
             + params.weight_sparse * schedules.fade_out(progress, params.sparse_until) * sparse_loss
             + params.weight_mask * mask_loss
             + params.weight_exposure * exposure_loss
@@ -179,7 +174,6 @@ class Trainer:
                 "rgb": rgb_loss.detach(),
                 "eikonal": eikonal_loss.detach(),
                 "planar": planar_loss.detach(),
-                "consistency": consistency_loss.detach(),
                 "sparse": sparse_loss.detach(),
                 "mask": mask_loss.detach(),
                 "appearance": appearance_loss.detach(),
