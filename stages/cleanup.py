@@ -174,8 +174,8 @@ def _under_the_border(vertices: np.ndarray, scene: PosedScene, depth: float) -> 
     points = scene.points[np.linalg.norm(scene.points, axis=1) < 1]
     if scene.kind != "object" or (scene.ground.heights(points) < -depth).sum() > MAX_UNDER * len(points):
         return np.zeros(len(vertices), dtype=bool)
-    under: np.ndarray = scene.ground.heights(vertices) < -depth
-    return under & (np.linalg.norm(vertices, axis=1) > BORDER_RADIUS)
+    under = scene.ground.heights(vertices) < -depth
+    return np.logical_and(under, np.linalg.norm(vertices, axis=1) > BORDER_RADIUS)
 
 
 def _without_bumps(

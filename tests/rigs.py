@@ -1,12 +1,15 @@
-"""Captures of known geometry: poses, cameras and sparse points of the common ways to photograph."""
+"""Captures of known geometry: poses, cameras, scenes and sparse points of the common ways to photograph."""
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
-from stages.geometry.cameras import PinholeCameras
+from stages.geometry.cameras import PinholeCameras, PosedScene
 from stages.geometry.normalisation import rotation_onto
 from stages.geometry.region import frames_around
+from stages.geometry.similarity import Similarity
 
 EAST, NORTH, UP = np.eye(3)
 
@@ -28,6 +31,18 @@ def capture(poses: list[np.ndarray], size: tuple[int, int] = (640, 480), focal: 
         intrinsics=np.stack([K] * len(poses)),
         cam_from_scene=np.stack(poses),
     )
+
+
+def scene_without_points(
+    cameras: PinholeCameras, world_from_scene: Similarity | None = None, **more: Any
+) -> PosedScene:
+    """Posed photos and nothing else; +z is up."""
+    none = {
+        "points": np.zeros((0, 3), np.float32),
+        "point_errors": np.zeros(0, np.float32),
+        "observations": np.zeros((0, 2), np.int32),
+    }
+    return PosedScene(cameras, world_from_scene or Similarity.identity(), **none, up=UP, **more)
 
 
 def ring(

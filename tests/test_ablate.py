@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -329,7 +329,8 @@ def test_the_mesh_is_scored_in_the_world_frame(here, monkeypatch):
 
 
 def test_a_scene_without_sparse_points_trains(tmp_path):
-    from sphere_scene import ring_of_cameras, sphere_scene, write_undistorted
+    from rigs import scene_without_points
+    from sphere_scene import ring_of_cameras, write_undistorted
 
     from configs.params import TrainParams
     from stages import train
@@ -337,8 +338,7 @@ def test_a_scene_without_sparse_points_trains(tmp_path):
     cameras = ring_of_cameras()
     folder, out, scratch = (tmp_path / name for name in ("undistort", "out", "scratch"))
     write_undistorted(folder, cameras)
-    nothing = {"points": np.zeros((0, 3)), "point_errors": np.zeros(0), "observations": np.zeros((0, 2), np.int32)}
-    artifacts.save_scene(folder, replace(sphere_scene(cameras), **nothing))
+    artifacts.save_scene(folder, scene_without_points(cameras))
     out.mkdir()
     scratch.mkdir()
     params = TrainParams(steps=2, rays=32, samples=8, levels=2, start_levels=2, log2_rows=9, coarsest=8, finest=16,

@@ -8,6 +8,7 @@ from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
+from rigs import scene_without_points
 
 from configs.params import BakeParams
 from stages import artifacts
@@ -16,8 +17,7 @@ from stages.bake import BAKE
 from stages.drawing.rendering import look_at
 from stages.engine.stage import StageContext
 from stages.errors import ReconstructionError, WorkspaceError
-from stages.geometry.cameras import PinholeCameras, PosedScene
-from stages.geometry.similarity import Similarity
+from stages.geometry.cameras import PinholeCameras
 from stages.texture.baking import Provenance
 
 SKY = np.array([90, 160, 210], np.uint8)
@@ -56,8 +56,7 @@ def context(tmp_path, monkeypatch) -> StageContext:
         np.concatenate([view.intrinsics for view in views]),
         np.concatenate([view.cam_from_scene for view in views]),
     )
-    scene = PosedScene(cameras, Similarity.identity(), np.zeros((1, 3)), np.zeros(1), np.zeros((1, 2)), up)
-    artifacts.save_scene(folders["undistort"], scene)
+    artifacts.save_scene(folders["undistort"], scene_without_points(cameras))
     for name in cameras.names:
         path = artifacts.image_path(folders["undistort"], name)
         path.parent.mkdir(parents=True, exist_ok=True)

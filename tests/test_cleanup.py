@@ -6,13 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from rigs import scene_without_points
 
 from configs.params import CleanupParams
 from stages import artifacts
 from stages.cleanup import CLEANUP
 from stages.engine.stage import StageContext
 from stages.errors import ReconstructionError
-from stages.geometry.cameras import PinholeCameras, PosedScene
+from stages.geometry.cameras import PinholeCameras
 from stages.geometry.place import given_region
 from stages.geometry.plane import Plane
 from stages.geometry.similarity import Similarity
@@ -65,9 +66,7 @@ def stage(tmp_path):
         for folder in (undistort, extract, place, out):
             folder.mkdir()
         cameras = ring_of_cameras()
-        empty = np.zeros((0, 2), dtype=np.int32)
-        scene = PosedScene(cameras, Similarity.identity(), np.zeros((0, 3)), np.zeros(0), empty, np.array([0, 0, 1.0]))
-        artifacts.save_scene(undistort, replace(scene, **(scene_extras or {})))
+        artifacts.save_scene(undistort, replace(scene_without_points(cameras), **(scene_extras or {})))
         artifacts.save_given_region(place, region)
         artifacts.save_mesh(extract, vertices, faces)
         if masks is not None:
@@ -419,9 +418,8 @@ def test_stage_drops_flaps_under_the_ground_at_the_border_unless_points_lie_ther
     surface = extract_solid(lambda p: np.minimum(slab(p), np.minimum(flap(p), pit(p))), 64)
     points = np.random.default_rng(0).uniform([-0.6, -0.6, -0.1], [0.6, 0.6, 0.1], (200, 3))
     points[: 10 if seen_below else 1, 2] = -0.3
-    numbers, vertices, _ = stage(
-        surface.vertices, surface.faces, scene_extras={"ground": ground, "points": points}, min_views=0
-    )
+    seen = {"points": points.astype(np.float32), "point_errors": np.zeros(200, np.float32)}
+    numbers, vertices, _ = stage(surface.vertices, surface.faces, scene_extras={"ground": ground, **seen}, min_views=0)
     assert (numbers["under_ground"] > 0) != seen_below
     low = vertices[vertices[:, 2] < -0.2]
     assert (low[:, 0] < 0.4).any()

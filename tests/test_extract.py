@@ -7,6 +7,7 @@ import types
 
 import numpy as np
 import pytest
+from rigs import scene_without_points
 from test_cleanup import ring_of_cameras
 
 from configs.params import ExtractParams
@@ -14,8 +15,6 @@ from stages import artifacts
 from stages.engine.stage import StageContext
 from stages.errors import ReconstructionError
 from stages.extract import EXTRACT, supported_resolution
-from stages.geometry.cameras import PosedScene
-from stages.geometry.similarity import Similarity
 
 
 @pytest.fixture
@@ -28,10 +27,7 @@ def stage(tmp_path, monkeypatch):
         stand_in = types.ModuleType("stages.neural.trained_field")
         stand_in.load_field = lambda path, device: types.SimpleNamespace(sdf=sdf)
         monkeypatch.setitem(sys.modules, "stages.neural.trained_field", stand_in)
-        empty = np.zeros((0, 2), dtype=np.int32)
-        up = np.array([0, 0, 1.0])
-        scene = PosedScene(ring_of_cameras(), Similarity.identity(), np.zeros((0, 3)), np.zeros(0), empty, up)
-        artifacts.save_scene(undistort, scene)
+        artifacts.save_scene(undistort, scene_without_points(ring_of_cameras()))
         seen = []
         context = StageContext(
             inputs={"undistort": undistort, "train": train},

@@ -57,6 +57,7 @@ def waits_of_steps(trainer) -> Waits:
     return waits
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("masks", "precision"), [(False, "mixed"), (True, "float32")])
 def test_a_step_does_not_wait_for_the_device(like_cuda, masks, precision):
     like_cuda()
@@ -82,6 +83,7 @@ def test_a_step_on_cuda_does_not_wait(masks):
     assert torch.isfinite(numbers["loss"]).item()
 
 
+@pytest.mark.slow
 def test_the_step_of_the_cpu_would_wait(monkeypatch):
     """What the test above looks for is found where it is."""
     monkeypatch.setattr(acceleration, "_has_numba", lambda: False)

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rigs import scene_without_points
 
 from configs.load import load_config
 from configs.params import ReportParams
@@ -30,7 +31,7 @@ from stages.engine.fingerprint import Identity
 from stages.engine.manifest import Manifest
 from stages.engine.stage import StageContext
 from stages.engine.workspace import Record
-from stages.geometry.cameras import PinholeCameras, PosedScene
+from stages.geometry.cameras import PinholeCameras
 from stages.geometry.orientation import y_up_rotation
 from stages.geometry.overview import overview_svg
 from stages.geometry.place import Place, given_region
@@ -77,8 +78,7 @@ def context(tmp_path) -> StageContext:
     pose = np.concatenate([np.eye(3), [[0], [0], [3]]], 1)[None]
     K = np.array([[24.0, 0, 8], [0, 24, 8], [0, 0, 1]])
     cameras = PinholeCameras(("a.png",), np.array([[16, 16]]), K[None], pose)
-    scene = PosedScene(cameras, Similarity.identity(), np.zeros((1, 3)), np.zeros(1), np.zeros((1, 2)), UP)
-    artifacts.save_scene(folders["undistort"], scene)
+    artifacts.save_scene(folders["undistort"], scene_without_points(cameras))
     artifacts.save_place(folders["place"], Place(Similarity.identity()))
     artifacts.save_given_region(folders["place"], None)
     artifacts.save_atlas(folders["atlas"], pyramid())
@@ -125,13 +125,14 @@ def full(context) -> StageContext:
     random = np.random.default_rng(0)
     scene = replace(
         artifacts.load_scene(inputs["undistort"]),
-        points=random.normal(size=(300, 3)),
+        points=random.normal(size=(300, 3)).astype(np.float32),
+        point_errors=np.full(300, 0.5, np.float32),
         ground=Plane(UP, -0.2, 0.01, 0.5),
     )
     artifacts.save_scene(inputs["undistort"], scene)
     still = Similarity.identity()
     artifacts.save_place(inputs["place"], Place(still, True, "2 markers (8 sides)", 0.0042))
-    region = given_region("box", BOX.ravel(), still)
+    region = given_region("box", BOX.ravel().tolist(), still)
     artifacts.save_given_region(inputs["place"], region)
     artifacts.overview_path(inputs["undistort"]).write_text(overview_svg(scene, region.box_corners()))
     artifacts.save_quality(inputs["bake"], quality())
@@ -229,6 +230,7 @@ def test_the_overview_shows_each_camera_from_both_sides(full):
     assert len(views[1].findall("{*}path")) == len(views[0].findall("{*}path")) + 1  # the ground
 
 
+@pytest.mark.slow
 def test_the_size_is_told_in_metres_where_they_are_known(full):
     def sized(units: str) -> StageContext:
         exported = manifest("export", extent=[0.31234, 0.2, 12.0], units=units)

@@ -92,6 +92,7 @@ def run_sfm(ingest: Path, root: Path, **params: object) -> tuple[dict[str, objec
     return SFM.run(context), out
 
 
+@pytest.mark.slow
 def test_rendered_capture_gives_back_its_cameras(tmp_path: Path):
     import pycolmap
 
@@ -129,6 +130,7 @@ def orbit(count: int, step_deg: float) -> list[np.ndarray]:
     return [look_at(center, np.array([0, 0, 0.35])) for center in centers]
 
 
+@pytest.mark.slow
 def test_a_background_that_stands_still_behind_a_turntable_does_not_matter(tmp_path: Path, monkeypatch):
     poses = orbit(8, 10)
     background = cv2.resize(texture(7), (WIDTH, HEIGHT)).astype(np.uint8)

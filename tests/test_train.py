@@ -171,6 +171,7 @@ EVERYTHING = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("settings", [{}, EVERYTHING], ids=["default", "everything"])
 def test_a_killed_run_goes_on_with_the_same_loss_curve(tmp_path, monkeypatch, settings):
     monkeypatch.setattr(train, "LOG_EVERY", 5)
@@ -223,6 +224,7 @@ def test_the_published_field_answers_in_numpy(tmp_path):
     assert colors.max() <= 1
 
 
+@pytest.mark.slow
 def test_a_budget_in_minutes_ends_on_time_whatever_the_steps(tmp_path):
     numbers = train.run(context(tmp_path, "out", TINY.model_copy(update={"steps": 10**9, "minutes": 0.02})))
     assert numbers["train_seconds"] < 60  # the first step may have to compile the kernels
@@ -304,6 +306,7 @@ def test_the_hull_of_a_ball_is_a_little_more_than_the_ball():
     assert hull_distances(cameras, [np.zeros((40, 48), np.uint8)] * 16, cells=20) is None
 
 
+@pytest.mark.slow
 def test_training_can_start_from_the_hull():
     trainer = make_trainer(TINY.model_copy(update={"sphere_radius": 0.8, "init": "hull"}), masks=True)
     cameras = ring_of_cameras()

@@ -42,6 +42,7 @@ def run_sfm(ingest: Path, poses: Path, root: Path, **params: object) -> tuple[di
     return SFM.run(StageContext({"ingest": ingest}, {"poses": poses}, out, scratch, settings, workers=2)), out
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("exhaustive_max", [150, 2])
 def test_poses_stay_and_points_are_found(tmp_path: Path, exhaustive_max: int):
     import pycolmap

@@ -159,6 +159,7 @@ def test_image_pixels_all_come_from_the_photo(tmp_path: Path):
         assert cv2.imread(str(artifacts.image_path(out, name))).min() == 255
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("model_name", "parameters"), MODELS[1:3])
 @pytest.mark.parametrize("max_side", [1600, 200])
 def test_masks_are_warped_by_the_same_maps(tmp_path: Path, model_name: str, parameters: list[float], max_side: int):
