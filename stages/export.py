@@ -104,7 +104,7 @@ def _textured_glb(asset: Asset, mesh: artifacts.AtlasMesh, extras: dict[str, Any
 
 def _write_levels(asset: Asset, count: int) -> Iterator[tuple[int, int]]:
     """Faces and bytes of each level of detail."""
-    from stages.texture.levels import levels_of_detail
+    from stages.surface.levels_of_detail import levels_of_detail
 
     for level, light in enumerate(levels_of_detail(asset.mesh, count) if count else (), 1):
         data = _textured_glb(asset, light, {**asset.extras, "level_of_detail": level})

@@ -92,7 +92,7 @@ def describe_view(
 ) -> dict[str, Any]:
     """The 3D view and, where the bake stage left its measures, their colours and the next photos to take."""
     from stages.reporting import view3d
-    from stages.texture.next_views import suggest_views, vertex_needs
+    from stages.reporting.next_views import suggest_views, vertex_needs
 
     try:
         quality = artifacts.load_quality(bake)

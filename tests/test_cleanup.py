@@ -15,9 +15,9 @@ from stages.errors import ReconstructionError
 from stages.geometry.cameras import PinholeCameras, PosedScene
 from stages.geometry.plane import Plane
 from stages.geometry.similarity import Similarity
-from stages.surface import triangle_mesh
+from stages.surface import selection, triangle_mesh
+from stages.surface.decimation import AGGRESSIVENESS, decimate
 from stages.surface.isosurface import extract_isosurface
-from stages.surface.simplify import AGGRESSIVENESS, decimate
 from stages.surface.solids import extract_solid
 
 SIZE = 160
@@ -89,16 +89,16 @@ def stage(tmp_path):
 
 def test_small_pieces_go_and_their_number_is_told():
     vertices, faces = join(ball(), ball(0.06, (0.8, 0, 0)), ball(0.06, (-0.8, 0, 0)))
-    keep, dropped = triangle_mesh.large_pieces(faces, 0.1)
+    keep, dropped = selection.large_pieces(faces, 0.1)
     assert dropped == 2
     assert np.linalg.norm(vertices[faces[keep]], axis=2).max() < 0.55
-    assert triangle_mesh.large_pieces(faces, 0.0) == (pytest.approx(np.ones(len(faces), bool)), 0)
+    assert selection.large_pieces(faces, 0.0) == (pytest.approx(np.ones(len(faces), bool)), 0)
 
 
 def test_views_of_a_ball_are_those_on_its_near_side():
     vertices, faces = ball()
     cameras = ring_of_cameras(count=1, elevations=(0,))  # at +x
-    seen = triangle_mesh.count_views(vertices, faces, cameras, enough=1) > 0
+    seen = selection.count_views(vertices, faces, cameras, enough=1) > 0
     horizon = 0.5**2 / 2.5  # the tangent cone touches the ball at x = r^2 / d
     assert seen[vertices[:, 0] > horizon + 0.06].all()
     assert not seen[vertices[:, 0] < horizon - 0.06].any()
@@ -108,15 +108,15 @@ def test_views_are_counted_up_to_enough():
     vertices, faces = ball()
     cameras = ring_of_cameras()
     top = vertices[:, 2].argmax()
-    assert triangle_mesh.count_views(vertices, faces, cameras, enough=3)[top] == 3
-    assert triangle_mesh.count_views(vertices, faces, cameras, enough=99)[top] == len(cameras)
+    assert selection.count_views(vertices, faces, cameras, enough=3)[top] == 3
+    assert selection.count_views(vertices, faces, cameras, enough=99)[top] == len(cameras)
 
 
 def test_what_lies_outside_the_image_is_not_seen():
     vertices, faces = ball()
     cameras = ring_of_cameras(count=1, elevations=(0,))
     narrow = PinholeCameras(cameras.names, np.array([[SIZE // 2, SIZE]]), cameras.intrinsics, cameras.cam_from_scene)
-    seen = triangle_mesh.count_views(vertices, faces, narrow, enough=1) > 0
+    seen = selection.count_views(vertices, faces, narrow, enough=1) > 0
     pixels, _ = cameras.project(0, vertices)
     assert seen.any()
     assert not seen[pixels[:, 0] >= SIZE // 2].any()
@@ -126,7 +126,7 @@ def test_small_unseen_gaps_are_kept_and_large_ones_dropped():
     vertices, faces = ball()
     middle = vertices[faces].mean(1)
     small, large = middle[:, 2] > 0.48, middle[:, 2] < -0.1
-    keep = triangle_mesh.fill_small_gaps(vertices, faces, ~small & ~large, max_area=0.2)
+    keep = selection.fill_small_gaps(vertices, faces, ~small & ~large, max_area=0.2)
     assert keep[small].all()
     assert not keep[large].any()
 
@@ -134,16 +134,16 @@ def test_small_unseen_gaps_are_kept_and_large_ones_dropped():
 def test_unseen_islands_are_not_gaps():
     vertices, faces = join(ball(), ball(0.06, (0.8, 0, 0)))
     island = np.linalg.norm(vertices[faces].mean(1), axis=1) > 0.6
-    assert not triangle_mesh.fill_small_gaps(vertices, faces, ~island, max_area=10)[island].any()
+    assert not selection.fill_small_gaps(vertices, faces, ~island, max_area=10)[island].any()
 
 
 def test_smoothing_a_selection_fills_notches_only():
     vertices, faces = ball()
     notch = np.zeros(len(faces), dtype=bool)
     notch[np.flatnonzero(vertices[faces].mean(1)[:, 2] > 0)[0]] = True
-    assert triangle_mesh.smooth_selection(faces, len(vertices), ~notch, 2).all()
+    assert selection.smooth_selection(faces, len(vertices), ~notch, 2).all()
     half = vertices[faces].mean(1)[:, 2] > 0
-    smooth = triangle_mesh.smooth_selection(faces, len(vertices), half, 2)
+    smooth = selection.smooth_selection(faces, len(vertices), half, 2)
     assert smooth[half].all()
     assert vertices[faces[smooth]].mean(1)[:, 2].min() > -0.15
 
@@ -254,10 +254,10 @@ def test_hull_drops_what_most_masks_exclude_but_trusts_no_single_mask():
     cameras = ring_of_cameras()
     points = np.array([[0, 0, 0], [0.8, 0, 0.0], [0, 0, 0.3]])
     disk = silhouettes(cameras)
-    assert triangle_mesh.outside_hull(points, cameras, disk, 0.1).tolist() == [False, True, False]
+    assert selection.outside_hull(points, cameras, disk, 0.1).tolist() == [False, True, False]
     one_bad = [(i, mask if i else np.zeros_like(mask)) for i, mask in disk]
-    assert triangle_mesh.outside_hull(points, cameras, one_bad, 0.05).tolist() == [False, True, False]
-    assert not triangle_mesh.outside_hull(points, cameras, [], 0.1).any()
+    assert selection.outside_hull(points, cameras, one_bad, 0.05).tolist() == [False, True, False]
+    assert not selection.outside_hull(points, cameras, [], 0.1).any()
 
 
 def silhouettes(cameras, radius=0.5):
@@ -427,7 +427,7 @@ def test_stage_drops_flaps_under_the_ground_at_the_border_unless_points_lie_ther
 
 
 def test_stage_says_when_a_solid_was_wanted_and_is_none(stage, monkeypatch, caplog):
-    decimated = "stages.surface.simplify.decimate"
+    decimated = "stages.surface.decimation.decimate"
     monkeypatch.setattr(decimated, lambda vertices, faces, target: (vertices, faces[1:]))
     numbers, _, _ = stage(*ball(), keep_closed=True)
     assert numbers["open_edges"] > 0

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from stages.files.tangents import vertex_tangents
+from stages.texture.tangents import vertex_tangents
 
 _FLOAT, _UINT = 5126, 5125
 _ARRAY_BUFFER, _ELEMENT_ARRAY_BUFFER = 34962, 34963
