@@ -19,7 +19,7 @@ def run(context: StageContext) -> dict[str, Any]:
     from stages.neural.trained_field import load_field
     from stages.texture.baking import bake_texture
     from stages.texture.relief import bake_normals, bake_occlusion
-    from stages.texture.vertex_quality import measure_quality
+    from stages.texture.vertex_quality import VertexWitness
 
     undistorted = context.inputs["undistort"]
     cameras = artifacts.load_scene(undistorted).cameras
@@ -29,6 +29,7 @@ def run(context: StageContext) -> dict[str, Any]:
     field = load_field(artifacts.field_path(context.inputs["train"]), context.device)
     params = context.params
     texels = rasterize_atlas(atlas.uvs, atlas.faces, atlas.texture_size)
+    witness = VertexWitness(atlas, len(cameras))
     try:
         baked = bake_texture(
             atlas,
@@ -43,6 +44,7 @@ def run(context: StageContext) -> dict[str, Any]:
             robust_sigma=params.robust_sigma,
             workers=context.workers,
             listener=context.progress,
+            visit=witness.look,
         )
     except ValueError as error:
         raise ReconstructionError(
@@ -51,16 +53,7 @@ def run(context: StageContext) -> dict[str, Any]:
         ) from error
     artifacts.write_png(artifacts.base_color_path(context.out), baked.base_color)
     artifacts.write_png(artifacts.provenance_path(context.out), baked.provenance)
-    quality = measure_quality(
-        atlas,
-        texels,
-        cameras,
-        lambda index: load_photo(undistorted, cameras, index),
-        baked.provenance,
-        baked.gains,
-        lambda done, total: context.progress(done, total, "judging vertices"),
-    )
-    artifacts.save_quality(context.out, quality)
+    artifacts.save_quality(context.out, witness.quality(texels, baked.provenance))
     numbers = dict(baked.numbers)
     if params.normal_map:
         full = artifacts.load_mesh(context.inputs["cleanup"], artifacts.FULL_MESH)

@@ -114,6 +114,17 @@ def test_the_quality_of_each_vertex_is_kept(context):
     np.testing.assert_allclose(quality.texel_density, np.sqrt(64**2 * 0.4 * 0.8), rtol=1e-5)
 
 
+def test_each_photo_is_read_and_its_depths_drawn_once(context, monkeypatch):
+    from stages.texture import photo_views
+
+    loaded, drawn = [], []
+    draw = photo_views.depth_map
+    monkeypatch.setattr("stages.bake.load_photo", lambda *where: loaded.append(where[2]) or load_photo(*where))
+    monkeypatch.setattr(photo_views, "depth_map", lambda *what: drawn.append(what[1]) or draw(*what))
+    BAKE.run(context)
+    assert sorted(loaded) == sorted(drawn) == [0, 1]
+
+
 def test_a_mask_hides_what_lies_outside_it(context):
     for name in ("one.png", "sub/two.png"):
         path = artifacts.mask_path(context.inputs["undistort"], name)
