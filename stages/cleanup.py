@@ -227,7 +227,7 @@ def _seen_faces(vertices: np.ndarray, faces: np.ndarray, seen: np.ndarray, param
 
 CLEANUP = Stage(
     name="cleanup",
-    version=6,
+    version=7,
     needs=("undistort", "extract"),
     params="cleanup",
     run=run,

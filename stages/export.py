@@ -19,7 +19,7 @@ from stages.geometry.orientation import y_up_rotation
 from stages.geometry.similarity import Similarity
 
 if TYPE_CHECKING:
-    from stages.files.writing import Textures
+    from stages.files.contents import Textures
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ def _write_glb(asset: Asset) -> int:
 
 
 def _textured_glb(asset: Asset, mesh: artifacts.AtlasMesh, extras: dict[str, Any]) -> bytes:
-    from stages.files.writing import glb_bytes
+    from stages.files.glb import glb_bytes
 
     vertices, normals = asset.in_gltf(mesh)
     return glb_bytes(vertices, normals, mesh.uvs, mesh.faces, asset.textures, generator=generator(), extras=extras)
@@ -113,7 +113,7 @@ def _write_levels(asset: Asset, count: int) -> Iterator[tuple[int, int]]:
 
 def _write_collision(asset: Asset, count: int) -> tuple[int, int]:
     """Pieces and bytes of the collision shapes."""
-    from stages.files.writing import shapes_glb_bytes
+    from stages.files.glb import shapes_glb_bytes
     from stages.surface.collision import convex_pieces
 
     try:
@@ -150,7 +150,7 @@ def _write_usdz(asset: Asset) -> int:
 
 def _write_obj(asset: Asset) -> int:
     """The OBJ, its material and its images. Returns the bytes of the OBJ."""
-    from stages.files.writing import mtl_text, obj_text
+    from stages.files.obj import mtl_text, obj_text
 
     texture_path, mtl = artifacts.obj_texture_path(asset.out), artifacts.mtl_path(asset.out)
     texture_path.write_bytes(asset.textures.base_color)
@@ -165,7 +165,7 @@ def _write_obj(asset: Asset) -> int:
 
 
 def _write_ply(asset: Asset) -> int:
-    from stages.files.writing import ply_bytes
+    from stages.files.ply_stl import ply_bytes
 
     colors = vertex_colors(asset.textures.base_color, asset.mesh.uvs)
     data = ply_bytes(*asset.in_world(asset.mesh), colors, asset.mesh.faces, asset.note)
@@ -173,7 +173,7 @@ def _write_ply(asset: Asset) -> int:
 
 
 def _write_stl(asset: Asset) -> int:
-    from stages.files.writing import stl_bytes
+    from stages.files.ply_stl import stl_bytes
 
     vertices, _ = asset.in_world(asset.mesh)
     return artifacts.stl_path(asset.out).write_bytes(stl_bytes(vertices, asset.mesh.faces, asset.note))
@@ -181,7 +181,7 @@ def _write_stl(asset: Asset) -> int:
 
 def load_textures(baked: Path) -> Textures:
     """The images that the bake stage left."""
-    from stages.files.writing import Textures
+    from stages.files.contents import Textures
 
     optional = (artifacts.normal_map_path(baked), artifacts.occlusion_path(baked))
     normal, occlusion = (path.read_bytes() if path.exists() else None for path in optional)
@@ -254,7 +254,7 @@ def provenance(scene: PosedScene, gltf_from_world: np.ndarray, run: str | None) 
 
 EXPORT = Stage(
     name="export",
-    version=5,
+    version=6,
     needs=("undistort", "atlas", "bake"),
     params="export",
     run=run,

@@ -1,24 +1,41 @@
-"""Fewer faces, same shape: quadric decimation that gives a 2-manifold or says so."""
+"""Fewer faces, same shape: quadric edge collapse (Garland and Heckbert 1997), by pymeshlab.
+
+docs/adr/0011-mesh-libraries.md has what other libraries make of the same meshes.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
+
 import numpy as np
 
-from stages.surface.triangle_mesh import mesh_state, repair_manifold
+from stages.surface.triangle_mesh import repair_manifold
 
-# How readily fast-simplification takes bad collapses (its own default is 7). At 3 the distance to the surface is a
-# third to a half lower than at 7 and broken edges are rarer, in the same time; at 2 it often stops short of its target.
-AGGRESSIVENESS = 3
-# Faces that a mesh may have beyond its target.
-SLACK = 0.01
+# Whole parameter lists: pymeshlab takes what is left out from the call before in the same process.
+_COLLAPSE = {
+    "targetperc": 0.0,
+    "qualitythr": 0.3,
+    "boundaryweight": 1.0,
+    "preservenormal": True,
+    "optimalplacement": True,
+    "planarquadric": False,
+    "selected": False,
+}
+# Borders may lose vertices, too: frozen, they take the faces of a light mesh for themselves.
+_PLAIN = {
+    **_COLLAPSE,
+    "preserveboundary": False,
+    "preservetopology": True,
+    "planarweight": 0.001,
+    "qualityweight": False,
+    "autoclean": True,
+}
+# pymeshlab's own weight of UVs is 1; more holds the texture better and the shape no worse.
+_TEXTURED = {**_COLLAPSE, "preserveboundary": True, "extratcoordw": 3.0}
 
 
 def decimate(vertices: np.ndarray, faces: np.ndarray, target_faces: int) -> tuple[np.ndarray, np.ndarray]:
     """A mesh of about `target_faces` faces; the same one where it has no more.
-
-    fast-simplification first: many times faster than the others, but it does not promise a manifold, nor to reach its
-    target. Where it leaves edges of more than two faces, a hole once these are mended, or too many faces, it goes half
-    the way and pymeshlab's topology-preserving collapse does the rest; and all of it, where half the way is too far.
 
     Args:
         vertices: [V, 3].
@@ -31,43 +48,42 @@ def decimate(vertices: np.ndarray, faces: np.ndarray, target_faces: int) -> tupl
     Raises:
         ValueError: `target_faces` out of bounds.
     """
+    import pymeshlab
+
     if target_faces < 4:
         raise ValueError(f"expected target_faces >= 4, got {target_faces}")
-    if len(faces) <= target_faces:
-        light = repair_manifold(vertices, faces)
-    else:
-        closed = mesh_state(faces).open_edges == 0
-        rough = _fast(vertices, faces, target_faces)
-        light = repair_manifold(*rough)
-        too_many = len(light[1]) > (1 + SLACK) * target_faces
-        if too_many or mesh_state(rough[1]).bad_edges or (closed and mesh_state(light[1]).open_edges):
-            halfway = repair_manifold(*_fast(vertices, faces, 2 * target_faces))
-            if closed and mesh_state(halfway[1]).open_edges:
-                halfway = (vertices, faces)
-            light = repair_manifold(*_careful(*halfway, target_faces))
-    return light[0].astype(np.float32), light[1]
+    if len(faces) > target_faces:
+        meshes = pymeshlab.MeshSet()
+        meshes.add_mesh(pymeshlab.Mesh(vertices.astype(np.float64), faces.astype(np.int32)))
+        meshes.meshing_decimation_quadric_edge_collapse(targetfacenum=target_faces, **_PLAIN)
+        light = meshes.current_mesh()
+        vertices, faces = light.vertex_matrix(), light.face_matrix()
+    vertices, faces = repair_manifold(vertices, faces)
+    return vertices.astype(np.float32), faces
 
 
-def _fast(vertices: np.ndarray, faces: np.ndarray, target_faces: int) -> tuple[np.ndarray, np.ndarray]:
-    import fast_simplification
+def decimate_textured(
+    vertices: np.ndarray, faces: np.ndarray, uvs: np.ndarray, targets: Sequence[int]
+) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Lighter and lighter versions of a textured mesh, each made from the one before.
 
-    if len(faces) <= target_faces:
-        return vertices, faces
-    return fast_simplification.simplify(
-        np.ascontiguousarray(vertices, dtype=np.float32),
-        np.ascontiguousarray(faces, dtype=np.int32),
-        target_count=target_faces,
-        agg=AGGRESSIVENESS,
-    )
+    Quadrics over position and UV (Garland and Heckbert 1998) keep seams and what lies where in the texture.
 
+    Args:
+        vertices, uvs: [V, 3] and [V, 2], split along the seams of the charts.
+        faces: [F, 3], one or more.
+        targets: faces of each version, >= 4, falling.
 
-def _careful(vertices: np.ndarray, faces: np.ndarray, target_faces: int) -> tuple[np.ndarray, np.ndarray]:
+    Yields:
+        Vertices [W, 3] float64, faces [G, 3] int32 and UVs [3G, 2] float64 of the faces' corners.
+    """
     import pymeshlab
 
     meshes = pymeshlab.MeshSet()
-    meshes.add_mesh(pymeshlab.Mesh(vertices.astype(np.float64), faces.astype(np.int32)))
-    meshes.meshing_decimation_quadric_edge_collapse(
-        targetfacenum=target_faces, preservetopology=True, preservenormal=True, preserveboundary=True
-    )
-    mesh = meshes.current_mesh()
-    return mesh.vertex_matrix(), mesh.face_matrix()
+    meshes.add_mesh(pymeshlab.Mesh(vertices.astype(np.float64), faces, v_tex_coords_matrix=uvs.astype(np.float64)))
+    meshes.compute_texcoord_transfer_vertex_to_wedge()
+    meshes.meshing_remove_duplicate_vertices()
+    for target in targets:
+        meshes.meshing_decimation_quadric_edge_collapse_with_texture(targetfacenum=target, **_TEXTURED)
+        light = meshes.current_mesh()
+        yield light.vertex_matrix(), light.face_matrix(), light.wedge_tex_coord_matrix()
