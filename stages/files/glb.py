@@ -13,7 +13,8 @@ from stages.texture.tangents import vertex_tangents
 
 _FLOAT, _UINT = 5126, 5125
 _ARRAY_BUFFER, _ELEMENT_ARRAY_BUFFER = 34962, 34963
-_LINEAR, _LINEAR_MIPMAP_LINEAR, _CLAMP_TO_EDGE = 9729, 9987, 33071
+# Linear, with mip-maps where it shrinks, clamped at the edges.
+_SAMPLER = {"magFilter": 9729, "minFilter": 9987, "wrapS": 33071, "wrapT": 33071}
 
 
 def glb_bytes(
@@ -69,19 +70,13 @@ def glb_bytes(
     if textures.occlusion is not None:
         material["occlusionTexture"] = {"index": buffer.add_image(textures.occlusion, "occlusion")}
     primitive = {"attributes": attributes, "indices": indices, "material": 0}
-    sampler = {
-        "magFilter": _LINEAR,
-        "minFilter": _LINEAR_MIPMAP_LINEAR,
-        "wrapS": _CLAMP_TO_EDGE,
-        "wrapT": _CLAMP_TO_EDGE,
-    }
     return buffer.file(
         [{"name": name, "primitives": [primitive]}],
         generator,
         extras,
         materials=[material],
         textures=[{"source": k, "sampler": 0} for k in range(len(buffer.images))],
-        samplers=[sampler],
+        samplers=[_SAMPLER],
         images=buffer.images,
     )
 
@@ -106,21 +101,6 @@ def shapes_glb_bytes(
         indices = buffer.add_numbers(faces.ravel().astype(np.uint32), "SCALAR", _ELEMENT_ARRAY_BUFFER)
         meshes.append({"name": name, "primitives": [{"attributes": {"POSITION": position}, "indices": indices}]})
     return buffer.file(meshes, generator, extras)
-
-
-def _chunks(tree: dict[str, Any], data: bytearray) -> bytes:
-    """The file of a JSON and a binary chunk, each of a multiple of four bytes."""
-    text = json.dumps(tree, separators=(",", ":"), allow_nan=False).encode()
-    text += b" " * (-len(text) % 4)
-    return b"".join(
-        [
-            struct.pack("<4sII", b"glTF", 2, 12 + 8 + len(text) + 8 + len(data)),
-            struct.pack("<I4s", len(text), b"JSON"),
-            text,
-            struct.pack("<I4s", len(data), b"BIN\0"),
-            data,
-        ]
-    )
 
 
 class _GlbBuffer:
@@ -157,7 +137,7 @@ class _GlbBuffer:
         extras: dict[str, Any] | None,
         **tables: list[Any],
     ) -> bytes:
-        """The whole file, with a node for each mesh."""
+        """The file: a JSON chunk, with a node for each mesh, and a binary one, each of a multiple of four bytes."""
         tree = {
             "asset": {"version": "2.0", "generator": generator, **({"extras": extras} if extras else {})},
             "scene": 0,
@@ -169,4 +149,8 @@ class _GlbBuffer:
             "bufferViews": self.views,
             "buffers": [{"byteLength": len(self.data)}],
         }
-        return _chunks(tree, self.data)
+        text = json.dumps(tree, separators=(",", ":"), allow_nan=False).encode()
+        text += b" " * (-len(text) % 4)
+        head = struct.pack("<4sII", b"glTF", 2, 12 + 8 + len(text) + 8 + len(self.data))
+        chunks = struct.pack("<I4s", len(text), b"JSON"), text, struct.pack("<I4s", len(self.data), b"BIN\0"), self.data
+        return b"".join([head, *chunks])

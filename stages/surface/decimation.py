@@ -13,23 +13,14 @@ from stages.surface.triangle_mesh import repair_manifold
 
 # Whole parameter lists: pymeshlab takes what is left out from the call before in the same process.
 _COLLAPSE = {
-    "targetperc": 0.0,
-    "qualitythr": 0.3,
-    "boundaryweight": 1.0,
-    "preservenormal": True,
-    "optimalplacement": True,
-    "planarquadric": False,
-    "selected": False,
-}
+    "targetperc": 0.0, "qualitythr": 0.3, "boundaryweight": 1.0, "preservenormal": True, "optimalplacement": True,
+    "planarquadric": False, "selected": False,
+}  # fmt: skip
 # Borders may lose vertices, too: frozen, they take the faces of a light mesh for themselves.
 _PLAIN = {
-    **_COLLAPSE,
-    "preserveboundary": False,
-    "preservetopology": True,
-    "planarweight": 0.001,
-    "qualityweight": False,
+    **_COLLAPSE, "preserveboundary": False, "preservetopology": True, "planarweight": 0.001, "qualityweight": False,
     "autoclean": True,
-}
+}  # fmt: skip
 # pymeshlab's own weight of UVs is 1; more holds the texture better and the shape no worse.
 _TEXTURED = {**_COLLAPSE, "preserveboundary": True, "extratcoordw": 3.0}
 

@@ -10,14 +10,7 @@ from collections.abc import Callable, Iterable
 import numpy as np
 
 from stages.geometry.cameras import PinholeCameras
-from stages.surface.triangle_mesh import (
-    MAX_RAYS,
-    face_adjacency,
-    face_areas,
-    label_pieces,
-    raycaster,
-    vertex_normals,
-)
+from stages.surface.triangle_mesh import MAX_RAYS, face_adjacency, face_areas, label_pieces, raycaster, vertex_normals
 
 # A face seen flatter than this (cosine) counts as unseen: no photo says anything of it.
 MIN_COSINE = 0.05

@@ -1,6 +1,6 @@
 """Photos to texture: visibility, gains, a robust mean in two bands, and what no photo saw.
 
-1. Each photo gets a depth map of the mesh, a trust map that fades near depth edges, and two bands (`views`).
+1. Each photo gets a depth map of the mesh, a trust map that fades near depth edges, and two bands (`photo_views`).
 2. A sample of texels, seen by several photos, gives the gains (`gains`) and tells blurred photos (`sharpness`).
 3. Each texel collects its best views (`observing`): low band = robust mean of many, high band = robust mean of those
    that resolve the most. Weights change smoothly over the surface and fade out before a view leaves the set, so
