@@ -249,9 +249,10 @@ def _parse_set(text: str) -> dict[str, Any]:
             f"--set {text}: the value is not valid YAML ({getattr(error, 'problem', error)}).",
             "Quote it for the shell, for example `--set 'export.formats=[glb, ply]'`.",
         ) from error
-    layer: Any = value
-    for part in reversed(parts):
-        layer = {part: layer}
+    *sections, name = parts
+    layer: dict[str, Any] = {name: value}
+    for section in reversed(sections):
+        layer = {section: layer}
     return layer
 
 

@@ -12,7 +12,7 @@ from rigs import scene_without_points
 
 from configs.params import BakeParams
 from stages import artifacts
-from stages.artifacts import AtlasMesh, write_png
+from stages.artifacts import AtlasMesh, Pictures, write_png
 from stages.bake import BAKE
 from stages.drawing.rendering import look_at
 from stages.engine.stage import StageContext
@@ -111,6 +111,19 @@ def test_the_quality_of_each_vertex_is_kept(context):
     assert (quality.seen_by[4:] == 0).all()
     assert quality.invented[:4].max() < 0.5
     np.testing.assert_allclose(quality.texel_density, np.sqrt(64**2 * 0.4 * 0.8), rtol=1e-5)
+
+
+def test_each_photo_is_read_and_its_depths_drawn_once(context, monkeypatch):
+    from stages.texture import photo_views
+
+    loaded, drawn = [], []
+    draw = photo_views.depth_map
+    load = Pictures.masked
+    monkeypatch.setattr(Pictures, "masked", lambda photos, name: loaded.append(name) or load(photos, name))
+    monkeypatch.setattr(photo_views, "depth_map", lambda *what: drawn.append(what[1]) or draw(*what))
+    BAKE.run(context)
+    assert sorted(loaded) == ["one.png", "sub/two.png"]
+    assert sorted(drawn) == [0, 1]
 
 
 def test_a_mask_hides_what_lies_outside_it(context):

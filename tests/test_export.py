@@ -24,7 +24,10 @@ from stages.engine.manifest import Manifest
 from stages.engine.stage import StageContext
 from stages.errors import ReconstructionError, SystemRequirementError
 from stages.export import EXPORT, unit_normals
-from stages.files.writing import Textures, glb_bytes, obj_text, ply_bytes, shapes_glb_bytes
+from stages.files.contents import Textures
+from stages.files.glb import glb_bytes, shapes_glb_bytes
+from stages.files.obj import obj_text
+from stages.files.ply_stl import ply_bytes
 from stages.geometry.cameras import PinholeCameras
 from stages.geometry.orientation import y_up_rotation
 from stages.geometry.place import Place

@@ -13,7 +13,7 @@ from stages.artifacts import VertexQuality
 from stages.drawing.rendering import look_at
 from stages.geometry.cameras import PinholeCameras, PosedScene
 from stages.geometry.plane import Plane
-from stages.texture.next_views import describe_place, suggest_views, vertex_needs
+from stages.reporting.next_views import describe_place, suggest_views, vertex_needs
 
 UP = np.array([0.0, 0, 1])
 BALL = trimesh.creation.icosphere(3, 0.5)

@@ -13,7 +13,7 @@ from stages.errors import InputError
 from stages.evaluation.alignment import by_icp
 from stages.evaluation.coloring import distance_colors
 from stages.evaluation.surfaces import DEFAULT_THRESHOLDS, Surface, Target, measure
-from stages.files.writing import ply_bytes
+from stages.files.ply_stl import ply_bytes
 
 Mesh = tuple[np.ndarray, np.ndarray]
 

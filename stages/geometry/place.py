@@ -98,7 +98,7 @@ class GivenRegion:
     """The region of interest that the user gave, brought into the frame of the poses.
 
     Attributes:
-        center, radius: of the sphere, or of the sphere about the box.
+        center: of the sphere. radius: of it, or of the sphere about the box.
         box: lowest and highest corner in the world of the box that the mesh is cropped to, or None.
         world_from_poses: as it was when the region was given.
     """
@@ -150,7 +150,7 @@ class Located:
 
     @property
     def up(self) -> Float[np.ndarray, " 3"]:
-        """Unit, in the model's frame."""
+        """Unit, in the frame of the poses."""
         return self.world_from_poses.rotation[2]
 
 
