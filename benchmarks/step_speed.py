@@ -162,7 +162,8 @@ def ball_trainer(params: TrainParams, device: str = "cpu") -> Trainer:
 
 def points_of_step(params: TrainParams) -> int:
     """How many points a training step asks the distance of."""
-    return params.rays * params.samples + 4 * params.sparse_batch + params.free_points
+    sampling = params.sampling
+    return sampling.rays * sampling.samples + 4 * params.losses.sparse_batch + sampling.free_points
 
 
 def preset_for(device: str) -> str:

@@ -48,7 +48,7 @@ def evaluate_views(workspace: Path, renders: Path | None = None, device: str = "
     if not held_out:
         raise InputError(
             f"{workspace} holds no photos back: all were trained on.",
-            f"Train without every 8th: `hineus run --workspace {workspace} --set train.holdout=8`.",
+            f"Train without every 8th: `hineus run --workspace {workspace} --set train.hold_out=8`.",
         )
     cameras = artifacts.load_scene(folders["undistort"]).cameras
     atlas = artifacts.load_atlas(folders["atlas"])
@@ -80,7 +80,7 @@ def evaluate_views(workspace: Path, renders: Path | None = None, device: str = "
         "mean": {what: mean_scores([photo[what] for photo in photos]) for what in ("field", "mesh")},
         "renders": None if renders is None else str(renders),
         "done": [
-            f"photos: {len(held_out)} of {len(cameras)}, held back from training and texture by `train.holdout`",
+            f"photos: {len(held_out)} of {len(cameras)}, held back from training and texture by `train.hold_out`",
             f"object: the photo's mask in {masked} photos, the mesh's silhouette in {len(held_out) - masked}",
             "whole: the photo as it is for a field with a background; else masked photo and drawing on white",
             f"lpips: {about_lpips}",
