@@ -46,7 +46,7 @@ from benchmarks.step_speed import (
     training_step,
 )
 from configs.load import load_config
-from configs.params import TrainParams
+from configs.training import TrainParams
 from stages.neural import encodings, losses
 from stages.neural.acceleration import short_products
 from stages.neural.encoding_shapes import HashGrid

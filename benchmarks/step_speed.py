@@ -32,7 +32,7 @@ from benchmarks import ball_heap
 from benchmarks.ablate import BASE, VARIANTS, settings_of
 from benchmarks.run_sets import markdown_table
 from configs.load import load_config
-from configs.params import TrainParams
+from configs.training import TrainParams
 from stages.geometry.cameras import PinholeCameras, PosedScene
 from stages.geometry.similarity import Similarity
 from stages.neural import encodings, fields

@@ -1,4 +1,4 @@
-"""Settings under the names they had before 0.1.0 put them in groups: read for one version, with a note.
+"""Settings under the names they had before: read for one version, with a note.
 
 A setting that is gone is dropped where it says what happens anyway, and else refused.
 """
@@ -6,7 +6,7 @@ A setting that is gone is dropped where it says what happens anyway, and else re
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 from configs.dotted import flatten, nested
@@ -23,7 +23,10 @@ _GROUPS = {
     "train.schedule": "start_levels coarse_until lr_table lr_network lr_warm_up lr_decay lr_final adam_beta2",
     "train.losses": "sparse_until sparse_tolerance sparse_step sparse_batch",
 }
-RENAMED = {f"train.{name}": f"{group}.{name}" for group, names in _GROUPS.items() for name in names.split()} | {
+_PLACE = "region up gps marker_size marker_dictionary known_distance"
+RENAMED = {
+    **{f"train.{name}": f"{group}.{name}" for group, names in _GROUPS.items() for name in names.split()},
+    **{f"undistort.{name}": f"place.{name}" for name in _PLACE.split()},
     "train.holdout": "train.hold_out",
     "train.density": "train.density.form",
     "train.weight_eikonal": "train.losses.eikonal",
@@ -53,6 +56,7 @@ RENAMED = {f"train.{name}": f"{group}.{name}" for group, names in _GROUPS.items(
     "train.relaxation_clip": "train.terms.eikonal.clip",
 }
 """Old dotted name -> new one."""
+_SECTIONS = {new.rpartition(".")[0] for new in RENAMED.values()}
 
 _ANNEALED = "an Eikonal term that grows or fades gained nothing"
 _COMPARED = "comparing photos with photos gained nothing"
@@ -80,25 +84,42 @@ def with_new_names(layer: Mapping[str, Any], origin: str) -> dict[str, Any]:
         ConfigError: a setting that is gone asks for what there is no more.
     """
     flat = flatten(layer)
-    # A name of today may be an old one, too: `train.density` was a value and is a section.
-    old = {key: value for key, value in flat.items() if key in REMOVED or (key in RENAMED and value is not None)}
+    old = [key for key, value in flat.items() if _is_old(key, value)]
     if not old:
         return dict(layer)
-    for key in old.keys() & REMOVED.keys():
-        harmless, why = REMOVED[key]
-        if harmless is not None and old[key] != harmless:
+    for key in old:
+        if key in REMOVED and not _did_nothing(key, flat[key]):
+            harmless, why = REMOVED[key]
             raise ConfigError(
-                f"`{key}` = {old[key]} in {origin}: this setting is gone, since {why}.",
+                f"`{key}` = {flat[key]} in {origin}: this setting is gone, since {why}.",
                 f"Leave it out, or use an older version of HiNeuS; it did nothing at {harmless}.",
             )
-    _note(old, origin)
-    renamed = {RENAMED[key]: value for key, value in old.items() if key in RENAMED}
-    return nested(renamed | {key: value for key, value in flat.items() if key not in old})
-
-
-def _note(old: Iterable[str], origin: str) -> None:
     moves = [f"`{key}` is now `{RENAMED[key]}`" if key in RENAMED else f"`{key}` is gone" for key in old]
     more = f", and {len(moves) - _NAMED} more" if len(moves) > _NAMED else ""
     log.warning(
         "%s: %s%s. Old names are read by this version and not by the next.", origin, ", ".join(moves[:_NAMED]), more
     )
+    return nested(_renamed(flat))
+
+
+def section_with_new_names(section: str, values: Mapping[str, Any]) -> dict[str, Any]:
+    """A section as a finished stage was made with, by today's names, to compare or to use again; no note.
+
+    A setting that is gone stays where it did something.
+    """
+    return dict(nested(_renamed(flatten({section: values}))).get(section, {}))
+
+
+def _renamed(flat: Mapping[str, Any]) -> dict[str, Any]:
+    new = {RENAMED[key]: value for key, value in flat.items() if key in RENAMED and _is_old(key, value)}
+    kept = {key: value for key, value in flat.items() if key not in RENAMED or not _is_old(key, value)}
+    return new | {key: value for key, value in kept.items() if not _did_nothing(key, value)}
+
+
+def _is_old(key: str, value: Any) -> bool:
+    # A name of today may be an old one, too: `train.density` was a value and is a section, which may be empty.
+    return key in REMOVED or (key in RENAMED and not (value is None and key in _SECTIONS))
+
+
+def _did_nothing(key: str, value: Any) -> bool:
+    return key in REMOVED and REMOVED[key][0] in (None, value)

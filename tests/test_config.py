@@ -6,10 +6,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 
 from configs.load import config_yaml, describe_settings, load_config, preset_names, preset_summary, preset_text
 from configs.params import Config
-from configs.renames import REMOVED, RENAMED
+from configs.renames import REMOVED, RENAMED, section_with_new_names
 from configs.replay import settings_beyond
 from stages.errors import ConfigError
 
@@ -46,7 +47,7 @@ def test_every_setting_is_described() -> None:
 
 
 def test_yaml_round_trip(tmp_path: Path) -> None:
-    config = load_config("tiny", sets=["train.minutes=2.5", "export.formats=[glb]", "undistort.up=+y"])
+    config = load_config("tiny", sets=["train.minutes=2.5", "export.formats=[glb]", "place.up=+y"])
     file = tmp_path / "config.yaml"
     file.write_text(config_yaml(config))
     assert load_config(file=file) == config
@@ -60,7 +61,7 @@ def test_yaml_round_trip(tmp_path: Path) -> None:
         ("train.minutes=1e-1", 0.1),
         ("bake.gain=false", False),
         ("export.formats=[glb, ply]", ("glb", "ply")),
-        ("undistort.up=-z", "-z"),
+        ("place.up=-z", "-z"),
         (" sfm.seed = 3", 3),
     ],
 )
@@ -230,6 +231,17 @@ def test_settings_that_are_gone_are_refused_where_they_did_something(text):
     assert "Leave it out" in caught.value.hint
 
 
+def test_a_stage_s_old_settings_compare_equal_to_the_same_ones_of_today():
+    """What a finished stage was made with is no reason to make it again where only names have changed."""
+    old = yaml.safe_load((Path(__file__).parent / "config_before_groups.yaml").read_text())
+    for section in ("train", "undistort", "extract"):
+        now = getattr(load_config("demo"), section).model_dump(mode="json")
+        assert section_with_new_names(section, old[section]) == now
+        assert section_with_new_names(section, now) == now
+    compared = section_with_new_names("train", {**old["train"], "weight_consistency": 0.1, "rays": 7})
+    assert (compared["weight_consistency"], compared["sampling"]["rays"]) == (0.1, 7)
+
+
 def test_an_old_workspace_s_settings_are_read():
     """All the settings of a run of before, as its config.yaml has them."""
     old = load_config(file=Path(__file__).parent / "config_before_groups.yaml")
@@ -239,21 +251,21 @@ def test_an_old_workspace_s_settings_are_read():
 
 @pytest.mark.parametrize("text", ["auto", "sphere 1 -2.5 3e1 0.5", "box -1 -1 0 1 1 2"])
 def test_regions(text: str) -> None:
-    assert load_config(sets=[f"undistort.region={text}"]).undistort.region == text
+    assert load_config(sets=[f"place.region={text}"]).place.region == text
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("undistort.region=ball 1 2 3 4", "it must be auto, 'sphere X Y Z RADIUS' or 'box X0 Y0 Z0 X1 Y1 Z1'"),
-        ("undistort.region=sphere 1 2 3", "'sphere' takes 4 numbers, got 3"),
-        ("undistort.region=sphere 1 2 3 -1", "the sphere's radius must be positive, not -1"),
-        ("undistort.region=box 0 0 0 1 1 0", "each of the box's X1 Y1 Z1 must be larger"),
-        ("undistort.region=box 0 0 0 1 1 wide", "'box' takes 6 numbers, got '0 0 0 1 1 wide'"),
-        ("undistort.region=sphere 0 0 0 .inf", "'sphere' takes 4 numbers, got"),
-        ("undistort.known_distance=0 0 0 1 0 0", "takes 7 numbers, got 6"),
-        ("undistort.known_distance=0 0 0 0 0 0 2", "the two points must not be the same"),
-        ("undistort.known_distance=0 0 0 1 0 0 0", "the distance must be positive, not 0 metres"),
+        ("place.region=ball 1 2 3 4", "it must be auto, 'sphere X Y Z RADIUS' or 'box X0 Y0 Z0 X1 Y1 Z1'"),
+        ("place.region=sphere 1 2 3", "'sphere' takes 4 numbers, got 3"),
+        ("place.region=sphere 1 2 3 -1", "the sphere's radius must be positive, not -1"),
+        ("place.region=box 0 0 0 1 1 0", "each of the box's X1 Y1 Z1 must be larger"),
+        ("place.region=box 0 0 0 1 1 wide", "'box' takes 6 numbers, got '0 0 0 1 1 wide'"),
+        ("place.region=sphere 0 0 0 .inf", "'sphere' takes 4 numbers, got"),
+        ("place.known_distance=0 0 0 1 0 0", "takes 7 numbers, got 6"),
+        ("place.known_distance=0 0 0 0 0 0 2", "the two points must not be the same"),
+        ("place.known_distance=0 0 0 1 0 0 0", "the distance must be positive, not 0 metres"),
     ],
 )
 def test_wrong_regions_and_distances_are_refused(text: str, message: str) -> None:

@@ -13,7 +13,7 @@ from train_settings import changed
 
 from configs.dotted import flatten
 from configs.load import load_config
-from configs.params import TrainParams
+from configs.training import TrainParams
 from stages.neural import visibility
 from stages.neural.terms.ambiguity import Ambiguity
 from stages.neural.trainer import Trainer

@@ -18,14 +18,14 @@ def test_a_preset_alone_needs_no_settings(preset):
 @pytest.mark.parametrize(
     "sets",
     [
-        ["train.steps=77", "export.formats=[glb, stl]", "undistort.known_distance=0 0 0 1 0 0 2.5"],
+        ["train.steps=77", "export.formats=[glb, stl]", "place.known_distance=0 0 0 1 0 0 2.5"],
         ["train.backbone=neuralangelo"],
         ["train.backbone=neus2", "train.density.form=laplace", "train.minutes=1.5"],
         [
             "sfm.deterministic=true",
             "train.density.scale_end=1e-5",
             "train.terms.ambiguity.form=off",
-            "undistort.region=box 0 0 0 1 1 2",
+            "place.region=box 0 0 0 1 1 2",
         ],
     ],
 )

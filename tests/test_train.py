@@ -13,7 +13,7 @@ import torch
 from sphere_scene import RADIUS, render, ring_of_cameras, sphere_scene, write_undistorted
 from train_settings import changed, small
 
-from configs.params import TrainParams
+from configs.training import TrainParams
 from stages import artifacts, train
 from stages.engine.stage import StageContext
 from stages.errors import InputError
@@ -119,9 +119,9 @@ def test_masks_for_some_photos_are_said_to_be_ignored(tmp_path, caplog):
     folder = tmp_path / "undistort"
     cameras = ring_of_cameras()
     write_undistorted(folder, cameras, masks=True)
-    assert len(list(train._load_images(folder, cameras.names)[1])) == 8
+    assert len(list(train._load_images(artifacts.Pictures(folder), cameras.names)[1])) == 8
     artifacts.mask_path(folder, cameras.names[0]).unlink()
-    assert train._load_images(folder, cameras.names)[1] is None
+    assert train._load_images(artifacts.Pictures(folder), cameras.names)[1] is None
     assert "only 7 of 8 photos have a mask" in caplog.text
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from configs.dotted import flatten, nested
-from configs.params import TrainParams
+from configs.training import TrainParams
 
 
 def changed(params: TrainParams, settings: dict[str, Any]) -> TrainParams:

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 from stages.errors import InputError
 
 if TYPE_CHECKING:
-    from stages.engine.manifest import Manifest
     from stages.engine.workspace import Workspace
     from stages.neural.drawing import FieldDrawer
 
@@ -90,29 +89,31 @@ def evaluate_views(workspace: Path, renders: Path | None = None, device: str = "
 
 def _whole(workspace: Path) -> Workspace:
     """A workspace whose stages that drawings are made from are all there, and of one run."""
+    from stages.atlas import ATLAS_STAGE
+    from stages.bake import BAKE
+    from stages.engine.status import replaced_inputs
     from stages.engine.workspace import Workspace
     from stages.errors import WorkspaceError
+    from stages.train import TRAIN
+    from stages.undistort import UNDISTORT
 
     opened = Workspace.open(workspace)
     hint = f"Make it: `hineus run --workspace {workspace}`."
-    manifests: dict[str, Manifest] = {}
-    for stage in DRAWN_FROM:
-        manifest = opened.published(stage)
-        if manifest is None:
-            raise WorkspaceError(f"{workspace} has no result of the stage {stage}.", hint)
-        for before in DRAWN_FROM:
-            made_of = manifest.identity.inputs.get(before)
-            if made_of is not None and made_of != manifests[before].outputs_digest:
-                raise WorkspaceError(
-                    f"The stage {stage} of {workspace} is of another {before} than the one there.", hint
-                )
-        manifests[stage] = manifest
+    for stage in (UNDISTORT, TRAIN, ATLAS_STAGE, BAKE):
+        if opened.published(stage.name) is None:
+            raise WorkspaceError(f"{workspace} has no result of the stage {stage.name}.", hint)
+        made_from = (artifact.partition("/")[0] for artifact in replaced_inputs(stage, opened))
+        if before := next((name for name in made_from if name in DRAWN_FROM), None):
+            raise WorkspaceError(
+                f"The stage {stage.name} of {workspace} is of another {before} than the one there.", hint
+            )
     return opened
 
 
 def field_drawer(workspace: Workspace, device: str) -> FieldDrawer:
     """What draws the trained field of a workspace, with the settings it was trained with."""
-    from configs.params import TrainParams
+    from configs.renames import section_with_new_names
+    from configs.training import TrainParams
     from stages import artifacts
     from stages.neural.drawing import FieldDrawer
     from stages.neural.trained_field import load_field
@@ -120,7 +121,8 @@ def field_drawer(workspace: Workspace, device: str) -> FieldDrawer:
     manifest = workspace.published("train")
     assert manifest is not None  # callers have made sure
     field = load_field(artifacts.field_path(workspace.stage_folder("train")), device)
-    return FieldDrawer(field.fields, TrainParams(**manifest.identity.params), device)
+    params = TrainParams.model_validate(section_with_new_names("train", manifest.identity.params))
+    return FieldDrawer(field.fields, params, device)
 
 
 def mean_scores(photos: list[dict[str, Any]]) -> dict[str, Any]:

@@ -10,6 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from stages import artifacts
+from stages.engine.workspace import Workspace
 from stages.errors import InputError, WorkspaceError
 from stages.evaluation.comparison import mesh_path, read_mesh
 from stages.evaluation.dtu import DtuTruth
@@ -43,7 +45,10 @@ def read_prediction(place: Path) -> tuple[Path, Surface]:
     """
     path = mesh_path(place)
     surface = read_surface(path)
-    return path, surface.moved(_posed_scene(place).poses_from_world.matrix()) if place.is_dir() else surface
+    if not place.is_dir():
+        return path, surface
+    poses_from_world = artifacts.load_place(Workspace.open(place).stage_folder("place")).world_from_poses.inverse()
+    return path, surface.moved(poses_from_world.matrix())
 
 
 def _has_faces(path: Path) -> bool:
@@ -123,7 +128,7 @@ def workspace_cameras(workspace: Path) -> Cameras:
         WorkspaceError: there is none, or it has no undistorted photos.
     """
     scene = _posed_scene(workspace)
-    frame, cameras = scene.poses_from_world.compose(scene.world_from_scene), scene.cameras
+    frame, cameras = scene.poses_from_scene, scene.cameras
     rotation = cameras.cam_from_scene[:, :, :3] @ frame.rotation.T
     translation = -np.einsum("nij,nj->ni", rotation, frame.apply(cameras.centers))
     poses = np.concatenate([rotation, translation[:, :, None]], 2)
@@ -131,9 +136,6 @@ def workspace_cameras(workspace: Path) -> Cameras:
 
 
 def _posed_scene(workspace: Path) -> PosedScene:
-    from stages import artifacts
-    from stages.engine.workspace import Workspace
-
     opened = Workspace.open(workspace)
     if opened.published("undistort") is None:
         raise WorkspaceError(

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from configs.params import TrainParams
+from configs.training import TrainParams
 from stages.geometry.cameras import PinholeCameras
 from stages.neural.fields import Fields, points_at_a_time
 from stages.neural.renderer import Renderer

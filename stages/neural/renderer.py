@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import torch
 
-from configs.params import TrainParams
+from configs.training import TrainParams
 from stages.neural import schedules
 from stages.neural.acceleration import fixed_shapes
 from stages.neural.fields import BackgroundNetwork, Fields

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from configs.params import TrainParams
+from configs.training import TrainParams
 from stages.neural import losses, schedules
 from stages.neural.acceleration import is_mixed, short_products
 from stages.neural.encoding_shapes import Frequencies, HashGrid

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import torch
 
-from configs.params import TrainParams
+from configs.training import TrainParams
 from stages.neural.fields import Fields
 from stages.neural.rendered import Rendered
 from stages.neural.sampling import SdfCache
