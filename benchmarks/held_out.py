@@ -1,6 +1,6 @@
 """Photos that training and texture did without, against drawings of the trained field and of the final mesh.
 
-python -m benchmarks.held_out WORKSPACE ...      these, each trained with `--set train.holdout=8`
+python -m benchmarks.held_out WORKSPACE ...      these, each trained with `--set train.hold_out=8`
 python -m benchmarks.held_out --table-only       only rewrite the table of docs/benchmarks.md
 
 Results go to benchmarks/results/held_out/NAME.json, where NAME is the workspace's.
@@ -66,7 +66,7 @@ def with_held_out(page: str) -> str:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("workspaces", type=Path, nargs="*", help="trained with train.holdout")
+    parser.add_argument("workspaces", type=Path, nargs="*", help="trained with train.hold_out")
     parser.add_argument("--table-only", action="store_true", help="measure nothing")
     arguments = parser.parse_args()
     if not arguments.workspaces and not arguments.table_only:

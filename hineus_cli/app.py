@@ -72,7 +72,7 @@ HoldOut = Annotated[
         "--hold-out",
         metavar="PERCENT",
         help="Keep this part of the photos back from training and texture, and compare the result with them; 5 is "
-        "every 20th: sets train.holdout.",
+        "every 20th: sets train.hold_out.",
         show_default=False,
     ),
 ]

@@ -167,7 +167,7 @@ def evaluate_tanks(
 @evaluate_app.command("views")
 def evaluate_views(
     context: typer.Context,
-    workspace: Annotated[Path, typer.Argument(help="Workspace trained with `train.holdout`.", show_default=False)],
+    workspace: Annotated[Path, typer.Argument(help="Workspace trained with `train.hold_out`.", show_default=False)],
     renders: Annotated[
         Path | None, typer.Option(help="Folder for the photos and their drawings.", show_default=False)
     ] = None,

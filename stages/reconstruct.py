@@ -216,7 +216,7 @@ def choose_config(request: Request, workspace: Workspace) -> tuple[str | None, C
     if request.time is not None:
         sets.append(f"train.minutes={minutes(request.time)}")
     if request.hold_out is not None:
-        sets.append(f"train.holdout={every_nth(request.hold_out)}")
+        sets.append(f"train.hold_out={every_nth(request.hold_out)}")
     if request.no_ground:
         sets.append("cleanup.remove_ground=true")
     if request.watertight:
@@ -297,7 +297,7 @@ def minutes(text: str) -> float:
 
 
 def every_nth(percent: float) -> int:
-    """Which photos are kept back, for `train.holdout`: 5 percent is every 20th; 0 is none.
+    """Which photos are kept back, for `train.hold_out`: 5 percent is every 20th; 0 is none.
 
     Raises:
         ConfigError: it is neither 0 nor from 1 to 50.

@@ -47,7 +47,7 @@ def evaluate_views(workspace: Path, renders: Path | None = None, device: str = "
     if not held_out:
         raise InputError(
             f"{workspace} holds no photos back: all were trained on.",
-            f"Train without every 8th: `hineus run --workspace {workspace} --set train.holdout=8`.",
+            f"Train without every 8th: `hineus run --workspace {workspace} --set train.hold_out=8`.",
         )
     cameras = artifacts.load_scene(folders["undistort"]).cameras
     atlas = artifacts.load_atlas(folders["atlas"])
@@ -79,7 +79,7 @@ def evaluate_views(workspace: Path, renders: Path | None = None, device: str = "
         "mean": {what: mean_scores([photo[what] for photo in photos]) for what in ("field", "mesh")},
         "renders": None if renders is None else str(renders),
         "done": [
-            f"photos: {len(held_out)} of {len(cameras)}, held back from training and texture by `train.holdout`",
+            f"photos: {len(held_out)} of {len(cameras)}, held back from training and texture by `train.hold_out`",
             f"object: the photo's mask in {masked} photos, the mesh's silhouette in {len(held_out) - masked}",
             "whole: the photo as it is for a field with a background; else masked photo and drawing on white",
             f"lpips: {about_lpips}",
@@ -112,7 +112,8 @@ def _whole(workspace: Path) -> Workspace:
 
 def field_drawer(workspace: Workspace, device: str) -> FieldDrawer:
     """What draws the trained field of a workspace, with the settings it was trained with."""
-    from configs.params import TrainParams
+    from configs.renames import section_with_new_names
+    from configs.training import TrainParams
     from stages import artifacts
     from stages.neural.drawing import FieldDrawer
     from stages.neural.trained_field import load_field
@@ -120,7 +121,8 @@ def field_drawer(workspace: Workspace, device: str) -> FieldDrawer:
     manifest = workspace.published("train")
     assert manifest is not None  # callers have made sure
     field = load_field(artifacts.field_path(workspace.stage_folder("train")), device)
-    return FieldDrawer(field.fields, TrainParams(**manifest.identity.params), device)
+    params = TrainParams.model_validate(section_with_new_names("train", manifest.identity.params))
+    return FieldDrawer(field.fields, params, device)
 
 
 def mean_scores(photos: list[dict[str, Any]]) -> dict[str, Any]:
