@@ -35,20 +35,8 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any
 
-from benchmarks.run_sets import (
-    NOT_MEASURED,
-    OUT,
-    PAGE,
-    RESULTS,
-    ROOT,
-    find_sets,
-    known_cameras,
-    machine,
-    markdown_table,
-    photos_of,
-    run_hineus,
-    with_table,
-)
+from benchmarks.pages import NOT_MEASURED, markdown_table, write_tables
+from benchmarks.run_sets import OUT, RESULTS, ROOT, find_sets, known_cameras, machine, photos_of, run_hineus
 from stages.engine.stage import Stage, StageContext
 from stages.errors import HineusError
 from stages.posing import neus
@@ -523,10 +511,10 @@ def _mean(values: Sequence[float], digits: int) -> str:
     return f"{fmean(values):.{digits}f}" if values else "-"
 
 
-def write_table() -> None:
+def tables() -> dict[str, str]:
+    """The tables, from the result files."""
     runs = load_runs()
-    body = ablation_table(runs) if runs else NOT_MEASURED
-    PAGE.write_text(with_table(PAGE.read_text(encoding="utf-8"), "ablation", body), encoding="utf-8")
+    return {"ablation": ablation_table(runs) if runs else NOT_MEASURED}
 
 
 # ---------------------------------------------------------------- command
@@ -582,7 +570,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"{len(plans)} runs to make (others have a result; --again measures them anew)", file=sys.stderr)
         jobs = arguments.jobs or (1 if has_cuda() else available_cores())
         failed += run_plans(plans, data, jobs, arguments.keep)
-    write_table()
+    write_tables(tables())
     return 1 if failed else 0
 
 

@@ -16,6 +16,7 @@ from configs.params import Config
 ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
 PAGES = sorted([*ROOT.glob("*.md"), *DOCS.rglob("*.md")])
+MEASURED = [*sorted((DOCS / "benchmarks").glob("*.md")), DOCS / "what-to-expect.md"]
 
 
 def _make_reference():
@@ -99,35 +100,29 @@ def test_every_loss_has_a_row_on_the_math_page():
 
 
 # ---------------------------------------------------------------- benchmarks
-def test_every_table_of_the_benchmarks_has_its_command_above():
+@pytest.mark.parametrize("page", MEASURED, ids=lambda page: page.stem)
+def test_every_table_of_measurements_has_its_command_above(page):
     """Between a heading and its table stands the command that makes it."""
-    for section in (DOCS / "benchmarks.md").read_text(encoding="utf-8").split("\n## ")[1:]:
-        if "<!-- table" in section or "\n|" in section:
-            above = re.split(r"<!-- table|\n\|", section)[0]
+    for section in re.split(r"^##? ", page.read_text(encoding="utf-8"), flags=re.M)[1:]:
+        if found := re.search(r"<!-- table|^\|.*\|\n\| --- \|.*---:", section, flags=re.M):
+            above = section[: found.start()]
             assert re.search(r"```\n(.*\n)*?(python -m benchmarks|hineus|make) ?.*\n(.*\n)*?```", above), section[:80]
-
-
-def test_the_benchmark_tables_are_those_of_the_result_files():
-    from benchmarks.run_sets import updated_page
-
-    page = (DOCS / "benchmarks.md").read_text(encoding="utf-8")
-    assert page == updated_page(page), "run `make docs`"
-
-
-def test_the_tables_of_suites_are_those_of_their_result_files():
-    from benchmarks.suites import FOLDER, with_suites
-    from stages.evaluation.suite_runs import load_results
-
-    page = (DOCS / "benchmarks.md").read_text(encoding="utf-8")
-    assert page == with_suites(page, load_results(FOLDER)), "run `make docs`"
 
 
 # ---------------------------------------------------------------- all pages
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_links_between_pages_lead_somewhere(page):
-    for target in re.findall(r"\]\(([^)#\s]+)", page.read_text(encoding="utf-8")):
+    for target, heading in re.findall(r"\]\(([^)#\s]*)(?:#([^)\s]+))?\)", page.read_text(encoding="utf-8")):
         if not target.startswith(("http:", "https:")):
-            assert (page.parent / target).exists(), f"{page.name} links to {target}"
+            file = page.parent / target if target else page
+            assert file.exists(), f"{page.name} links to {target}"
+            assert not heading or heading in _anchors(file), f"{page.name} links to {target}#{heading}"
+
+
+def _anchors(page):
+    """The names that GitHub gives to a page's headings."""
+    headings = re.findall(r"^#+ (.+)$", page.read_text(encoding="utf-8"), flags=re.M)
+    return {re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-") for heading in headings}
 
 
 def _shell_lines(page):
