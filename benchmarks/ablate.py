@@ -83,9 +83,6 @@ VARIANTS: dict[str, dict[str, str]] = {
     # its weight is made of the planar term's
     "eikonal-paper": {"train.planar": "paper", "train.eikonal": "paper"},
     "all-paper": {**dict.fromkeys(TERMS, "paper"), "train.visibility": "paper"},
-    # forms of our own: see docs/math.md
-    "eikonal-annealed": {"train.eikonal_start": "0.3", "train.eikonal_end": "3"},
-    "consistency": {"train.weight_consistency": "0.1"},
     # the colours and the Eikonal term alone, as in NeuS: no SfM points, no reflected direction
     "rgb+eikonal": {"train.weight_sparse": "0", "train.radiance_inputs": "view"},
     "density-neus": {"train.density": "neus"},

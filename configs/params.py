@@ -272,10 +272,6 @@ class TrainParams(Section):
     adam_beta2: float = Field(0.99, gt=0, lt=1, description="Adam's decay of the squared gradients")
 
     weight_eikonal: float = Field(0.1, ge=0, description="weight of the Eikonal term")
-    eikonal_start: float = Field(
-        1.0, gt=0, description="the Eikonal term is scaled by this at the start, then on a log scale to `eikonal_end`"
-    )
-    eikonal_end: float = Field(1.0, gt=0, description="the Eikonal term is scaled by this at the end")
     weight_sparse: float = Field(1.0, ge=0, description="weight of the SfM points' terms, faded out")
     sparse_until: float = Field(0.8, ge=0, le=1, description="progress at which the SfM points' term is gone")
     sparse_tolerance: float = Field(0.005, gt=0, description="SfM points off by this count linearly, scene units")
@@ -322,12 +318,6 @@ class TrainParams(Section):
     planar_rays: int = Field(256, ge=1, description="rays per step that the planar term looks at")
     planar_neighbors: int = Field(4, ge=1, description="places around each of their surface points")
     planar_until: float = Field(1.0, gt=0, le=1, description="progress from which lambda_pla is not scaled down")
-
-    weight_consistency: float = Field(
-        0.0, ge=0, description="weight of the term that compares patches of the photos with each other; 0: off"
-    )
-    consistency_from: float = Field(0.4, ge=0, le=1, description="progress at which that term begins")
-    consistency_rays: int = Field(128, ge=1, description="rays per step that it looks at")
 
     eikonal: Literal["plain", "paper", "stable"] = Field(
         "plain", description="hold the SDF's gradient to length 1 evenly, or less where the photos are not met yet"

@@ -50,7 +50,6 @@ def like_cuda(monkeypatch):
 def waits_of_steps(trainer) -> Waits:
     """In the steps at the beginning, in the middle and at the end, with full and partial refreshes of the grid."""
     trainer.step(0.0)  # the optimiser makes its state
-    assert trainer.terms.color_precision is not None  # made once
     with Waits() as waits:
         for step in range(1, 6 * TINY.cache_every):
             trainer.step_index = step
@@ -61,7 +60,7 @@ def waits_of_steps(trainer) -> Waits:
 @pytest.mark.parametrize(("masks", "precision"), [(False, "mixed"), (True, "float32")])
 def test_a_step_does_not_wait_for_the_device(like_cuda, masks, precision):
     like_cuda()
-    settings = {"rays": 16, "precision": precision, "weight_consistency": 0.1}
+    settings = {"rays": 16, "precision": precision}
     waits = waits_of_steps(make_trainer(TINY.model_copy(update=settings), masks=masks))
     assert waits.operations > 1000
     assert not waits.found

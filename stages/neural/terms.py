@@ -14,8 +14,7 @@ from functools import cached_property
 import torch
 
 from configs.params import TrainParams
-from stages.neural import consistency, losses, schedules, visibility
-from stages.neural.acceleration import first_rows
+from stages.neural import losses, schedules, visibility
 from stages.neural.fields import Fields, points_at_a_time
 from stages.neural.renderer import OPAQUE, Rendered
 from stages.neural.sampling import SdfCache
@@ -24,10 +23,6 @@ from stages.neural.training_photos import Photos
 
 # Samples that weigh more than this count as near the surface for the relaxed Eikonal term.
 _NEAR_SURFACE_WEIGHT = 0.01
-# Photos that a ray's patch is compared with; half of them, those it matches best, count.
-_CONSISTENCY_VIEWS = 8
-# Pixels from sample to sample of a patch, at first and from this progress on.
-_PATCH_STEPS, _FINE_PATCHES_FROM = (2, 1), 0.75
 
 
 class Terms:
@@ -197,48 +192,6 @@ class Terms:
         disk = torch.nn.functional.normalize(tangent, dim=2) * (reach * radius).sqrt()  # even over the disk's area
         half = torch.arange(shape[1], device=self.device) % 2 == 0
         return torch.where(half[None, :, None], on_ray * reach, disk)
-
-    # ------------------------------------------------------------------ consistency
-    def consistency_loss(self, rendered: Rendered, moment: Moment) -> torch.Tensor:
-        """Mean disagreement of the photos around the surface points of some of the rays (not in the paper).
-
-        The paper's visibility says which photos see a point, and its ambiguity how far they are to be trusted.
-        """
-        params, photos, batch = self.params, self.photos, rendered.batch
-        if params.weight_consistency == 0 or moment.progress < params.consistency_from:
-            return torch.zeros((), device=self.device)
-        met = rendered.opacity.detach() > OPAQUE
-        if batch.masks is not None:
-            met = met & (batch.masks > 0.5)
-        hit = first_rows(met, params.consistency_rays)
-        images, directions = batch.images[hit], batch.directions[hit]
-        surface = rendered.surface[0][hit]
-        sdf, _, gradients = self.fields.sdf(surface, moment.levels)
-        points = consistency.slide_to_surface(surface, directions, sdf, gradients)
-        normals = torch.nn.functional.normalize(gradients, dim=1)
-        with torch.no_grad():
-            colors, in_frame = photos.observe(points)
-            candidates = in_frame & photos.training
-            views, facing, fit = consistency.views_beside(
-                photos.centers, points, normals, directions, candidates, _CONSISTENCY_VIEWS
-            )
-            smallest = visibility.smallest_sdf_on_paths(
-                self.cache, points[:, None].expand(*views.shape, 3).reshape(-1, 3), photos.centers[views.view(-1)],
-                self._path_margin(facing.reshape(-1), moment), params.visibility_samples, params.visibility_sharpness,
-            )  # fmt: skip
-            seen = fit * visibility.sdf_visibility(smallest, params.visibility_sharpness).view_as(facing)
-            gains = torch.exp(self.fields.log_gains)
-            others = colors.gather(1, views[..., None].expand(-1, -1, 3)) / gains[views]
-            own = batch.colors[hit] / gains[images]
-            distance = visibility.mahalanobis(own[:, None], others, self.color_precision)
-            trust = consistency.patch_trust(visibility.ambiguity(seen, distance)) * met[hit]
-            pixels = consistency.pixels_of(photos, images, points)
-        planes = consistency.tangent_planes(photos, images, points, normals)
-        step = _PATCH_STEPS[0] if moment.progress < _FINE_PATCHES_FROM else _PATCH_STEPS[1]
-        errors = consistency.patch_errors(photos, images, pixels, planes, views, step)
-        valid = (seen > visibility.VISIBLE) & (errors.detach() >= 0)
-        per_ray = consistency.mean_of_best(errors, valid, _CONSISTENCY_VIEWS // 2)
-        return (trust * per_ray).mean()
 
     # ------------------------------------------------------------------ Eikonal relaxation
     def relaxation(

@@ -143,16 +143,11 @@ class Trainer:
         sparse_loss = sighting_loss(rendered.extra_sdf[: len(places)], sparse_weights, params)
         exposure_loss = losses.exposure_error(self.fields.log_gains).mean()
         proposal_loss = self._proposal_loss(rendered)
-        consistency_loss = self.terms.consistency_loss(rendered, moment)
 
-        eikonal_weight = params.weight_eikonal * schedules.exponential(
-            progress, params.eikonal_start, params.eikonal_end
-        )
         loss = (
             rgb_loss
-            + eikonal_weight * eikonal_loss
+            + params.weight_eikonal * eikonal_loss
             + params.weight_planar * planar_loss
-            + params.weight_consistency * consistency_loss
             + params.weight_sparse * schedules.fade_out(progress, params.sparse_until) * sparse_loss
             + params.weight_mask * mask_loss
             + params.weight_exposure * exposure_loss
@@ -179,7 +174,6 @@ class Trainer:
                 "rgb": rgb_loss.detach(),
                 "eikonal": eikonal_loss.detach(),
                 "planar": planar_loss.detach(),
-                "consistency": consistency_loss.detach(),
                 "sparse": sparse_loss.detach(),
                 "mask": mask_loss.detach(),
                 "appearance": appearance_loss.detach(),
