@@ -73,7 +73,7 @@ def cost_table(results: Sequence[Result]) -> str:
         width, height = (result.number("undistort", side) for side in ("width", "height"))
         rows.append(
             [
-                SCENES[result.name],
+                SCENES.get(result.name, result.name),
                 f"{result.number('sfm', 'images')} of {width} x {height}",
                 *(f"{part / 60:.1f}" for part in (poses, train, result.wall_s - poses - train, result.wall_s)),
                 f"{result.cpu_s / 60:.1f}",
