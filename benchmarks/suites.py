@@ -15,11 +15,11 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.run_sets import NOT_MEASURED, PAGE, RESULTS, markdown_table, with_table
-from hineus_cli.bench_tables import TextTable, score_of, tables_of
 from stages import artifacts
-from stages.evaluation.suite_runs import load_results
 from stages.evaluation.suites.paper import paper_tables
 from stages.evaluation.suites.registry import SUITES
+from stages.evaluation.suites.runs import load_results
+from stages.evaluation.suites.tables import TextTable, score_of, tables_of
 
 FOLDER = RESULTS / "suites"
 

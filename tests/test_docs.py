@@ -116,7 +116,7 @@ def test_the_benchmark_tables_are_those_of_the_result_files():
 
 def test_the_tables_of_suites_are_those_of_their_result_files():
     from benchmarks.suites import FOLDER, with_suites
-    from stages.evaluation.suite_runs import load_results
+    from stages.evaluation.suites.runs import load_results
 
     page = (DOCS / "benchmarks.md").read_text(encoding="utf-8")
     assert page == with_suites(page, load_results(FOLDER)), "run `make docs`"
