@@ -149,7 +149,7 @@ class Run:
         machine: CPU, cores, versions, device, how many runs went side by side.
         poses: hash of the undistorted photos and poses it started from.
         code: hash of the sources in `stages/neural`.
-        score: distances of the clean mesh, see `stages.evaluation.known_surface`; None without a known surface.
+        score: distances of the clean mesh, see `protocols.known_object`; None without a known surface.
         psnr: of the training's rays at its end, dB.
         held_out_psnr: of photos left out of the training, dB; None where none were.
         train_wall_s, train_cpu_s: seconds of the training stage.
@@ -256,7 +256,7 @@ def code_hash() -> str:
 def measured_stages(truth: Path) -> list[Stage]:
     """The stages of a run; a mesh that nothing is known of is not made."""
     from stages.cleanup import CLEANUP
-    from stages.evaluation.known_object import has_truth
+    from stages.evaluation.protocols.known_object import has_truth
     from stages.extract import EXTRACT
     from stages.train import TRAIN
 
@@ -329,7 +329,7 @@ def score_clean_mesh(
 ) -> dict[str, float] | None:
     """Distances of the run's clean mesh to the known surface, None where there is none; see `score_mesh`."""
     from stages import artifacts
-    from stages.evaluation.known_object import file_stem, has_truth, score_mesh
+    from stages.evaluation.protocols.known_object import file_stem, has_truth, score_mesh
 
     if not has_truth(truth):
         return None
@@ -516,7 +516,7 @@ def tables() -> dict[str, str]:
 
 # ---------------------------------------------------------------- command
 def main(argv: Sequence[str] | None = None) -> int:
-    from stages.evaluation.known_object import has_truth
+    from stages.evaluation.protocols.known_object import has_truth
     from stages.reconstruct import available_cores, default_preset, has_cuda
 
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)

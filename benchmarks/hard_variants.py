@@ -69,7 +69,7 @@ class Row:
         attempts: what each rung of the ladder did, see `stages.posing.ladder.Step`.
         cpu_s: CPU seconds of the sfm stage, all attempts.
         failure: message and hint of the error that ended the row, or None.
-        score: distances of the clean mesh to the truth, see `evaluation.known_surface`; None where it was not made.
+        score: distances of the clean mesh to the truth, see `protocols.known_object`; None where it was not made.
         mesh_preset: preset of the training behind that mesh; mesh_settings: what was set over it, SECTION.KEY=VALUE.
     """
 
@@ -255,13 +255,15 @@ def true_centers(folder: Path) -> tuple[list[np.ndarray], float] | None:
 
     The extent of a set in the layout of NeuS is the diameter of its sphere.
     """
-    from stages.evaluation.known_object import has_truth, load_known_surface
+    from stages.evaluation.protocols.known_object import has_truth, load_known_object
 
     source = photos_of(folder)
     if source is not None and has_truth(folder):
-        known, centers = load_known_surface(folder)
-        by_stem = {Path(name).stem: center for name, center in centers.items()}
-        return [by_stem[path.stem] for path in sorted(source.iterdir())], known.extent
+        known = load_known_object(folder)
+        by_stem = {
+            Path(name).stem: center for name, center in zip(known.cameras.names, known.cameras.centers, strict=True)
+        }
+        return [by_stem[path.stem] for path in sorted(source.iterdir())], known.surface.extent
     if (path := known_cameras(folder)) is not None:
         stated = read_neus(path)
         poses = [camera.cam_from_world for camera in stated.cameras]
@@ -298,7 +300,7 @@ def known_stem(source: Path, variant: str) -> Callable[[str], str]:
 
     Frames of a video have their numbers at the end of their names.
     """
-    from stages.evaluation.known_object import file_stem
+    from stages.evaluation.protocols.known_object import file_stem
 
     if variant != "video":
         return file_stem
@@ -311,9 +313,10 @@ def _stems(source: Path) -> list[str]:
 
 
 def _found_centers(model: Path) -> dict[str, np.ndarray]:
-    from stages.evaluation.known_object import load_model_centers
+    from stages.evaluation.reading import read_cameras
 
-    return load_model_centers(model)
+    cameras = read_cameras(model).pinhole
+    return dict(zip(cameras.names, cameras.centers, strict=True))
 
 
 # ---------------------------------------------------------------- one row
@@ -324,7 +327,7 @@ def run_row(row: str, data: Path, mesh: bool, preset: str, settings: Sequence[st
         RuntimeError: `hineus` broke, rather than saying why it cannot.
     """
     from stages import artifacts
-    from stages.evaluation.known_object import has_truth
+    from stages.evaluation.protocols.known_object import has_truth
 
     photos = make_photos(row, data)
     workspace = FOLDERS / row / "workspace"

@@ -1,6 +1,6 @@
 """Photos that training and texture did without, against drawings of the trained field and of the final mesh.
 
-python -m benchmarks.held_out WORKSPACE ...      these, each trained with `--set train.holdout=8`
+python -m benchmarks.held_out WORKSPACE ...      these, each made with `--hold-out 8`
 python -m benchmarks.held_out --table-only       only rewrite the table of docs/benchmarks/held-out.md
 
 Results go to benchmarks/results/held_out/NAME.json, where NAME is the workspace's.
@@ -35,7 +35,7 @@ COLUMNS = (
 
 def measure(workspace: Path) -> dict[str, Any]:
     """One workspace's scores, without what belongs to this machine's folders."""
-    from stages.evaluation.against_photos import evaluate_views
+    from stages.evaluation.photos.held_out import evaluate_views
 
     found = evaluate_views(workspace)
     kept = {key: found[key] for key in ("photos", "mean", "done")}
@@ -67,7 +67,7 @@ def tables() -> dict[str, str]:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("workspaces", type=Path, nargs="*", help="trained with train.holdout")
+    parser.add_argument("workspaces", type=Path, nargs="*", help="made with --hold-out")
     parser.add_argument("--table-only", action="store_true", help="measure nothing")
     arguments = parser.parse_args()
     if not arguments.workspaces and not arguments.table_only:

@@ -59,7 +59,7 @@ class Result:
         command: that made it, with DATA for the folder of sets.
         machine: CPU, cores, versions.
         stages: in order.
-        score: distances in percent of the extent, or None without truth; see `stages.evaluation.known_surface`.
+        score: distances in percent of the extent, or None without truth; see `protocols.known_object`.
         validator: counts of the glTF validator's messages, or None where it is not installed.
         glb_bytes: size of the textured model.
         seed: of the training.
@@ -171,7 +171,7 @@ def run_hineus(arguments: Sequence[str]) -> dict[str, Any]:
 
 def _score(workspace: Path, truth: Path | None) -> dict[str, float] | None:
     from stages import artifacts
-    from stages.evaluation.known_object import has_truth, score_mesh
+    from stages.evaluation.protocols.known_object import has_truth, score_mesh
 
     if truth is None or not has_truth(truth):
         return None

@@ -16,11 +16,11 @@ from typing import Any
 
 from benchmarks.pages import NOT_MEASURED, markdown_table, write_tables
 from benchmarks.run_sets import RESULTS
-from hineus_cli.bench_tables import TextTable, score_of, tables_of
 from stages import artifacts
-from stages.evaluation.suite_runs import load_results
 from stages.evaluation.suites.paper import paper_tables
 from stages.evaluation.suites.registry import SUITES
+from stages.evaluation.suites.runs import load_results
+from stages.evaluation.suites.tables import TextTable, score_of, tables_of
 
 FOLDER = RESULTS / "suites"
 

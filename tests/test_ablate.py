@@ -312,7 +312,7 @@ def test_the_mesh_is_scored_in_the_world_frame(here, monkeypatch):
         seen["vertices"], seen["model"] = artifacts.load_mesh(mesh.parent)[0], model
         return {"mean": 1.0}
 
-    monkeypatch.setattr("stages.evaluation.known_object.score_mesh", score_mesh)
+    monkeypatch.setattr("stages.evaluation.protocols.known_object.score_mesh", score_mesh)
     assert ablate.score_clean_mesh(folder, here / "shared", truth / "helmet") == {"mean": 1.0}
     assert np.allclose(seen["vertices"], 2 * corners + [1, 0, 0])
     assert seen["model"] == here / "shared" / "sfm" / "model"

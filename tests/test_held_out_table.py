@@ -23,7 +23,7 @@ def test_the_table_has_a_row_a_workspace_and_dashes_where_nothing_can_be_said(tm
 
 
 def test_a_measurement_keeps_no_folder_of_the_machine(tmp_path, monkeypatch):
-    from stages.evaluation import against_photos
+    from stages.evaluation.photos import held_out as against_photos
 
     found = {"workspace": str(tmp_path), "renders": None, "photos": [], "mean": {}, "done": ["photos: 1 of 2"]}
     monkeypatch.setattr(against_photos, "evaluate_views", lambda workspace: found)

@@ -1,15 +1,18 @@
-"""`hineus evaluate`: results against truths, by distance or by a benchmark's own protocol, and against photos."""
+"""`hineus evaluate`: results against truths, by distance or by a benchmark's own protocol, and against photos.
+
+`hineus compare` is `evaluate mesh` of two files as they are.
+"""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
-from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
+from hineus_cli.options import Device, Json
+from hineus_cli.session import print_json
 from stages.errors import ConfigError
 
 evaluate_app = typer.Typer(
@@ -33,7 +36,11 @@ Matrix = Annotated[
     typer.Option(help="Text file of 4 x 4 numbers that takes what is judged to the truth's frame.", show_default=False),
 ]
 Seed = Annotated[int, typer.Option(help="Of the random numbers that choose points.")]
-Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout.")]
+DistanceMap = Annotated[
+    Path | None,
+    typer.Option("--map", help="Write what is judged, coloured by its distance to the truth, as PLY.",
+                 show_default=False),
+]  # fmt: skip
 
 
 @evaluate_app.command("mesh")
@@ -75,17 +82,18 @@ def evaluate_mesh(
             show_default=False,
         ),
     ] = None,
+    distance_map: DistanceMap = None,
     as_json: Json = False,
 ) -> None:
     """A surface against a true one: accuracy, completeness, Chamfer, F-scores and normals, both ways."""
-    from stages.evaluation import against_truth
+    from stages.evaluation.protocols.plain import MOTIONS, MeshOptions, evaluate_mesh
 
     def evaluate() -> dict[str, Any]:
-        if icp is not None and icp not in against_truth.MOTIONS:
-            raise ConfigError(f"There is no ICP '{icp}'.", f"Choose {' or '.join(against_truth.MOTIONS)}.")
+        if icp is not None and icp not in MOTIONS:
+            raise ConfigError(f"There is no ICP '{icp}'.", f"Choose {' or '.join(MOTIONS)}.")
         numbers, parts = _lengths(thresholds, "--thresholds")
         corners, margin = _box(box)
-        options = against_truth.MeshOptions(
+        options = MeshOptions(
             thresholds=numbers,
             threshold_parts=parts,
             samples=samples,
@@ -100,10 +108,27 @@ def evaluate_mesh(
             grow=grow,
             box=corners,
             box_margin=margin,
+            distance_map=distance_map,
         )
-        return against_truth.evaluate_mesh(predicted, truth, options)
+        return evaluate_mesh(predicted, truth, options)
 
     _run(context, as_json, evaluate, _show_surfaces)
+
+
+def compare(
+    context: typer.Context,
+    first: Annotated[Path, typer.Argument(help="Mesh file, or workspace: its exported PLY.", show_default=False)],
+    second: Annotated[Path, typer.Argument(help="As the first; it is taken for the truth.", show_default=False)],
+    icp: Annotated[bool, typer.Option("--icp", help="Move the first onto the second before (rigid).")] = False,
+    distance_map: DistanceMap = None,
+    as_json: Json = False,
+) -> None:
+    """How far two meshes, or two workspaces' results, are from each other, both ways: `evaluate mesh` of the files."""
+    from stages.evaluation.protocols.plain import MeshOptions, evaluate_mesh
+    from stages.evaluation.reading import mesh_path
+
+    options = MeshOptions(icp="rigid" if icp else None, distance_map=distance_map)
+    _run(context, as_json, lambda: evaluate_mesh(mesh_path(first), mesh_path(second), options), _show_surfaces)
 
 
 @evaluate_app.command("dtu")
@@ -116,9 +141,9 @@ def evaluate_dtu(
     as_json: Json = False,
 ) -> None:
     """DTU's protocol: observed cells, plane cut, distances below 20 mm. DATA has ObsMask/ and Points/stl/."""
-    from stages.evaluation import against_truth
+    from stages.evaluation.protocols.dtu import evaluate_dtu as score
 
-    _run(context, as_json, lambda: against_truth.evaluate_dtu(predicted, data, scan, seed), _show_numbers)
+    _run(context, as_json, lambda: score(predicted, data, scan, seed), _show_numbers)
 
 
 @evaluate_app.command("glossy")
@@ -134,9 +159,9 @@ def evaluate_glossy(
     as_json: Json = False,
 ) -> None:  # fmt: skip
     """GlossySynthetic's protocol: points of what the test views see. DATA is an object's folder, e.g. bell."""
-    from stages.evaluation import against_truth
+    from stages.evaluation.protocols.glossy import evaluate_glossy as score
 
-    _run(context, as_json, lambda: against_truth.evaluate_glossy(predicted, data, split), _show_numbers)
+    _run(context, as_json, lambda: score(predicted, data, split), _show_numbers)
 
 
 @evaluate_app.command("tanks")
@@ -154,12 +179,12 @@ def evaluate_tanks(
     as_json: Json = False,
 ) -> None:
     """Tanks and Temples' protocol: F-score at tau in the crop volume. DATA is a scene's folder, e.g. Ignatius."""
-    from stages.evaluation import against_truth
+    from stages.evaluation.protocols.tanks import evaluate_tanks as score
 
     _run(
         context,
         as_json,
-        lambda: against_truth.evaluate_tanks(predicted, data, cameras, tau, refine, matrix, seed),
+        lambda: score(predicted, data, cameras, tau, refine, matrix, seed),
         _show_numbers,
     )
 
@@ -167,17 +192,17 @@ def evaluate_tanks(
 @evaluate_app.command("views")
 def evaluate_views(
     context: typer.Context,
-    workspace: Annotated[Path, typer.Argument(help="Workspace trained with `train.holdout`.", show_default=False)],
+    workspace: Annotated[Path, typer.Argument(help="Workspace made with `--hold-out`.", show_default=False)],
     renders: Annotated[
         Path | None, typer.Option(help="Folder for the photos and their drawings.", show_default=False)
     ] = None,
-    device: Annotated[str, typer.Option(help="auto, cpu or cuda.")] = "auto",
+    device: Device = "auto",
     as_json: Json = False,
 ) -> None:
     """Photos held back from training, against drawings of the field and of the textured mesh."""
-    from stages.evaluation import against_photos
+    from stages.evaluation.photos.held_out import evaluate_views as score
 
-    _run(context, as_json, lambda: against_photos.evaluate_views(workspace, renders, device), _show_views)
+    _run(context, as_json, lambda: score(workspace, renders, device), _show_views)
 
 
 # ---------------------------------------------------------------- running, showing
@@ -187,14 +212,12 @@ def _run(
     evaluate: Callable[[], dict[str, Any]],
     show: Callable[[dict[str, Any]], None],
 ) -> None:
-    from hineus_cli.console import product, set_up_logging, stdout_kept_clean
+    from hineus_cli.console import product
 
-    context.obj.json = as_json
-    set_up_logging()
-    with stdout_kept_clean() if as_json else nullcontext():
+    with context.obj.working():
         found = evaluate()
     if as_json:
-        typer.echo(json.dumps({"ok": True, **found}))
+        print_json(found)
         return
     show(found)
     console = product()

@@ -25,11 +25,11 @@ from stages.engine.stage import Stage
 from stages.engine.workspace import Workspace, storage_errors
 from stages.errors import HineusError, InputError
 from stages.evaluation.machine import machine
-from stages.evaluation.peers import MESH, Peer, run_peer
-from stages.evaluation.pose_export import export_poses
-from stages.evaluation.suite_scores import posed_mesh, result_mesh, score_result
+from stages.evaluation.peers.running import MESH, Peer, run_peer
 from stages.evaluation.suites.registry import Suite, find_scenes
 from stages.evaluation.suites.scene import SuiteScene, Wanted
+from stages.evaluation.suites.scores import posed_mesh, result_mesh, score_result
+from stages.export_poses import export_poses
 from stages.posing.exporting import write_colmap
 from stages.reconstruct import Reconstruction, Request, default_preset, reconstruct
 

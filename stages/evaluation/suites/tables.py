@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from stages.evaluation.suite_runs import OURS
 from stages.evaluation.suites.paper import PaperTable, paper_tables
 from stages.evaluation.suites.registry import Suite
+from stages.evaluation.suites.runs import OURS
 
 GIB = 1 << 30
 NONE = "-"

@@ -9,11 +9,13 @@ import numpy as np
 
 from stages import artifacts
 from stages.engine.workspace import Workspace
-from stages.evaluation import against_truth
-from stages.evaluation.comparison import read_mesh
-from stages.evaluation.known_object import score_mesh
+from stages.evaluation.photos.test_photos import TestPhotos, score_test_views
+from stages.evaluation.protocols.blendedmvs import evaluate_blended
+from stages.evaluation.protocols.dtu import evaluate_dtu
+from stages.evaluation.protocols.glossy import evaluate_glossy
+from stages.evaluation.protocols.known_object import score_mesh
+from stages.evaluation.reading import read_mesh
 from stages.evaluation.suites.scene import SuiteScene, Truth
-from stages.evaluation.test_photos import TestPhotos, score_test_views
 from stages.geometry.similarity import Similarity
 
 
@@ -76,22 +78,12 @@ def score_surface(truth: Truth, mesh: Path, workspace: Workspace) -> dict[str, A
     if truth.protocol == "known":
         return dict(score_mesh(mesh, artifacts.model_path(workspace.stage_folder("sfm")), truth.folder))
     if truth.protocol == "dtu":
-        return _without_paths(against_truth.evaluate_dtu(mesh, truth.folder, truth.scan))
+        return _without_paths(evaluate_dtu(mesh, truth.folder, truth.scan))
     if truth.protocol == "glossy":
-        return _without_paths(against_truth.evaluate_glossy(mesh, truth.folder, truth.split))
-    return _score_depth_maps(mesh, truth.folder)
+        return _without_paths(evaluate_glossy(mesh, truth.folder, truth.split))
+    return evaluate_blended(mesh, truth.folder)
 
 
 def _without_paths(found: dict[str, Any]) -> dict[str, Any]:
     """Only what was measured: results are passed on, and folders here mean nothing elsewhere."""
     return {key: value for key, value in found.items() if key not in ("predicted", "truth", "done")}
-
-
-def _score_depth_maps(mesh: Path, folder: Path) -> dict[str, Any]:
-    """Against the points of BlendedMVS' rendered depth maps; distances also in percent of their extent."""
-    from stages.evaluation.scenes import blended_score
-    from stages.evaluation.suites.depth_maps import true_points
-    from stages.evaluation.surfaces import Surface
-
-    scores = blended_score(Surface(*read_mesh(mesh)), Surface(true_points(folder)))
-    return {**scores.as_dict(), "chamfer_percent": 100 * scores.chamfer / scores.extent}

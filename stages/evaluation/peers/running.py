@@ -32,7 +32,7 @@ BUILT_IN = {
     "ball-pivoting": "ball pivoting of the sparse points (pymeshlab)",
     "colmap-dense": "COLMAP's patch-match stereo, fusion and Poisson; needs pycolmap with CUDA",
 }
-PROGRAM = Path(__file__).with_name("builtin_peers.py")
+PROGRAM = Path(__file__).with_name("builtin.py")
 PLACEHOLDERS = ("photos", "model", "masks", "out")
 MESH, LOG = "mesh.ply", "output.log"
 # Seconds between looks at its memory: many at first, for a command that soon ends.

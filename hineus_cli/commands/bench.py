@@ -1,16 +1,17 @@
-"""The command `bench`: parse, run the suite, print our rows beside the paper's."""
+"""`hineus bench`."""
 
 from __future__ import annotations
 
-import json
-from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from hineus_cli.options import Device, Json, Preset, Sets, Until, Verbose, Workers, hold_out_option
+from hineus_cli.session import print_json
+
 if TYPE_CHECKING:
-    from hineus_cli.bench_tables import TextTable
+    from stages.evaluation.suites.tables import TextTable
 
 
 def bench(
@@ -27,18 +28,11 @@ def bench(
     scenes: Annotated[
         str | None, typer.Option(help="Names of scenes, with commas between; default: all.", show_default=False)
     ] = None,
-    preset: Annotated[
-        str | None,
-        typer.Option(help="See `hineus presets`; default: gpu with a CUDA device, else cpu.", show_default=False),
-    ] = None,
-    sets: Annotated[
-        list[str] | None, typer.Option("--set", help="One setting: section.key=value. Repeatable.", show_default=False)
-    ] = None,
+    preset: Preset = None,
+    sets: Sets = None,
     seeds: Annotated[int, typer.Option(min=1, help="Runs of each scene, with seeds 0, 1, ...")] = 1,
-    until: Annotated[str | None, typer.Option(help="Stop after this stage.", show_default=False)] = None,
-    hold_out: Annotated[
-        int, typer.Option(min=0, help="Keep every n-th photo back as a test, where the suite names none.")
-    ] = 0,
+    until: Until = None,
+    hold_out: Annotated[int | None, hold_out_option("from every stage as a test, where the suite names none")] = None,
     masks: Annotated[bool, typer.Option("--masks", help="Use the masks that come with the photos.")] = False,
     truth: Annotated[
         Path | None, typer.Option(help="Folder of the evaluation data, if it lies elsewhere.", show_default=False)
@@ -51,32 +45,30 @@ def bench(
             show_default=False,
         ),
     ] = None,
-    device: Annotated[str, typer.Option(help="auto, cpu or cuda.")] = "auto",
-    workers: Annotated[int | None, typer.Option(min=1, help="CPU threads; default: all.", show_default=False)] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout.")] = False,
-    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Say more.")] = False,
+    device: Device = "auto",
+    workers: Workers = None,
+    as_json: Json = False,
+    verbose: Verbose = False,
 ) -> None:
     """Run a benchmark's scenes, score them by its protocol, and print them beside the paper's figures."""
     from dataclasses import asdict
 
-    from hineus_cli.bench_tables import tables_of
-    from hineus_cli.console import ProgressDisplay, product, set_up_logging, stdout_kept_clean
-    from stages.evaluation.peers import parse_peer
-    from stages.evaluation.suite_runs import BenchRequest, run_bench
+    from hineus_cli.console import product
+    from stages.evaluation.peers.running import parse_peer
     from stages.evaluation.suites.paper import paper_tables
     from stages.evaluation.suites.registry import find_suite
+    from stages.evaluation.suites.runs import BenchRequest, run_bench
     from stages.evaluation.suites.scene import Wanted
+    from stages.evaluation.suites.tables import tables_of
 
     session = context.obj
-    session.json = as_json
-    set_up_logging(verbose)
     request = BenchRequest(
         suite=find_suite(suite),
         data=data,
         out=out,
         scenes=tuple(name.strip() for name in scenes.split(",")) if scenes else (),
         seeds=seeds,
-        wanted=Wanted(masks, hold_out, truth),
+        wanted=Wanted(masks, hold_out or 0, truth),
         peers=tuple(parse_peer(text) for text in peer or ()),
         preset=preset,
         sets=tuple(sets or ()),
@@ -84,17 +76,14 @@ def bench(
         device=device,
         workers=workers,
     )
-    with stdout_kept_clean() if as_json else nullcontext(), ProgressDisplay() as session.progress:
-        results = list(run_bench(request, session.pipeline, session.progress))
+    with session.running(verbose) as progress:
+        results = list(run_bench(request, session.pipeline, progress))
     if as_json:
         paper = paper_tables().get(suite)
-        answer = {
-            "ok": not any("error" in result for result in results),
-            "suite": suite,
-            "results": results,
-            "paper": asdict(paper) if paper else None,
-        }
-        typer.echo(json.dumps(answer))
+        print_json(
+            {"suite": suite, "results": results, "paper": asdict(paper) if paper else None},
+            ok=not any("error" in result for result in results),
+        )
     else:
         for table in tables_of(request.suite, results):
             _print(product(), table)

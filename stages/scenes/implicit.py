@@ -78,9 +78,16 @@ def mesh_of(
     shape: Shape, low: Sequence[float], high: Sequence[float], cell: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Vertices [V, 3], outward faces [F, 3] and unit normals [V, 3] of `shape` = 0 in a box, from a grid of `cell`."""
+    vertices, faces = march(shape, [np.arange(low[i], high[i] + cell, cell) for i in range(3)], cell)
+    # Smoother than those of the mesh, which a mirror would show.
+    gradient = differences(shape, vertices, 2e-3)
+    return vertices, faces, gradient / np.maximum(np.linalg.norm(gradient, axis=1, keepdims=True), 1e-12)
+
+
+def march(shape: Shape, axes: Sequence[np.ndarray], cell: float) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices [V, 3] and outward faces [F, 3] of `shape` = 0 on a grid of `axes`, whose places are `cell` apart."""
     import open3d as o3d
 
-    axes = [np.arange(low[i], high[i] + cell, cell) for i in range(3)]
     y, z = (side.ravel() for side in np.meshgrid(axes[1], axes[2], indexing="ij"))
     values = np.empty([len(axis) for axis in axes], np.float32)
     for i, x in enumerate(axes[0]):  # slab by slab keeps the temporaries small
@@ -88,16 +95,14 @@ def mesh_of(
     surface = o3d.t.geometry.TriangleMesh.create_isosurfaces(
         o3d.core.Tensor(np.ascontiguousarray(values.transpose(2, 1, 0))), [0.0]
     )
-    vertices = surface.vertex.positions.numpy().astype(np.float64) * cell + np.array(low)
+    vertices = surface.vertex.positions.numpy().astype(np.float64) * cell + [axis[0] for axis in axes]
     faces = surface.triangle.indices.numpy().astype(np.int32)
     corners = vertices[faces]
     if np.einsum("ij,ij->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) < 0:  # the volume, six times
         faces = np.ascontiguousarray(faces[:, ::-1])
-    return vertices, faces, _normals(shape, vertices)
+    return vertices, faces
 
 
-def _normals(shape: Shape, points: np.ndarray, step: float = 2e-3) -> np.ndarray:
-    """Directions [P, 3] in which `shape` grows; smoother than those of the mesh, which a mirror would show."""
-    offsets = step * np.eye(3)
-    gradient = np.stack([shape(points + offset) - shape(points - offset) for offset in offsets], 1)
-    return gradient / np.maximum(np.linalg.norm(gradient, axis=1, keepdims=True), 1e-12)
+def differences(shape: Shape, points: np.ndarray, step: float) -> np.ndarray:
+    """[P, 3] by how much `shape` grows from `step` before points [P, 3] to `step` behind them, along each axis."""
+    return np.stack([shape(points + offset) - shape(points - offset) for offset in step * np.eye(3)], 1)

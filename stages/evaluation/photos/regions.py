@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stages.evaluation.images import ImageScore, Lpips, score_image
+from stages.evaluation.photos.images import ImageScore, Lpips, score_image
 from stages.neural.drawing import FieldDrawing
 
 WHITE = 255

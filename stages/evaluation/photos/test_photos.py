@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-import logging
-from dataclasses import asdict
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from stages import artifacts
 from stages.engine.workspace import Workspace
-from stages.evaluation.suites.scene import TestViews
+from stages.evaluation.photos.images import find_lpips
+from stages.evaluation.photos.regions import WHITE
+from stages.evaluation.photos.scoring import score_photos
 from stages.geometry.cameras import PinholeCameras
 from stages.geometry.normalisation import into_scene
 from stages.ingest import find_masks, read_mask_file
@@ -20,10 +21,25 @@ from stages.posing.reading import read_poses
 from stages.posing.triangulation import fitted_camera
 from stages.undistort import pinhole_camera, pinhole_photo
 
-log = logging.getLogger(__name__)
-
-WHITE = 255
 OPAQUE = 127  # alpha above this is the object, as ingest has it
+
+
+@dataclass(frozen=True)
+class TestViews:
+    """Photos to judge by, which no stage sees.
+
+    Attributes:
+        folder: of the photos. names: relative to it, posix.
+        poses: what `stages.posing.reading.read_poses` takes.
+        background: how the suite's PSNR counts what is not the object: "white", or as "photo" shows it.
+    """
+
+    __test__ = False  # pytest takes the name for a test
+
+    folder: Path
+    names: tuple[str, ...]
+    poses: Path
+    background: Literal["white", "photo"] = "photo"
 
 
 class TestPhotos:
@@ -90,33 +106,10 @@ def score_test_views(photos: TestPhotos, workspace: Workspace, fresh: set[str], 
     """Every test photo against drawings of the trained field and, where it is up to date, of the textured mesh.
 
     Returns:
-        {"counted": photos, "mean": {"field": {"object": ..., "whole": ...}, "mesh": ...}, "photos": [...]}, the regions
-        and scores as `stages.evaluation.against_photos.evaluate_views` has them.
+        How many were "counted", and photos and means as of `score_photos`.
     """
-    from stages.drawing.view_scores import draw_view, silhouette
-    from stages.evaluation.against_photos import field_drawer, mean_scores
-    from stages.evaluation.images import find_lpips
-    from stages.evaluation.views import judge
-    from stages.reporting.pictures import read_rgb
-
-    drawer = field_drawer(workspace, device)
-    textured = "bake" in fresh
-    if textured:
-        atlas = artifacts.load_atlas(workspace.stage_folder("atlas"))
-        texture = read_rgb(artifacts.base_color_path(workspace.stage_folder("bake")))
-    lpips, _ = find_lpips()
-    judged = []
-    for index, name in enumerate(photos.cameras.names):
-        photo, mask = photos.load(index)
-        if textured:
-            drawing = draw_view(atlas, texture, photos.cameras, index)
-            covered = silhouette(atlas.vertices, atlas.faces, photos.cameras, index)
-        else:
-            drawing, covered = np.full_like(photo, WHITE), np.zeros(photo.shape[:2], bool)
-        found = judge(photo, mask, drawer.draw(photos.cameras, index), drawing, covered, lpips)
-        scores: dict[str, Any] = {"name": name, "field": asdict(found.field)}
-        judged.append({**scores, "mesh": asdict(found.mesh)} if textured else scores)
-        log.info("%s: %d of %d test photos", name, index + 1, len(photos.cameras))
-    kinds = ("field", "mesh") if textured else ("field",)
-    means = {kind: mean_scores([photo[kind] for photo in judged]) for kind in kinds}
-    return {"counted": len(judged), "mean": means, "photos": judged}
+    indices = range(len(photos.cameras))
+    found = score_photos(
+        workspace, photos.cameras, indices, photos.load, device, textured="bake" in fresh, lpips=find_lpips()[0]
+    )
+    return {"counted": len(indices), **found}

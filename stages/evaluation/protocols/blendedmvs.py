@@ -1,19 +1,45 @@
-"""The surface that BlendedMVS' rendered depth maps show, as points."""
+"""BlendedMVS (Yao et al. 2020): its makers published no program to score surfaces.
+
+The truth is what its rendered depth maps show, as points. Plain distances and F-scores, at thresholds of our own; they
+are parts of the true surface's extent, as its scenes have no unit.
+"""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from stages.errors import InputError
-from stages.evaluation.suites.blendedmvs import DEPTHS
+from stages.evaluation.reading import read_surface
+from stages.evaluation.surfaces import Sampling, Surface, SurfaceScores, measure
+from stages.evaluation.thinning import one_a_cube
 from stages.posing import mvsnet
 
+DEPTHS = "rendered_depth_maps"
+THRESHOLDS = (0.005, 0.01, 0.02)  # of the truth's extent
 STRIDE = 2  # of the pixels that are looked at: all of them would be tens of millions
 SPACING = 0.002  # of the extent: near views are not to outvote far ones
 
 
+def evaluate_blended(predicted: Path, data: Path) -> dict[str, Any]:
+    """Numbers of `SurfaceScores`, and Chamfer in percent of the extent, of a mesh in the frame of the scene's cameras.
+
+    Raises:
+        InputError: a file cannot be read.
+        ValueError: the mesh has no area.
+    """
+    scores = blended_score(read_surface(predicted), Surface(true_points(data)))
+    return {**scores.as_dict(), "chamfer_percent": 100 * scores.chamfer / scores.extent}
+
+
+def blended_score(predicted: Surface, truth: Surface, sampling: Sampling | None = None) -> SurfaceScores:
+    """Hold a surface against a scene of BlendedMVS, in its frame. Raises ValueError as `measure` does."""
+    return measure(predicted, truth, [part * truth.extent for part in THRESHOLDS], sampling)
+
+
+# ---------------------------------------------------------------- the truth
 def true_points(folder: Path) -> np.ndarray:
     """Points [P, 3] of all depth maps of a scene, in the frame of its cameras, evenly thinned.
 
@@ -22,8 +48,6 @@ def true_points(folder: Path) -> np.ndarray:
     Raises:
         InputError: the maps show nothing, or cannot be read.
     """
-    import open3d as o3d
-
     parts = []
     for camera in mvsnet.read_mvsnet(folder / mvsnet.CAMERAS).cameras:
         file = folder / DEPTHS / f"{Path(camera.name).stem}.pfm"
@@ -32,8 +56,7 @@ def true_points(folder: Path) -> np.ndarray:
     points = np.concatenate(parts) if parts else np.zeros((0, 3))
     if not len(points):
         raise InputError(f"{folder / DEPTHS} shows no surface.", "It needs 00000000.pfm, ... as published.")
-    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
-    return np.asarray(cloud.voxel_down_sample(SPACING * float(np.ptp(points, axis=0).max())).points)
+    return one_a_cube(points, SPACING * float(np.ptp(points, axis=0).max()))
 
 
 def _points(depth: np.ndarray, params: np.ndarray, cam_from_world: np.ndarray, size: tuple[int, int]) -> np.ndarray:

@@ -5,10 +5,14 @@ All in millimetres, in the frame of the data set's cameras.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from stages.errors import InputError
+from stages.evaluation.reading import read_prediction, read_surface
 from stages.evaluation.surfaces import Surface, Target
 from stages.evaluation.thinning import thin
 
@@ -121,3 +125,77 @@ def lattice(vertices: np.ndarray, faces: np.ndarray, spacing: float) -> np.ndarr
         along = along[along.sum(1) < 1]
         found.append((corners[rows, None, 0] + along @ sides[rows]).reshape(-1, 3))
     return np.concatenate(found)
+
+
+# ---------------------------------------------------------------- files
+def evaluate_dtu(predicted: Path, data: Path, scan: int, seed: int = 0) -> dict[str, Any]:
+    """Numbers of `DtuScore` and what was done, from `data` in the published layout.
+
+    Args:
+        predicted: in the frame of the data set's cameras, mm: as `hineus run --poses cameras_sphere.npz` makes it.
+        data: folder with `ObsMask/ObsMask24_10.mat`, `ObsMask/Plane24.mat` and `Points/stl/stl024_total.ply`.
+
+    Raises:
+        InputError: a file cannot be read, or nothing is left to measure.
+    """
+    truth, (path, ours) = read_dtu(data, scan), read_prediction(predicted)
+    try:
+        found = dtu_score(ours, truth, seed)
+    except ValueError as error:
+        raise InputError(
+            f"{path} cannot be held against scan {scan}: {error}.",
+            "Reconstruct with the data set's own poses: `hineus run PHOTOS --poses cameras_sphere.npz`.",
+        ) from error
+    return {
+        "predicted": str(path),
+        "truth": str(data),
+        "scan": scan,
+        "unit": "mm",
+        **asdict(found),
+        "done": [
+            "protocol: DTU, as in DTUeval-python",
+            "alignment: none, the frame of the data set's cameras",
+            f"sampling: a point each {DENSITY:g} mm, thinned to that in random order, seed {seed}",
+            f"cut: {PATCH:g} mm below to {2 * PATCH:g} mm above ObsMask's box, observed cells; scan above the ground",
+            f"distances of {MAX_DISTANCE:g} mm and more are left out of both means",
+        ],
+    }
+
+
+def read_dtu(data: Path, scan: int) -> DtuTruth:
+    """The truth of one scan from `SampleSet/MVS Data` of DTU, with the scans of `Points`.
+
+    Raises:
+        InputError: a file is missing or does not hold what it should.
+    """
+    observed, plane, scanned = (
+        data / "ObsMask" / f"ObsMask{scan}_10.mat",
+        data / "ObsMask" / f"Plane{scan}.mat",
+        data / "Points" / "stl" / f"stl{scan:03}_total.ply",
+    )
+    missing = [str(path.relative_to(data)) for path in (observed, plane, scanned) if not path.is_file()]
+    if missing:
+        raise InputError(
+            f"{data} lacks {len(missing)} of 3 files of scan {scan}: {', '.join(missing)}.",
+            "`--data` takes the folder with ObsMask/ (of DTU's SampleSet) and Points/stl/ (of its Points).",
+        )
+    cells, box, side = (_matrix(observed, key) for key in ("ObsMask", "BB", "Res"))
+    ground = _matrix(plane, "P")
+    if cells.ndim != 3 or box.shape != (2, 3) or side.size != 1 or ground.size != 4:
+        raise InputError(
+            f"{observed} and {plane} hold ObsMask {cells.shape}, BB {box.shape}, Res {side.shape} and P "
+            f"{ground.shape}, need [X, Y, Z], (2, 3), 1 and 4 numbers.",
+            "Unpack DTU's SampleSet again.",
+        )
+    return DtuTruth(
+        read_surface(scanned).points, cells.astype(bool), box.astype(np.float32), float(side.item()), ground.ravel()
+    )
+
+
+def _matrix(path: Path, key: str) -> np.ndarray:
+    from scipy.io import loadmat
+
+    try:
+        return np.asarray(loadmat(str(path))[key])
+    except Exception as error:  # scipy raises nearly anything on a damaged file
+        raise InputError(f"{path} holds no matrix {key} ({error}).", "Unpack DTU's SampleSet again.") from error
