@@ -35,9 +35,8 @@ def test_the_command_line_loads_nothing_heavy():
 def test_the_command_line_has_no_science_and_catches_errors_in_one_place():
     for path in sorted((ROOT / "hineus_cli").rglob("*.py")):
         source = path.read_text(encoding="utf-8")
-        assert not re.search(r"(import|from) (numpy|scipy|torch|cv2)\b", source), (
-            f"{path}: computing belongs to stages/"
-        )
+        imported = re.search(r"^\s*(import|from) (numpy|scipy|torch|cv2)\b", source, flags=re.M)
+        assert not imported, f"{path}: computing belongs to stages/"
         assert path.name == "app.py" or "except HineusError" not in source, path
 
 
