@@ -173,6 +173,21 @@ def test_the_make_targets_on_the_pages_exist():
                 assert found[1] in targets, f"{page.name}: {line}"
 
 
+@pytest.mark.parametrize("page", [p for p in PAGES if p.parent.name != "adr"], ids=lambda p: str(p.relative_to(ROOT)))
+def test_the_measuring_commands_on_the_pages_exist(page):
+    """Every `python -m benchmarks.NAME --option` names a module, and an option that stands in it."""
+    text = page.read_text(encoding="utf-8")
+    for command in [*_shell_lines(page), *re.findall(r"`(python -m [^`]+)`", text)]:
+        for name, rest in re.findall(r"python -m ((?:benchmarks|docs)\.[a-z_]+)([^&|#]*)", command):
+            spec = importlib.util.find_spec(name)
+            assert spec is not None, command
+            sources = [Path(spec.origin)]
+            sources = [*sources[0].parent.glob("*.py")] if sources[0].name == "__init__.py" else sources
+            code = "".join(source.read_text(encoding="utf-8") for source in sources)
+            for option in re.findall(r" (--[a-z-]+)", rest):
+                assert f'"{option}"' in code, command
+
+
 def test_the_reference_generator_is_importable_without_side_effects():
     before = set(sys.modules)
     _make_reference()
