@@ -35,7 +35,7 @@ HARD = {
     "synth_helmet-two_cameras": "two cameras, mixed",
     "synth_helmet-greyscale": "black and white",
     "synth_helmet-video": "a video",
-    "synth_helmet-blurred": "a third out of focus",
+    "synth_helmet-blurred": "30 % out of focus",
     "synth_helmet-every_third": "a third of the photos",
     "synth_helmet-black_background": "black background",
     "synth_helmet-plain_ground": "no print on the ground",
