@@ -125,7 +125,7 @@ def measure(folder: Path) -> dict[str, float]:
     Raises:
         RuntimeError: `hineus` failed.
     """
-    from stages.scenes.figurine import PHOTOS, make_demo_photos
+    from stages.scenes.demo_photos import PHOTOS, make_demo_photos
 
     make_demo_photos(folder, NUM_PHOTOS, SIZE)
     workspace = folder / "workspace"
@@ -143,7 +143,7 @@ def figures(workspace: Path, answer: dict[str, Any], truth: Path) -> dict[str, f
         truth: folder with the known surface.
     """
     from stages import artifacts
-    from stages.evaluation.known_object import score_mesh
+    from stages.evaluation.protocols.known_object import score_mesh
 
     numbers = {stage["name"]: stage["numbers"] for stage in answer["stages"]}
     score = score_mesh(artifacts.ply_path(workspace / "export"), artifacts.model_path(workspace / "sfm"), truth)
