@@ -127,7 +127,7 @@ def big_training() -> tuple[float, int]:
     import numpy as np
 
     from benchmarks import ball_heap
-    from configs.params import TrainParams
+    from configs.training import TrainParams
     from stages.geometry.cameras import PinholeCameras
     from stages.neural.trainer import Sightings, Trainer
     from stages.neural.training_photos import Photos

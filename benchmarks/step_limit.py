@@ -46,7 +46,7 @@ from benchmarks.step_speed import (
     training_step,
 )
 from configs.load import load_config
-from configs.params import TrainParams
+from configs.training import TrainParams
 from stages.neural import encodings, losses
 from stages.neural.acceleration import short_products
 from stages.neural.encoding_shapes import HashGrid
@@ -59,7 +59,7 @@ PROCESS_SECONDS = 4.0  # each process of the two works that long
 
 def settings(log2_rows: int, device: str) -> TrainParams:
     """The preset of the device, with tables of 2**log2_rows rows a level."""
-    return load_config(preset_for(device), None, [f"train.log2_rows={log2_rows}"]).train
+    return load_config(preset_for(device), None, [f"train.field.log2_rows={log2_rows}"]).train
 
 
 def shape_of(log2_rows: int, device: str = "cpu") -> FieldShape:

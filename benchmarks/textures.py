@@ -7,7 +7,7 @@ python -m benchmarks.textures --table-only                     only rewrite the 
 
 WORKSPACES holds a workspace a set, named like the set in DATA, made with every eighth photo held out:
 
-    hineus run DATA/viking/images --workspace WORKSPACES/viking --set train.holdout=8
+    hineus run DATA/viking/images --workspace WORKSPACES/viking --set train.hold_out=8
 
 Each texture is baked from the other photos; the final mesh with it is drawn into the held-out ones and compared with
 them, inside the object's mask and where the mesh covers the pixel (how much of the mask that is has a column). Masks
@@ -112,7 +112,7 @@ class Capture:
         self.cameras = artifacts.load_scene(self.undistorted).cameras
         held_out = artifacts.load_held_out(workspace / "train")
         if not held_out:
-            sys.exit(f"{workspace} held no photo out: run it with `--set train.holdout=8`")
+            sys.exit(f"{workspace} held no photo out: run it with `--set train.hold_out=8`")
         self.held_out = [i for i, name in enumerate(self.cameras.names) if name in held_out]
         self.training = [i for i, name in enumerate(self.cameras.names) if name not in held_out]
         self.atlas = artifacts.load_atlas(workspace / "atlas")

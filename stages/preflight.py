@@ -141,7 +141,8 @@ def _minutes(looked_at: list[float], config: Config, workers: int) -> float:
     count, train = len(looked_at), config.train
     pairs = count * (count - 1) / 2 if count <= config.sfm.exhaustive_max else 10 * count
     wall_per_cpu = 1 - PARALLEL_SHARE + PARALLEL_SHARE / workers
-    training_s = train.steps * train.rays * train.samples * TRAIN_CPU_S_PER_RAY_SAMPLE * wall_per_cpu
+    ray_samples = train.steps * train.sampling.rays * train.sampling.samples
+    training_s = ray_samples * TRAIN_CPU_S_PER_RAY_SAMPLE * wall_per_cpu
     if train.minutes is not None:
         training_s = 60 * train.minutes
     other_s = SFM_CPU_S_PER_MP * sum(looked_at) / 1e6 + SFM_CPU_S_PER_PAIR * pairs + OTHER_CPU_S

@@ -23,7 +23,7 @@ from stages.preflight import Preflight, in_short, preflight
 
 log = logging.getLogger(__name__)
 
-HOLD_OUT = "train.holdout"  # the setting that keeps every n-th photo back
+HOLD_OUT = "train.hold_out"  # the setting that keeps every n-th photo back
 
 
 @dataclass(frozen=True)

@@ -114,7 +114,7 @@ def test_one_json_a_run_with_settings_costs_and_scores(data: Path):
     assert (result["method"], result["preset"], result["seed"]) == ("hineus", "tiny", 0)
     assert result["settings"]["undistort.max_side"] == 64
     assert result["settings"]["train.steps"] == 500
-    assert "train.holdout" not in result["settings"]
+    assert "train.hold_out" not in result["settings"]
     assert [stage["name"] for stage in result["stages"]] == ["ingest", "sfm", "place", "undistort", "cleanup"]
     assert result["wall_s"] > 0
     assert result["wall_after_poses_s"] == pytest.approx(result["stages"][-1]["wall_s"], abs=0.01)

@@ -559,12 +559,13 @@ def test_a_stage_that_reads_manifests_or_the_run_follows_them(bench: Bench) -> N
 
 
 def test_a_workspace_of_the_first_version_goes_on(bench: Bench) -> None:
-    """0.1.0 wrote one digest for all that a stage published."""
+    """0.1.0 wrote one digest for all that a stage published, and had other names for some settings."""
     bench.run()
     for stage, before in (("sfm", "ingest"), ("undistort", "sfm"), ("export", "undistort")):
         manifest = bench.workspace.published(stage)
         digest = bench.workspace.published(before).outputs_digest
-        old = replace(manifest, identity=replace(manifest.identity, inputs={before: digest}))
+        params = {**manifest.identity.params, **({"gps": True} if stage == "undistort" else {})}  # now place.gps
+        old = replace(manifest, identity=replace(manifest.identity, inputs={before: digest}, params=params))
         (bench.root / stage / MANIFEST).write_text(old.to_json())
     assert bench.ran() == {}
     for path in bench.photos.iterdir():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 from test_train import TINY, assert_finds_the_ball, make_trainer
+from train_settings import changed
 
 from stages.neural.acceleration import is_mixed, short_products
 from stages.neural.mlp import mlp
@@ -14,7 +15,7 @@ EVERYTHING = {"reflection": "stable", "reflection_from": 0.0, "sampler": "propos
 
 
 def mixed(**settings):
-    return TINY.model_copy(update={"precision": "mixed", **settings})
+    return changed(TINY, {"precision": "mixed", **settings})
 
 
 def test_auto_is_mixed_on_cuda_only_where_it_is_fast(monkeypatch):

@@ -18,7 +18,7 @@ from stages.neural.encoding_shapes import Encoding, Frequencies, HashGrid
 from stages.neural.encodings import encode, encode_features
 from stages.neural.mlp import Mlp, kaiming_uniform, mlp, spherical_harmonics
 from stages.neural.proposal import ProposalNetwork
-from stages.neural.reflection import ReflectionNetwork
+from stages.neural.reflection_network import ReflectionNetwork
 
 if TYPE_CHECKING:
     from jaxtyping import Float
