@@ -300,7 +300,7 @@ def measure(plan: Plan, data: Path, jobs: int = 1, keep: bool = False) -> Run:
     wall: dict[str, float] = {}
     cpu: dict[str, float] = {}
     for stage in measured_stages(data / plan.set):
-        inputs = {name: shared / name if name == SHARED else folder / name for name in stage.needs}
+        inputs = {name: shared / name if name in (SHARED, "place") else folder / name for name in stage.needs}
         out, scratch = folder / stage.name, folder / f"{stage.name}.scratch"
         out.mkdir(parents=True)
         scratch.mkdir()
@@ -349,9 +349,9 @@ def score_clean_mesh(
     if not has_truth(truth):
         return None
     vertices, faces = artifacts.load_mesh(folder / "cleanup")
-    world_from_scene = artifacts.load_scene(shared / SHARED).world_from_scene
+    poses_from_scene = artifacts.load_scene(shared / SHARED).poses_from_scene
     with tempfile.TemporaryDirectory() as world:
-        artifacts.save_mesh(Path(world), world_from_scene.apply(vertices), faces)
+        artifacts.save_mesh(Path(world), poses_from_scene.apply(vertices), faces)
         return score_mesh(
             Path(world) / artifacts.MESH, artifacts.model_path(shared / "sfm"), truth, known_stem or file_stem
         )

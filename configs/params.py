@@ -72,19 +72,14 @@ class SfmParams(Section):
     seed: int = Field(0, ge=0, description="random seed")
 
 
-class UndistortParams(Section):
-    """Camera poses to pinhole images in a normalised frame."""
+class PlaceParams(Section):
+    """How the frame of the poses lies in the world: metres, place on Earth, up; and a region in its coordinates."""
 
-    max_side: int = Field(1600, ge=64, description="longest side of the undistorted images, pixels")
-    mask_erode: int = Field(
-        0, ge=0, description="masks shrink by this many pixels (at the undistorted size), and the object with them"
-    )
     region: str = Field(
         "auto",
         description=f"region of interest: {REGION_FORMS}, in the coordinates of the exported PLY and OBJ; "
         "a box also crops the mesh",
     )
-    roi_scale: float = Field(1.0, gt=0, description="the region of interest found automatically is scaled by this")
     up: Literal["auto", "+x", "-x", "+y", "-y", "+z", "-z"] = Field(
         "auto", description="up axis in the world frame; auto: from GPS, the ground or the cameras"
     )
@@ -115,6 +110,16 @@ class UndistortParams(Section):
         if text is not None:
             read_distance(text)
         return text
+
+
+class UndistortParams(Section):
+    """Camera poses to pinhole images in a normalised frame."""
+
+    max_side: int = Field(1600, ge=64, description="longest side of the undistorted images, pixels")
+    mask_erode: int = Field(
+        0, ge=0, description="masks shrink by this many pixels (at the undistorted size), and the object with them"
+    )
+    roi_scale: float = Field(1.0, gt=0, description="the region of interest found automatically is scaled by this")
 
 
 class ExtractParams(Section):
@@ -357,6 +362,7 @@ class Config(Section):
 
     ingest: IngestParams = IngestParams()
     sfm: SfmParams = SfmParams()
+    place: PlaceParams = PlaceParams()
     undistort: UndistortParams = UndistortParams()
     train: TrainParams = TrainParams()
     extract: ExtractParams = ExtractParams()

@@ -3,22 +3,25 @@
 from __future__ import annotations
 
 import logging
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from stages import artifacts
+from stages.artifacts import ATLAS, CAMERAS, CLEAN_MESH, AtlasMesh
 from stages.engine.stage import Stage, StageContext
 from stages.errors import ReconstructionError
+
+if TYPE_CHECKING:
+    from configs.params import AtlasParams
 
 logger = logging.getLogger(__name__)
 
 
-def run(context: StageContext) -> dict[str, Any]:
+def run(context: StageContext[AtlasParams]) -> dict[str, Any]:
     from stages.texture import charts
 
     params = context.params
-    vertices, faces = artifacts.load_mesh(context.inputs["cleanup"])
+    vertices, faces = context.read(CLEAN_MESH)
     size = params.texture_size or _fitting_size(context, vertices, faces)
     context.progress(0, 1, f"charts for {len(faces)} faces")
     method, why = "xatlas", ""
@@ -35,9 +38,9 @@ def run(context: StageContext) -> dict[str, Any]:
                 f"Try `--set atlas.texture_size={2 * size}`, or `--set cleanup.target_faces=20000`.",
             ) from misfit
     uvs = layout.texels / size
-    artifacts.save_atlas(
-        context.out,
-        artifacts.AtlasMesh(
+    context.write(
+        ATLAS,
+        AtlasMesh(
             vertices=vertices[layout.source].astype(np.float32),
             normals=charts.smooth_normals(vertices, faces, layout.source),
             uvs=np.clip(uvs, 0, 1).astype(np.float32),
@@ -59,19 +62,19 @@ def run(context: StageContext) -> dict[str, Any]:
     }
 
 
-def _fitting_size(context: StageContext, vertices: np.ndarray, faces: np.ndarray) -> int:
+def _fitting_size(context: StageContext[AtlasParams], vertices: np.ndarray, faces: np.ndarray) -> int:
     """The size of texture that the photos can fill."""
     from stages.texture.footprint import pixels_per_area, texture_size_for
 
-    cameras = artifacts.load_scene(context.inputs["undistort"]).cameras
-    return texture_size_for(*pixels_per_area(vertices, faces, cameras))
+    return texture_size_for(*pixels_per_area(vertices, faces, context.read(CAMERAS)))
 
 
-ATLAS = Stage(
+ATLAS_STAGE: Stage[AtlasParams] = Stage(
     name="atlas",
     version=2,
-    needs=("undistort", "cleanup"),
-    params="atlas",
+    settings=lambda config: config.atlas,
     run=run,
+    reads=(CAMERAS, CLEAN_MESH),
+    writes=(ATLAS,),
     summary="UV charts without overlaps",
 )

@@ -2,18 +2,30 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
-from stages import artifacts
+from stages.artifacts import (
+    ATLAS,
+    BASE_COLOR,
+    CAMERAS,
+    CLEAN_FULL_MESH,
+    FIELD,
+    HELD_OUT,
+    NORMAL_MAP,
+    OCCLUSION,
+    PINHOLE_PHOTOS,
+    PROVENANCE,
+    QUALITY,
+    write_png,
+)
 from stages.engine.stage import Stage, StageContext
 from stages.errors import ReconstructionError
-from stages.geometry.cameras import PinholeCameras
+
+if TYPE_CHECKING:
+    from configs.params import BakeParams
 
 
-def run(context: StageContext) -> dict[str, Any]:
+def run(context: StageContext[BakeParams]) -> dict[str, Any]:
     """Bake the textures. Returns `stages.texture.baking.Baked.numbers`, and how much of the normal map is known."""
     from stages.drawing.rasterizing import rasterize_atlas
     from stages.neural.trained_field import load_field
@@ -21,12 +33,10 @@ def run(context: StageContext) -> dict[str, Any]:
     from stages.texture.relief import bake_normals, bake_occlusion
     from stages.texture.vertex_quality import measure_quality
 
-    undistorted = context.inputs["undistort"]
-    cameras = artifacts.load_scene(undistorted).cameras
-    held_out = artifacts.load_held_out(context.inputs["train"])
+    photos, cameras, held_out = context.read(PINHOLE_PHOTOS), context.read(CAMERAS), context.read(HELD_OUT)
     cameras = cameras.select([i for i, name in enumerate(cameras.names) if name not in held_out])
-    atlas = artifacts.load_atlas(context.inputs["atlas"])
-    field = load_field(artifacts.field_path(context.inputs["train"]), context.device)
+    atlas = context.read(ATLAS)
+    field = load_field(context.read(FIELD), context.device)
     params = context.params
     texels = rasterize_atlas(atlas.uvs, atlas.faces, atlas.texture_size)
     try:
@@ -34,7 +44,7 @@ def run(context: StageContext) -> dict[str, Any]:
             atlas,
             texels,
             cameras,
-            lambda index: load_photo(undistorted, cameras, index),
+            lambda index: photos.masked(cameras.names[index]),
             field.color,
             views=params.views,
             detail=params.detail,
@@ -49,25 +59,25 @@ def run(context: StageContext) -> dict[str, Any]:
             f"The texture could not be baked: {error}.",
             "Rebuild the inputs: `hineus run PHOTOS --from undistort`.",
         ) from error
-    artifacts.write_png(artifacts.base_color_path(context.out), baked.base_color)
-    artifacts.write_png(artifacts.provenance_path(context.out), baked.provenance)
+    write_png(context.to_write(BASE_COLOR), baked.base_color)
+    write_png(context.to_write(PROVENANCE), baked.provenance)
     quality = measure_quality(
         atlas,
         texels,
         cameras,
-        lambda index: load_photo(undistorted, cameras, index),
+        lambda index: photos.masked(cameras.names[index]),
         baked.provenance,
         baked.gains,
         lambda done, total: context.progress(done, total, "judging vertices"),
     )
-    artifacts.save_quality(context.out, quality)
+    context.write(QUALITY, quality)
     numbers = dict(baked.numbers)
     if params.normal_map:
-        full = artifacts.load_mesh(context.inputs["cleanup"], artifacts.FULL_MESH)
+        full = context.read(CLEAN_FULL_MESH)
         normal_map, met = bake_normals(
             atlas, texels, *full, lambda done, total: context.progress(done, total, "normals")
         )
-        artifacts.write_png(artifacts.normal_map_path(context.out), normal_map)
+        write_png(context.to_write(NORMAL_MAP), normal_map)
         numbers["normals_share"] = round(met, 4)
     if params.occlusion_rays > 0:
         occlusion = bake_occlusion(
@@ -77,22 +87,16 @@ def run(context: StageContext) -> dict[str, Any]:
             params.occlusion_reach,
             lambda done, total: context.progress(done, total, "occlusion"),
         )
-        artifacts.write_png(artifacts.occlusion_path(context.out), occlusion)
+        write_png(context.to_write(OCCLUSION), occlusion)
     return numbers
 
 
-def load_photo(undistorted: Path, cameras: PinholeCameras, index: int) -> tuple[np.ndarray, np.ndarray | None]:
-    """Undistorted photo [H, W, 3] uint8 RGB and its mask [H, W] bool, or None where there is no mask."""
-    name = cameras.names[index]
-    mask = artifacts.load_mask(undistorted, name)
-    return artifacts.load_image(undistorted, name), None if mask is None else mask > 127
-
-
-BAKE = Stage(
+BAKE: Stage[BakeParams] = Stage(
     name="bake",
     version=6,
-    needs=("undistort", "train", "cleanup", "atlas"),
-    params="bake",
+    settings=lambda config: config.bake,
     run=run,
+    reads=(PINHOLE_PHOTOS, CAMERAS, FIELD, HELD_OUT, CLEAN_FULL_MESH, ATLAS),
+    writes=(BASE_COLOR, PROVENANCE, NORMAL_MAP, OCCLUSION, QUALITY),
     summary="charts + photos -> textures",
 )

@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator
-from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from stages import artifacts
+from stages.artifacts import CLEAN_FULL_MESH, CLEAN_MESH, GIVEN_REGION, PINHOLE_PHOTOS, RAW_MESH, SCENE, Pictures
 from stages.engine.stage import Stage, StageContext
 from stages.errors import ReconstructionError
 from stages.geometry.cameras import PinholeCameras, PosedScene
+from stages.geometry.place import GivenRegion
 from stages.geometry.plane import Plane, fit_plane
 from stages.geometry.similarity import Similarity
+
+if TYPE_CHECKING:
+    from configs.params import CleanupParams
 
 logger = logging.getLogger(__name__)
 
@@ -34,25 +37,25 @@ UNDER_TOLERANCES, BORDER_RADIUS, MAX_UNDER = 2.0, 0.75, 0.01
 SPECK = 0.1
 
 
-def _masks(folder: Path, cameras: PinholeCameras, margin: int) -> Iterator[tuple[int, np.ndarray]]:
+def _masks(pictures: Pictures, cameras: PinholeCameras, margin: int) -> Iterator[tuple[int, np.ndarray]]:
     """Index and widened mask [H, W] bool of every photo that has one."""
     import cv2
 
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * margin + 1, 2 * margin + 1))
     for index, name in enumerate(cameras.names):
-        mask = artifacts.load_mask(folder, name)
+        mask = pictures.mask(name)
         if mask is not None:
             yield index, cv2.dilate(mask, kernel) > 127
 
 
-def run(context: StageContext) -> dict[str, Any]:
+def run(context: StageContext[CleanupParams]) -> dict[str, Any]:
     from stages.surface import triangle_mesh
     from stages.surface.simplify import decimate
 
     params = context.params
-    scene = artifacts.load_scene(context.inputs["undistort"])
+    scene = context.read(SCENE)
     cameras = scene.cameras
-    vertices, faces = artifacts.load_mesh(context.inputs["extract"])
+    vertices, faces = context.read(RAW_MESH)
     numbers: dict[str, Any] = {"faces_before": len(faces)}
 
     def keep(selection: np.ndarray, what: str, hint: str) -> None:
@@ -71,15 +74,17 @@ def run(context: StageContext) -> dict[str, Any]:
     keep(
         inside, "outside_region", "Try `--set undistort.roi_scale=1.5`, or train for longer: `--set train.steps=6000`."
     )
-    vertices, faces = _crop(vertices, faces, scene, params)
+    region = context.read(GIVEN_REGION)
+    sides = region_sides(region, scene.poses_from_scene) if region else []
+    vertices, faces = _crop(vertices, faces, scene, sides, params)
     numbers["ground_removed"] = params.remove_ground and scene.ground is not None
     if scene.ground is not None and not params.keep_closed:
         under = _under_the_border(vertices, scene, UNDER_TOLERANCES * params.ground_tolerance)
-        keep(~under[faces].all(1), "under_ground", "Try `--set undistort.roi_scale=1.5`.")
+        keep(np.asarray(~under[faces].all(1)), "under_ground", "Try `--set undistort.roi_scale=1.5`.")
     selection, numbers["specks_dropped"] = triangle_mesh.large_pieces(faces, SPECK * params.min_component)
     keep(selection, "speck_faces", "Try `--set cleanup.min_component=0`.")
     if params.mask_hull:
-        masks = _masks(context.inputs["undistort"], cameras, params.mask_margin)
+        masks = _masks(context.read(PINHOLE_PHOTOS), cameras, params.mask_margin)
         outside = triangle_mesh.outside_hull(vertices, cameras, masks, params.mask_outside)
         within = np.count_nonzero(outside[faces], axis=1) < 2
         keep(
@@ -89,7 +94,7 @@ def run(context: StageContext) -> dict[str, Any]:
         )
 
     # The detail that decimation takes away, for the normal map.
-    artifacts.save_mesh(context.out, vertices, faces, artifacts.FULL_MESH)
+    context.write(CLEAN_FULL_MESH, (vertices, faces))
     context.progress(1, 5, "lightening")
     vertices, faces = decimate(vertices, faces, WORKING_FACES * params.target_faces)
 
@@ -116,7 +121,7 @@ def run(context: StageContext) -> dict[str, Any]:
         logger.warning("mesh is not manifold: %d edges, %d vertices", state.bad_edges, state.bad_vertices)
     if params.keep_closed and not state.watertight:
         logger.warning("mesh was to be closed, but %d edges are open", state.open_edges)
-    artifacts.save_mesh(context.out, vertices, faces)
+    context.write(CLEAN_MESH, (vertices, faces))
     return {
         **numbers,
         "faces": len(faces),
@@ -127,7 +132,13 @@ def run(context: StageContext) -> dict[str, Any]:
     }
 
 
-def _crop(vertices: np.ndarray, faces: np.ndarray, scene: PosedScene, params: Any) -> tuple[np.ndarray, np.ndarray]:
+def _crop(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    scene: PosedScene,
+    sides: list[tuple[np.ndarray, float]],
+    params: CleanupParams,
+) -> tuple[np.ndarray, np.ndarray]:
     """The mesh within the box and above the ground, where there is a box and the ground is to go.
 
     A mesh that is to be closed ends in lids there, and at the border of the region of interest.
@@ -136,19 +147,18 @@ def _crop(vertices: np.ndarray, faces: np.ndarray, scene: PosedScene, params: An
 
     if params.keep_closed:
         vertices, faces = solids.cut_to_ball(vertices, faces, params.roi_radius)
-    sides = [] if scene.box is None else box_sides(scene.box, scene.world_from_scene)
     if params.remove_ground:
         if scene.ground is None:
             logger.warning("no ground was found in the sparse points, so none is removed")
         else:
-            sides.append(_cut_above_ground(vertices, faces, scene.ground, params.ground_tolerance))
+            sides = [*sides, _cut_above_ground(vertices, faces, scene.ground, params.ground_tolerance)]
     for normal, offset in sides:
         cut = solids.cut_at_plane if params.keep_closed else triangle_mesh.clip
         vertices, faces = cut(vertices, faces, normal, offset)
         if not len(faces):
             raise ReconstructionError(
                 "Nothing of the mesh is left inside the box and above the ground.",
-                "Look at `undistort.region` and at the report's drawing, or try `--set cleanup.remove_ground=false`.",
+                "Look at `place.region` and at the report's drawing, or try `--set cleanup.remove_ground=false`.",
             )
     if params.remove_ground and scene.ground is not None:
         vertices, faces = _without_bumps(vertices, faces, *sides[-1], BUMP_TOLERANCES * params.ground_tolerance)
@@ -181,6 +191,13 @@ def _without_bumps(
     return triangle_mesh.compact(vertices, faces[~bumps[labels]])
 
 
+def region_sides(region: GivenRegion, poses_from_scene: Similarity) -> list[tuple[np.ndarray, float]]:
+    """The sides of the box that was given, see `box_sides`; none where it was a sphere."""
+    if region.box is None:
+        return []
+    return box_sides(region.box, region.world_from_poses.compose(poses_from_scene))
+
+
 def box_sides(box: np.ndarray, world_from_scene: Similarity) -> list[tuple[np.ndarray, float]]:
     """Planes (normal [3], offset) in the scene frame, the box's inside above them, of a world box [2, 3]."""
     sides = []
@@ -210,7 +227,7 @@ def _cut_above_ground(
     return normal, offset + tolerance
 
 
-def _seen_faces(vertices: np.ndarray, faces: np.ndarray, seen: np.ndarray, params: Any) -> np.ndarray:
+def _seen_faces(vertices: np.ndarray, faces: np.ndarray, seen: np.ndarray, params: CleanupParams) -> np.ndarray:
     """Faces [F] bool to keep, given which vertices [V] bool are seen: seen ones, their surroundings, small gaps."""
     from stages.surface import triangle_mesh
 
@@ -225,11 +242,12 @@ def _seen_faces(vertices: np.ndarray, faces: np.ndarray, seen: np.ndarray, param
     return triangle_mesh.fill_small_gaps(vertices, faces, chosen, params.max_hidden_area * float(area[chosen].sum()))
 
 
-CLEANUP = Stage(
+CLEANUP: Stage[CleanupParams] = Stage(
     name="cleanup",
     version=6,
-    needs=("undistort", "extract"),
-    params="cleanup",
+    settings=lambda config: config.cleanup,
     run=run,
+    reads=(SCENE, PINHOLE_PHOTOS, GIVEN_REGION, RAW_MESH),
+    writes=(CLEAN_MESH, CLEAN_FULL_MESH),
     summary="floaters and unseen shells gone, manifold, decimated",
 )

@@ -11,14 +11,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from stages import artifacts
-from stages.engine.manifest import MANIFEST
+from stages.artifacts import ASSET, ATLAS, BASE_COLOR, NORMAL_MAP, OCCLUSION, PLACE, SCENE
 from stages.engine.stage import Stage, StageContext
 from stages.errors import ReconstructionError, SystemRequirementError
 from stages.geometry.cameras import PosedScene
 from stages.geometry.orientation import y_up_rotation
+from stages.geometry.place import Place
 from stages.geometry.similarity import Similarity
 
 if TYPE_CHECKING:
+    from configs.params import ExportParams
     from stages.files.writing import Textures
 
 
@@ -55,30 +57,33 @@ class Asset:
         return vertices @ self.gltf_from_world.T, normals @ self.gltf_from_world.T
 
 
-def run(context: StageContext) -> dict[str, Any]:
+def run(context: StageContext[ExportParams]) -> dict[str, Any]:
     """Write what the settings ask for. Returns counts, extents in world units, and bytes of each file."""
     params = context.params
-    scene = artifacts.load_scene(context.inputs["undistort"])
-    gltf_from_world = y_up_rotation(scene.world_from_scene.rotation @ scene.up)
+    scene, place = context.read(SCENE), context.read(PLACE)
+    world_from_scene = scene.world_from_scene(place)
+    gltf_from_world = y_up_rotation(world_from_scene.rotation @ scene.up_in(place))
+    baked = context.manifests.get("bake")
     asset = Asset(
-        mesh=artifacts.load_atlas(context.inputs["atlas"]),
-        world_from_scene=scene.world_from_scene,
+        mesh=context.read(ATLAS),
+        world_from_scene=world_from_scene,
         gltf_from_world=gltf_from_world,
-        textures=load_textures(context.inputs["bake"]),
-        extras=provenance(scene, gltf_from_world, run_id(context.inputs["bake"])),
-        note="" if scene.place is None else scene.place.describe().replace("±", "+-"),
+        textures=load_textures(context),
+        # The fingerprint of its textures, and so of photos, settings and versions, tells this asset from others.
+        extras=provenance(scene, place, gltf_from_world, baked.identity.fingerprint if baked else None),
+        note=place.describe().replace("±", "+-"),
         out=context.out,
     )
     numbers: dict[str, Any] = {
         "vertices": len(asset.mesh.vertices),
         "faces": len(asset.mesh.faces),
-        "units": "arbitrary units" if scene.place is None else scene.place.units,
+        "units": place.units,
     }
     writers = {"glb": _write_glb, "usdz": _write_usdz, "obj": _write_obj, "ply": _write_ply, "stl": _write_stl}
     try:
         vertices, _ = asset.in_world(asset.mesh)
         numbers["extent"] = [round(float(side), 6) for side in np.ptp(vertices, axis=0)]
-        sizes = {name: write(asset) for name, write in writers.items() if name in params.formats}
+        sizes: dict[str, int] = {name: write(asset) for name, write in writers.items() if name in params.formats}
         for level, (faces, size) in enumerate(_write_levels(asset, params.lods), 1):
             numbers.setdefault("lod_faces", []).append(faces)
             sizes[f"lod{level}"] = size
@@ -179,13 +184,13 @@ def _write_stl(asset: Asset) -> int:
     return artifacts.stl_path(asset.out).write_bytes(stl_bytes(vertices, asset.mesh.faces, asset.note))
 
 
-def load_textures(baked: Path) -> Textures:
+def load_textures(context: StageContext[ExportParams]) -> Textures:
     """The images that the bake stage left."""
     from stages.files.writing import Textures
 
-    optional = (artifacts.normal_map_path(baked), artifacts.occlusion_path(baked))
+    optional = (context.read(NORMAL_MAP), context.read(OCCLUSION))
     normal, occlusion = (path.read_bytes() if path.exists() else None for path in optional)
-    return Textures(artifacts.base_color_path(baked).read_bytes(), normal, occlusion)
+    return Textures(context.read(BASE_COLOR).read_bytes(), normal, occlusion)
 
 
 def unit_normals(vertices: np.ndarray, normals: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -226,37 +231,32 @@ def generator() -> str:
         return "hineus"
 
 
-def run_id(baked: Path) -> str | None:
-    """What tells this asset from others: the fingerprint of its textures, and so of photos, settings and versions."""
-    return artifacts.read_json(baked / MANIFEST)["fingerprint"] if (baked / MANIFEST).exists() else None
-
-
-def provenance(scene: PosedScene, gltf_from_world: np.ndarray, run: str | None) -> dict[str, Any]:
+def provenance(scene: PosedScene, place: Place, gltf_from_world: np.ndarray, run: str | None) -> dict[str, Any]:
     """What an asset says of its origin: run, photos, units, place on Earth, and the way back to the other frames."""
     extras: dict[str, Any] = {} if run is None else {"run": run}
     extras |= {
         "photos": len(scene.cameras),
-        "units": "arbitrary units" if scene.place is None else scene.place.units,
+        "units": place.units,
         "gltf_from_world_rotation": gltf_from_world.tolist(),
-        "world_from_scene": scene.world_from_scene.matrix().tolist(),
+        "world_from_scene": scene.world_from_scene(place).matrix().tolist(),
+        "world_from_model": place.world_from_poses.matrix().tolist(),
     }
-    if scene.place is None:
-        return extras
-    extras["world_from_model"] = scene.place.world_from_model.matrix().tolist()
-    if scene.place.metric:
-        extras |= {"scale_from": scene.place.scale_from, "scale_relative_error": scene.place.scale_error}
-    if scene.place.origin is not None:
+    if place.metric:
+        extras |= {"scale_from": place.scale_from, "scale_relative_error": place.scale_error}
+    if place.origin is not None:
         keys = ("latitude_deg", "longitude_deg", "altitude_m")
-        extras["world_origin"] = dict(zip(keys, scene.place.origin, strict=True))
-        extras["gps_residual_m"] = scene.place.gps_residual
+        extras["world_origin"] = dict(zip(keys, place.origin, strict=True))
+        extras["gps_residual_m"] = place.gps_residual
     return extras
 
 
-EXPORT = Stage(
+EXPORT: Stage[ExportParams] = Stage(
     name="export",
     version=5,
-    needs=("undistort", "atlas", "bake"),
-    params="export",
+    settings=lambda config: config.export,
     run=run,
+    reads=(SCENE, PLACE, ATLAS, BASE_COLOR, NORMAL_MAP, OCCLUSION),
+    writes=(ASSET,),
+    reads_manifests=("bake",),
     summary="textured mesh -> GLB, USDZ, OBJ, PLY, STL",
 )

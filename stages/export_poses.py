@@ -6,10 +6,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from stages.engine.status import replaced_inputs
 from stages.engine.workspace import Workspace, storage_errors
 from stages.errors import InputError, WorkspaceError
+from stages.place import PLACE_STAGE
+from stages.undistort import UNDISTORT
 
-Writer = Callable[[Path, Path, Path], dict[str, Any]]
+Writer = Callable[[Path, Path, Path, Path], dict[str, Any]]
 
 
 def export_poses(workspace: Path, out: Path, write: Writer) -> dict[str, Any]:
@@ -20,14 +23,14 @@ def export_poses(workspace: Path, out: Path, write: Writer) -> dict[str, Any]:
         InputError: `out` holds something.
     """
     opened = Workspace.open(workspace)
-    sfm, undistort = opened.published("sfm"), opened.published("undistort")
-    if sfm is None or undistort is None or undistort.identity.inputs["sfm"] != sfm.outputs_digest:
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise InputError(f"{out} is there already.", "Name a new or empty folder.")
+    if replaced_inputs(UNDISTORT, opened) or replaced_inputs(PLACE_STAGE, opened):
         raise WorkspaceError(
             f"The workspace {opened.root} has no undistorted photos of its present poses.",
             f"Make them: `hineus undistort --workspace {opened.root}`.",
         )
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise InputError(f"{out} is there already.", "Name a new or empty folder.")
     with storage_errors(out, "writing the poses"):
         out.mkdir(parents=True, exist_ok=True)
-        return write(opened.stage_folder("undistort"), opened.stage_folder("sfm"), out)
+        undistort, sfm, place = (opened.stage_folder(name) for name in ("undistort", "sfm", "place"))
+        return write(undistort, sfm, place, out)

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from stages import artifacts
+from stages.artifacts import CAMERAS, FIELD, RAW_MESH
 from stages.engine.stage import Stage, StageContext
 from stages.errors import ReconstructionError
 from stages.geometry.cameras import PinholeCameras
+
+if TYPE_CHECKING:
+    from configs.params import ExtractParams
 
 # However small the photos, a coarser grid than this loses the object's shape.
 MIN_RESOLUTION = 64
@@ -22,13 +25,12 @@ def supported_resolution(cameras: PinholeCameras) -> int:
     return int(np.ceil(2 * np.quantile(pixels_per_unit, 0.9)))
 
 
-def run(context: StageContext) -> dict[str, Any]:
+def run(context: StageContext[ExtractParams]) -> dict[str, Any]:
     from stages.neural.trained_field import load_field
     from stages.surface.solids import extract_solid
 
-    scene = artifacts.load_scene(context.inputs["undistort"])
-    field = load_field(artifacts.field_path(context.inputs["train"]), context.device)
-    supported = max(supported_resolution(scene.cameras), MIN_RESOLUTION)
+    field = load_field(context.read(FIELD), context.device)
+    supported = max(supported_resolution(context.read(CAMERAS)), MIN_RESOLUTION)
     resolution = min(context.params.resolution, supported)
     surface = extract_solid(
         field.sdf,
@@ -44,7 +46,7 @@ def run(context: StageContext) -> dict[str, Any]:
             "Training ended too early or the region is wrong: try `--set train.steps=6000`, or "
             "`--set undistort.roi_scale=1.5`.",
         )
-    artifacts.save_mesh(context.out, surface.vertices, surface.faces)
+    context.write(RAW_MESH, (surface.vertices, surface.faces))
     return {
         "resolution": resolution,
         "supported_resolution": supported,
@@ -54,11 +56,12 @@ def run(context: StageContext) -> dict[str, Any]:
     }
 
 
-EXTRACT = Stage(
+EXTRACT: Stage[ExtractParams] = Stage(
     name="extract",
     version=2,
-    needs=("undistort", "train"),
-    params="extract",
+    settings=lambda config: config.extract,
     run=run,
+    reads=(CAMERAS, FIELD),
+    writes=(RAW_MESH,),
     summary="field to mesh",
 )

@@ -16,12 +16,11 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from fnmatch import fnmatchcase
 from pathlib import Path, PurePosixPath
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from stages import artifacts
-from stages.artifacts import ImageRecord, ImageSet, SkippedImage
+from stages.artifacts import IMAGE_SET, PHOTOS, ImageRecord, ImageSet, SkippedImage
 from stages.capture.background import find_background, object_mask
 from stages.capture.exif import ORIENTATION, camera_key, focal_px, gps_position
 from stages.capture.listing import list_captures
@@ -36,6 +35,9 @@ from stages.posing.known import KnownPoses, match_photos
 from stages.posing.nero import DEPTH, read_depth_mask
 from stages.posing.reading import read_poses
 
+if TYPE_CHECKING:
+    from configs.params import IngestParams
+
 log = logging.getLogger(__name__)
 
 PLAIN_PHOTOS = 0.9  # this part of the photos must have a plain background before masks are made from it
@@ -46,7 +48,7 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 
-def run(context: StageContext) -> dict[str, Any]:
+def run(context: StageContext[IngestParams]) -> dict[str, Any]:
     """Read every photo once, write images/, masks/ and images.json."""
     params, source = context.params, context.sources["photos"]
     masks_folder = context.sources.get("masks")
@@ -68,7 +70,8 @@ def run(context: StageContext) -> dict[str, Any]:
     skipped += [SkippedImage(path, "named in ingest.leave_out") for path in kept_back]
     paths = [path for path in paths if path not in set(kept_back)]
 
-    digests = _in_threads(lambda path: _sha256(files[path]), paths, context.workers)
+    known = context.digests.get("photos", {})
+    digests = _in_threads(lambda path: known.get(path) or _sha256(files[path]), paths, context.workers)
     first_with: dict[str, str] = {}
     unique: list[tuple[str, str]] = []
     for path, digest in zip(paths, digests, strict=True):
@@ -115,7 +118,7 @@ def run(context: StageContext) -> dict[str, Any]:
     masked = sum(record.has_mask for record in images)
     if 0 < masked < len(images):
         log.warning("only %d of %d photos have a mask (from their alpha channel)", masked, len(images))
-    artifacts.save_image_set(context.out, ImageSet(tuple(images), tuple(skipped)))
+    context.write(IMAGE_SET, ImageSet(tuple(images), tuple(skipped)))
     return {
         "images": len(images),
         "skipped": len(skipped),
@@ -129,7 +132,9 @@ def run(context: StageContext) -> dict[str, Any]:
 
 
 # ---------------------------------------------------------------- which files
-def _frames_of(videos: list[str], folder: Path, context: StageContext) -> tuple[dict[str, Path], list[SkippedImage]]:
+def _frames_of(
+    videos: list[str], folder: Path, context: StageContext[IngestParams]
+) -> tuple[dict[str, Path], list[SkippedImage]]:
     """Frames of each video, as `clip.mp4/000120.jpg` -> file, so that no photo can have that name; and bad videos."""
     found: dict[str, Path] = {}
     damaged = []
@@ -251,7 +256,7 @@ def _in_threads(function: Callable[[Item], Result], items: Iterable[Item], worke
 
 
 def _mask_plain_backgrounds(
-    images: list[ImageRecord], context: StageContext
+    images: list[ImageRecord], context: StageContext[IngestParams]
 ) -> tuple[list[ImageRecord], list[SkippedImage]]:
     """Masks for the photos that have none; the few whose background is not plain are left out.
 
@@ -259,13 +264,14 @@ def _mask_plain_backgrounds(
         InputError: those are not few.
     """
     bare = [record for record in images if not record.has_mask]
+    pictures = context.to_write(PHOTOS)
 
     def masked(record: ImageRecord) -> bool:
-        rgb = artifacts.load_image(context.out, record.name)
+        rgb = pictures.image(record.name)
         background = find_background(rgb)
         mask = object_mask(rgb, background) if background.is_plain else None
         if mask is not None:
-            write_mask(mask, artifacts.mask_path(context.out, record.name), (record.width, record.height))
+            write_mask(mask, pictures.mask_path(record.name), (record.width, record.height))
         return mask is not None
 
     found = dict(zip((record.name for record in bare), _in_threads(masked, bare, context.workers), strict=True))
@@ -277,14 +283,14 @@ def _mask_plain_backgrounds(
             "Run with `--set ingest.auto_mask=off`, or give masks: `--masks FOLDER`.",
         )
     for record in left_out:
-        artifacts.image_path(context.out, record.name).unlink()
+        pictures.path(record.name).unlink()
     kept = [replace(record, has_mask=True) for record in images if record not in left_out]
     return kept, [SkippedImage(record.source, "its background is not plain") for record in left_out]
 
 
 # ---------------------------------------------------------------- one photo
 def _take_photo(
-    file: Path, source: str, digest: str, mask_file: Path | None, names: _Names, context: StageContext
+    file: Path, source: str, digest: str, mask_file: Path | None, names: _Names, context: StageContext[IngestParams]
 ) -> ImageRecord:
     from PIL import Image
 
@@ -302,14 +308,15 @@ def _take_photo(
     suffix = None if keep else _encoded_suffix(file, photo.lossy)
     name = names.target(source, suffix)
 
-    target = artifacts.image_path(context.out, name)
+    pictures = context.to_write(PHOTOS)
+    target = pictures.path(name)
     target.parent.mkdir(parents=True, exist_ok=True)
     if keep:
         shutil.copyfile(file, target)
     else:
         _encode(rgb, target, photo.lossy, photo.exif)
     if mask is not None:
-        write_mask(mask, artifacts.mask_path(context.out, name), rgb.size)
+        write_mask(mask, pictures.mask_path(name), rgb.size)
 
     focal = focal_px(photo.exif, photo.stored_size)
     return ImageRecord(
@@ -348,12 +355,12 @@ def _encode(rgb: Any, target: Path, lossy: bool, exif: Any) -> None:
         rgb.save(target, format="PNG", compress_level=3, **extra)
 
 
-INGEST = Stage(
+INGEST: Stage[IngestParams] = Stage(
     name="ingest",
     version=3,
-    needs=(),
-    params="ingest",
+    settings=lambda config: config.ingest,
     run=run,
+    writes=(PHOTOS, IMAGE_SET),
     sources=("photos", "masks", "poses"),
     summary="read the photos and masks",
 )

@@ -7,16 +7,43 @@ Whatever an earlier stage did not leave is left out; only the textured mesh itse
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from stages import artifacts
-from stages.artifacts import AtlasMesh
+from stages.artifacts import (
+    ATLAS,
+    BASE_COLOR,
+    GIVEN_REGION,
+    HELD_OUT,
+    IMAGE_SET,
+    METRICS,
+    MODEL,
+    OVERVIEW,
+    PAGE,
+    PHOTOS,
+    PINHOLE_PHOTOS,
+    PLACE,
+    PREVIEWS,
+    PROVENANCE,
+    QUALITY,
+    REGISTRATION,
+    SCENE,
+    Artifact,
+    AtlasMesh,
+    VertexQuality,
+)
 from stages.engine.stage import Stage, StageContext
 from stages.errors import HineusError
 from stages.geometry.cameras import PosedScene
+from stages.geometry.place import GivenRegion
+
+if TYPE_CHECKING:
+    from configs.params import ReportParams
+
+T = TypeVar("T")
 
 TEMPLATES = Path(__file__).parent / "templates"
 THREE = TEMPLATES / "vendor" / "three.min.js"
@@ -24,62 +51,63 @@ SVG = "http://www.w3.org/2000/svg"
 REPLAY_WORKSPACE = "again_hineus"
 
 
-def run(context: StageContext) -> dict[str, Any]:
+def run(context: StageContext[ReportParams]) -> dict[str, Any]:
     """Write report.html. Returns its size in bytes, and how the final mesh meets photos that were kept back."""
     import jinja2
 
     from stages.reporting import curves, numbers, photo_table, pictures
     from stages.reporting.kept_back import compare_held_out
 
-    inputs = context.inputs
-    scene = artifacts.load_scene(inputs["undistort"])
-    atlas = artifacts.load_atlas(inputs["atlas"])
-    texture = pictures.read_rgb(artifacts.base_color_path(inputs["bake"]))
-    manifests = {name: numbers.read_manifest(folder) for name, folder in inputs.items()}
+    place, atlas, texture = context.read(PLACE), context.read(ATLAS), pictures.read_rgb(context.read(BASE_COLOR))
+    scene = context.read(SCENE)
+    scene = replace(scene, up=scene.up_in(place))
+    held_out, pinholes = context.read(HELD_OUT), context.read(PINHOLE_PHOTOS)
+    manifests = context.manifests
     steps = 5
     context.progress(0, steps, "drawing the model")
     page: dict[str, Any] = {
         "stills": [pictures.jpeg_uri(still) for still in pictures.draw_stills(atlas, texture, scene.up)],
         "texture": pictures.jpeg_uri(pictures.shrink(texture, pictures.PICTURE_SIDE)),
-        "provenance": pictures.describe_provenance(artifacts.provenance_path(inputs["bake"])),
+        "provenance": pictures.describe_provenance(context.read(PROVENANCE)),
     }
     context.progress(1, steps, "comparing with photos that were kept back")
-    held_out = artifacts.load_held_out(inputs["train"])
-    undistorted = inputs["undistort"]
     page["held_out"] = compare_held_out(
-        atlas, texture, scene.cameras, lambda index: load_photo(undistorted, scene.cameras.names[index]), held_out
+        atlas, texture, scene.cameras, lambda index: pinholes.masked(scene.cameras.names[index]), held_out
     )
     context.progress(2, steps, "collecting the photos")
-    results = photo_table.photo_results(inputs["ingest"], inputs["sfm"], scene.cameras.names, held_out)
-    page |= photo_table.describe_photos(results, inputs["ingest"], inputs["sfm"], context.params.thumbnails)
-    context.progress(3, steps, "packing the 3D view")
-    page |= describe_view(
-        scene, atlas, texture, inputs["bake"], photo_table.camera_captions(results, scene.cameras.names)
+    image_set, registration = left(context, IMAGE_SET), left(context, REGISTRATION)
+    results = photo_table.photo_results(image_set, registration, context.read(MODEL), scene.cameras.names, held_out)
+    page |= photo_table.describe_photos(
+        results, image_set, registration, context.read(PHOTOS), context.params.thumbnails
     )
+    context.progress(3, steps, "packing the 3D view")
+    captions = photo_table.camera_captions(results, scene.cameras.names)
+    page |= describe_view(scene, context.read(GIVEN_REGION), atlas, texture, left(context, QUALITY), captions)
     context.progress(4, steps, "writing the page")
+    placed = {name: manifests[name].numbers for name in ("undistort", "place") if name in manifests}
     page |= {
         "numbers": numbers.headline(scene, atlas, manifests, page["held_out"]),
         # part of a page, the drawing needs no namespace
-        "overview": read_text(artifacts.overview_path(undistorted)).replace(f' xmlns="{SVG}"', ""),
-        "where": numbers.describe_where(scene, manifests.get("undistort", {}).get("numbers") or {}),
-        "charts": curves.training_charts(artifacts.metrics_path(inputs["train"])),
-        "previews": pictures.training_previews(artifacts.previews_path(inputs["train"])),
-        "stages": [numbers.stage_row(name, manifest) for name, manifest in manifests.items() if manifest],
+        "overview": read_text(context.read(OVERVIEW)).replace(f' xmlns="{SVG}"', ""),
+        "where": numbers.describe_where(scene, place, placed),
+        "charts": curves.training_charts(context.read(METRICS)),
+        "previews": pictures.training_previews(context.read(PREVIEWS)),
+        "stages": [numbers.stage_row(manifest) for manifest in manifests.values()],
         "total": numbers.total_row(list(manifests.values())),
         "settings": [
-            {"name": name, "text": json.dumps(manifest["params"], indent=1)}
+            {"name": name, "text": json.dumps(manifest.identity.params, indent=1)}
             for name, manifest in manifests.items()
-            if manifest.get("params")
+            if manifest.identity.params
         ],
-        "replay": replay(inputs["ingest"].parent),
+        "replay": replay(context),
         "generator": numbers.generator(manifests),
-        "created": next((m["created"] for m in reversed(list(manifests.values())) if m.get("created")), ""),
+        "created": next((each.created for each in reversed(list(manifests.values())) if each.created), ""),
     }
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(TEMPLATES), autoescape=True, undefined=jinja2.ChainableUndefined
     )
     html = environment.get_template("report.html.j2").render(page)
-    artifacts.report_path(context.out).write_text(html, encoding="utf-8")
+    context.to_write(PAGE).write_text(html, encoding="utf-8")
     context.progress(steps, steps, "done")
     summary: dict[str, Any] = {"bytes": len(html.encode())}
     if page["held_out"]:
@@ -87,17 +115,28 @@ def run(context: StageContext) -> dict[str, Any]:
     return summary
 
 
+def left(context: StageContext[ReportParams], artifact: Artifact[T]) -> T | None:
+    """An artifact that the page can do without: None where it is missing or damaged."""
+    try:
+        return context.read(artifact)
+    except (OSError, ValueError, TypeError, KeyError, HineusError):
+        return None
+
+
 def describe_view(
-    scene: PosedScene, atlas: AtlasMesh, texture: np.ndarray, bake: Path, captions: list[dict[str, Any]]
+    scene: PosedScene,
+    region: GivenRegion | None,
+    atlas: AtlasMesh,
+    texture: np.ndarray,
+    quality: VertexQuality | None,
+    captions: list[dict[str, Any]],
 ) -> dict[str, Any]:
     """The 3D view and, where the bake stage left its measures, their colours and the next photos to take."""
     from stages.reporting import view3d
     from stages.texture.next_views import suggest_views, vertex_needs
 
-    try:
-        quality = artifacts.load_quality(bake)
-    except (OSError, ValueError, TypeError):
-        quality = None
+    corners = region.box_corners() if region else None
+    box = None if corners is None else scene.poses_from_scene.inverse().apply(corners)
     advice = quality and suggest_views(atlas.vertices, atlas.normals, atlas.faces, vertex_needs(quality), scene)
     page: dict[str, Any] = {"advice": advice}
     if len(atlas.faces) > view3d.MAX_FACES:
@@ -106,31 +145,21 @@ def describe_view(
     page["overlays"] = view3d.pack_overlays(quality) if quality else []
     page["viewer"] = {
         **view3d.pack_mesh(atlas, texture, scene.up),
-        **view3d.pack_scene(scene, captions, advice.views if advice else (), atlas),
+        **view3d.pack_scene(scene, captions, advice.views if advice else (), atlas, box),
         "overlays": page["overlays"],
     }
     page["three"] = THREE.read_text(encoding="utf-8")
     return page
 
 
-def load_photo(undistorted: Path, name: str) -> tuple[np.ndarray, np.ndarray | None]:
-    """Undistorted photo [H, W, 3] uint8 and its mask [H, W] bool, or None where it has none."""
-    mask = artifacts.load_mask(undistorted, name)
-    return artifacts.load_image(undistorted, name), None if mask is None else mask > 127
-
-
-def replay(root: Path) -> str:
-    """The command that runs it all again, from the workspace's record; empty where that cannot be read."""
-    from configs.load import load_config
+def replay(context: StageContext[ReportParams]) -> str:
+    """The command that runs it all again, from what this run was started with; empty where that is not known."""
+    from configs.params import Config
     from configs.replay import replay_command
-    from stages.engine.workspace import Workspace
 
-    try:
-        workspace = Workspace.open(root)
-        config = load_config(file=workspace.config_path)
-    except HineusError:
+    record, config = context.record, context.config
+    if record is None or not isinstance(config, Config):
         return ""
-    record = workspace.record
     return replay_command(record.sources, record.preset, config, REPLAY_WORKSPACE)
 
 
@@ -139,11 +168,42 @@ def read_text(path: Path) -> str:
     return path.read_text(encoding="utf-8") if path.exists() else ""
 
 
-REPORT = Stage(
+REPORT: Stage[ReportParams] = Stage(
     name="report",
-    version=4,
-    needs=("ingest", "sfm", "undistort", "train", "extract", "cleanup", "atlas", "bake", "export"),
-    params="report",
+    version=5,
+    settings=lambda config: config.report,
     run=run,
+    reads=(
+        IMAGE_SET,
+        PHOTOS,
+        MODEL,
+        REGISTRATION,
+        PLACE,
+        GIVEN_REGION,
+        SCENE,
+        PINHOLE_PHOTOS,
+        OVERVIEW,
+        METRICS,
+        PREVIEWS,
+        HELD_OUT,
+        ATLAS,
+        BASE_COLOR,
+        PROVENANCE,
+        QUALITY,
+    ),
+    writes=(PAGE,),
+    reads_manifests=(
+        "ingest",
+        "sfm",
+        "place",
+        "undistort",
+        "train",
+        "extract",
+        "cleanup",
+        "atlas",
+        "bake",
+        "export",
+    ),
+    reads_run=True,
     summary="everything -> one HTML page",
 )

@@ -10,10 +10,20 @@ import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from stages import artifacts
-from stages.artifacts import ImageSet
+from stages.artifacts import (
+    GIVEN_POSES,
+    IMAGE_SET,
+    MODEL,
+    PHOTOS,
+    REGISTRATION,
+    GivenPoses,
+    ImageSet,
+    KnownSphere,
+    Registration,
+    Unregistered,
+)
 from stages.engine.stage import Stage, StageContext
 from stages.errors import InputError, ReconstructionError
 from stages.posing.evidence import MIN_VERIFIED, Evidence
@@ -23,13 +33,16 @@ from stages.posing.reading import read_poses
 from stages.posing.triangulation import triangulate
 from stages.posing.workbench import RELAXED, Workbench
 
+if TYPE_CHECKING:
+    from configs.params import SfmParams
+
 log = logging.getLogger(__name__)
 
 FEW_POINTS = 10  # fewer points than this a photo are worth a warning where the poses are known
 DOUBTFUL_ERROR_PX = 2.0  # COLMAP's own models are below one
 
 
-def run(context: StageContext) -> dict[str, Any]:
+def run(context: StageContext[SfmParams]) -> dict[str, Any]:
     """Features, matches, mapping, and again in other ways while too few photos have a pose.
 
     Writes model/ and registration.json.
@@ -42,8 +55,7 @@ def run(context: StageContext) -> dict[str, Any]:
         return _from_known_poses(context)
     import pycolmap
 
-    params, ingest = context.params, context.inputs["ingest"]
-    image_set = artifacts.load_image_set(ingest)
+    params, photos, image_set = context.params, context.read(PHOTOS), context.read(IMAGE_SET)
     _check_masks(image_set, params)
     work = context.scratch / "colmap"
     shutil.rmtree(work, ignore_errors=True)  # a killed run may have left half a database
@@ -55,8 +67,8 @@ def run(context: StageContext) -> dict[str, Any]:
         pycolmap.set_random_seed(params.seed)
         bench = Workbench(
             work,
-            ingest / artifacts.IMAGES,
-            ingest / artifacts.MASKS,
+            photos.images,
+            photos.masks,
             image_set,
             params,
             threads=1 if params.deterministic else max(1, context.workers),
@@ -70,15 +82,17 @@ def run(context: StageContext) -> dict[str, Any]:
 
     if best is None:
         raise _nothing_matched(evidence, names, steps, params)
-    unregistered = [
-        {"name": name, "reason": evidence.reason(name, best.registered, best.others, bench.verified, bench.agreeing)}
+    unregistered = tuple(
+        Unregistered(
+            name=name, reason=evidence.reason(name, best.registered, best.others, bench.verified, bench.agreeing)
+        )
         for name in names
         if name not in best.registered
-    ]
+    )
     if len(best.registered) < needed:
         raise _too_few(len(best.registered), unregistered, needed, _tried(steps), _hint(steps, params))
     for item in unregistered:
-        log.warning("not registered: %s: %s", item["name"], item["reason"])
+        log.warning("not registered: %s: %s", item.name, item.reason)
     for prior, found in bench.contradicted(best):
         log.warning("the EXIF focal length, %.0f px, is wrong: the poses say %.0f px", prior, found)
     if steps[-1].kept and steps[-1].rung == RELAXED:
@@ -87,30 +101,30 @@ def run(context: StageContext) -> dict[str, Any]:
 
 
 def _publish(
-    context: StageContext, best: Solution, unregistered: list[dict[str, str]], steps: Sequence[Step], bench: Workbench
+    context: StageContext[SfmParams],
+    best: Solution,
+    unregistered: tuple[Unregistered, ...],
+    steps: Sequence[Step],
+    bench: Workbench,
 ) -> dict[str, Any]:
     """Write model and registration; returns the numbers of the manifest."""
-    folder = artifacts.model_path(context.out)
-    folder.mkdir(parents=True)
-    best.model.write(str(folder))
+    _write_model(context, best.model)
     error, track = best.error_px, best.model.compute_mean_track_length()
     kept = next(step.rung for step in reversed(steps) if step.kept)
     ladder = [step.as_dict() for step in steps]
-    artifacts.save_registration(
-        context.out,
-        {
-            "registered": sorted(best.registered),
-            "unregistered": unregistered,
-            "mean_reprojection_error_px": error,
-            "mean_track_length": track,
-            "num_points": best.points,
-            "num_models": 1 + len(best.others),
-            "mapper": context.params.mapper,
-            "matcher": bench.matcher,
-            "kept": kept,
-            "ladder": ladder,
-        },
+    registration = Registration(
+        registered=tuple(sorted(best.registered)),
+        unregistered=unregistered,
+        mean_reprojection_error_px=error,
+        mean_track_length=track,
+        num_points=best.points,
+        num_models=1 + len(best.others),
+        mapper=context.params.mapper,
+        matcher=bench.matcher,
+        kept=kept,
+        ladder=tuple(ladder),
     )
+    context.write(REGISTRATION, registration)
     context.progress(1, 1, "done")
     return {
         "registered": len(best.registered),
@@ -127,20 +141,26 @@ def _publish(
     }
 
 
-def _from_known_poses(context: StageContext) -> dict[str, Any]:
+def _write_model(context: StageContext[SfmParams], model: Any) -> None:
+    folder = context.to_write(MODEL)
+    folder.mkdir(parents=True)
+    model.write(str(folder))
+
+
+def _from_known_poses(context: StageContext[SfmParams]) -> dict[str, Any]:
     """The model of the given cameras; write the same files."""
     import pycolmap
 
-    params, image_set = context.params, artifacts.load_image_set(context.inputs["ingest"])
+    params, image_set = context.params, context.read(IMAGE_SET)
     poses = read_poses(context.sources["poses"])
     by_source = {record.source: record for record in image_set.images}
     matched = match_photos(poses, by_source)
     cameras = {by_source[source].name: (camera, by_source[source]) for source, camera in matched.items()}
-    unregistered = [
-        {"name": record.name, "reason": f"has no pose in {poses.origin.name}"}
+    unregistered = tuple(
+        Unregistered(name=record.name, reason=f"has no pose in {poses.origin.name}")
         for record in image_set.images
         if record.name not in cameras
-    ]
+    )
     needed = _needed(len(image_set.images), params)
     if len(cameras) < needed:
         hint = "Give the poses of these photos, or leave --poses out (`--no-poses`) to have them found."
@@ -152,7 +172,7 @@ def _from_known_poses(context: StageContext) -> dict[str, Any]:
         pycolmap.set_random_seed(params.seed)
         model, matcher = triangulate(
             work,
-            context.inputs["ingest"] / artifacts.IMAGES,
+            context.read(PHOTOS).images,
             cameras,
             params,
             threads=1 if params.deterministic else max(1, context.workers),
@@ -170,37 +190,26 @@ def _from_known_poses(context: StageContext) -> dict[str, Any]:
         )
     if error > DOUBTFUL_ERROR_PX:
         log.warning("the known poses fit the photos badly: a mean reprojection error of %.1f px", error)
-    folder = artifacts.model_path(context.out)
-    folder.mkdir(parents=True)
-    model.write(str(folder))
-    region = poses.region
-    artifacts.save_known_poses(
-        context.out,
-        poses.origin.name,
-        None
-        if region is None
-        else {"center": region.center.tolist(), "radius": region.radius, "source": region.source},
+    _write_model(context, model)
+    region = poses.region and KnownSphere.model_validate(poses.region)
+    context.write(GIVEN_POSES, GivenPoses(origin=poses.origin.name, region=region))
+    registration = Registration(
+        registered=tuple(sorted(cameras)),
+        unregistered=unregistered,
+        mean_reprojection_error_px=error,
+        mean_track_length=model.compute_mean_track_length() if points else 0.0,
+        num_points=points,
+        mapper="known poses",
+        matcher=matcher,
     )
-    artifacts.save_registration(
-        context.out,
-        {
-            "registered": sorted(cameras),
-            "unregistered": unregistered,
-            "mean_reprojection_error_px": error,
-            "mean_track_length": model.compute_mean_track_length() if points else 0.0,
-            "num_points": points,
-            "num_models": 1,
-            "mapper": "known poses",
-            "matcher": matcher,
-        },
-    )
+    context.write(REGISTRATION, registration)
     context.progress(1, 1, "done")
     return {
         "registered": len(cameras),
         "images": len(image_set.images),
         "points": points,
         "mean_reprojection_error_px": round(error, 3),
-        "mean_track_length": round(model.compute_mean_track_length(), 2) if points else 0.0,
+        "mean_track_length": round(registration.mean_track_length, 2),
         "models": 1,
         "matcher": matcher,
         "poses_from": poses.origin.name,
@@ -208,7 +217,7 @@ def _from_known_poses(context: StageContext) -> dict[str, Any]:
     }
 
 
-def _check_masks(image_set: ImageSet, params: Any) -> None:
+def _check_masks(image_set: ImageSet, params: SfmParams) -> None:
     bare = [record.name for record in image_set.images if not record.has_mask]
     if params.masks == "always" and bare:
         raise InputError(
@@ -236,7 +245,7 @@ def _quiet_glog(folder: Path) -> Iterator[None]:
 
 
 # ---------------------------------------------------------------- failures
-def _hint(steps: Sequence[Step], params: Any) -> str:
+def _hint(steps: Sequence[Step], params: SfmParams) -> str:
     """What is left to try after these attempts."""
     if params.wanted == 0 and len(steps) == 1:
         return "Try `--set sfm.wanted=0.95`, which goes on with other ways, or add overlapping photos."
@@ -250,7 +259,9 @@ def _tried(steps: Sequence[Step]) -> str:
     return "Tried " + "; ".join(describe(step) for step in steps) + "."
 
 
-def _nothing_matched(evidence: Evidence, names: list[str], steps: Sequence[Step], params: Any) -> ReconstructionError:
+def _nothing_matched(
+    evidence: Evidence, names: list[str], steps: Sequence[Step], params: SfmParams
+) -> ReconstructionError:
     features = sorted(evidence.features.get(name, 0) for name in names)
     median, best = features[len(features) // 2], evidence.best_pair
     if best < MIN_VERIFIED:
@@ -270,26 +281,27 @@ def _nothing_matched(evidence: Evidence, names: list[str], steps: Sequence[Step]
     return ReconstructionError(message, _hint(steps, params))
 
 
-def _needed(total: int, params: Any) -> int:
+def _needed(total: int, params: SfmParams) -> int:
     """Photos without whose poses the stage has failed."""
     return max(params.min_registered, round(params.min_registered_ratio * total))
 
 
 def _too_few(
-    registered: int, unregistered: list[dict[str, str]], needed: int, tried: str, hint: str
+    registered: int, unregistered: Sequence[Unregistered], needed: int, tried: str, hint: str
 ) -> ReconstructionError:
     total = registered + len(unregistered)
-    first = "; ".join(f"{item['name']}: {item['reason']}" for item in unregistered[:2])
+    first = "; ".join(f"{item.name}: {item.reason}" for item in unregistered[:2])
     message = f"Only {registered} of {total} photos were registered (need {needed}). E.g. {first}. {tried}"
     return ReconstructionError(message.rstrip(), hint)
 
 
-SFM = Stage(
+SFM: Stage[SfmParams] = Stage(
     name="sfm",
     version=3,
-    needs=("ingest",),
-    params="sfm",
+    settings=lambda config: config.sfm,
     run=run,
+    reads=(PHOTOS, IMAGE_SET),
+    writes=(MODEL, REGISTRATION, GIVEN_POSES),
     sources=("poses",),
     summary="find the camera poses, or take known ones",
 )

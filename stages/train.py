@@ -9,14 +9,18 @@ import shutil
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 
 from stages import artifacts
+from stages.artifacts import FIELD, HELD_OUT, METRICS, PINHOLE_PHOTOS, PREVIEWS, SCENE, Pictures
 from stages.engine.stage import Stage, StageContext
 from stages.errors import ConfigError, InputError, ReconstructionError
 from stages.geometry.cameras import PinholeCameras
+
+if TYPE_CHECKING:
+    from configs.params import TrainParams
 
 log = logging.getLogger(__name__)
 
@@ -27,7 +31,7 @@ METRIC_GRADIENTS = (0.8, 1.2)  # mean lengths of grad f within which f passes fo
 SETTLED = 500  # steps between looks at that
 
 
-def run(context: StageContext) -> dict[str, Any]:
+def run(context: StageContext[TrainParams]) -> dict[str, Any]:
     """Train until the budget of steps or minutes is spent; write field.pt, metrics.jsonl and previews."""
     import torch
 
@@ -38,11 +42,11 @@ def run(context: StageContext) -> dict[str, Any]:
     from stages.neural.training_photos import Photos
 
     _use_threads(context)
-    folder, params = context.inputs["undistort"], context.params
-    scene = artifacts.load_scene(folder)
+    params, scene = context.params, context.read(SCENE)
     held_out = left_out(len(scene.cameras), params.holdout)
     _check_hold_out(len(held_out), int(held_out.sum()), params.holdout)
-    photos = Photos(scene.cameras, *_load_images(folder, scene.cameras.names), context.device, ~held_out)
+    images = _load_images(context.read(PINHOLE_PHOTOS), scene.cameras.names)
+    photos = Photos(scene.cameras, *images, context.device, ~held_out)
     sightings = Sightings.from_scene(scene, context.device, (~held_out).numpy())
     trainer = Trainer(photos, sightings, params, context.device)
 
@@ -70,13 +74,13 @@ def run(context: StageContext) -> dict[str, Any]:
                 _preview(trainer, context.scratch, progress)
                 previewed = progress
     _preview(trainer, context.scratch, 1.0)
-    shutil.copytree(artifacts.previews_path(context.scratch), artifacts.previews_path(context.out))
-    torch.save(field_state(trainer.fields), artifacts.field_path(context.out))
-    artifacts.metrics_path(context.out).write_bytes(metrics.read_bytes())
+    shutil.copytree(artifacts.previews_path(context.scratch), context.to_write(PREVIEWS))
+    torch.save(field_state(trainer.fields), context.to_write(FIELD))
+    context.to_write(METRICS).write_bytes(metrics.read_bytes())
     seconds = spent + time.monotonic() - started
-    summary: dict[str, Any] = _last_numbers(artifacts.metrics_path(context.out))
+    summary: dict[str, Any] = _last_numbers(context.to_write(METRICS))
     if params.holdout:
-        artifacts.save_held_out(context.out, [scene.cameras.names[i] for i in held_out.nonzero().flatten().tolist()])
+        context.write(HELD_OUT, tuple(scene.cameras.names[i] for i in held_out.nonzero().flatten().tolist()))
         nothing = torch.zeros(0, 3, device=trainer.device)
         psnr = held_out_psnr(photos, lambda batch: trainer.render(batch, 1.0, nothing, None).colors)
         summary |= {"held_out": int(held_out.sum()), "held_out_psnr": psnr and round(psnr, 4)}
@@ -90,7 +94,7 @@ def run(context: StageContext) -> dict[str, Any]:
     }
 
 
-def _use_threads(context: StageContext) -> None:
+def _use_threads(context: StageContext[TrainParams]) -> None:
     """Torch and numba take as many threads as the run was given."""
     import torch
 
@@ -102,13 +106,15 @@ def _use_threads(context: StageContext) -> None:
     numba.set_num_threads(min(context.workers, numba.config.NUMBA_NUM_THREADS))
 
 
-def _load_images(folder: Path, names: tuple[str, ...]) -> tuple[Iterator[np.ndarray], Iterator[np.ndarray] | None]:
+def _load_images(
+    pictures: Pictures, names: tuple[str, ...]
+) -> tuple[Iterator[np.ndarray], Iterator[np.ndarray] | None]:
     """RGB images [H, W, 3] uint8 and masks [H, W] uint8, each read when taken; no masks unless every photo has one."""
-    masked = sum(artifacts.mask_path(folder, name).exists() for name in names)
+    masked = sum(pictures.mask_path(name).exists() for name in names)
     if 0 < masked < len(names):
         log.warning("only %d of %d photos have a mask: training goes without masks", masked, len(names))
-    images = (artifacts.load_image(folder, name) for name in names)
-    masks = (mask for name in names if (mask := artifacts.load_mask(folder, name)) is not None)
+    images = (pictures.image(name) for name in names)
+    masks = (mask for name in names if (mask := pictures.mask(name)) is not None)
     return images, masks if masked == len(names) else None
 
 
@@ -152,7 +158,7 @@ def _check_hold_out(num_photos: int, num_held_out: int, every: int) -> None:
         raise ConfigError(f"`train.holdout` = {every} {found}.", "Try `--hold-out 8`, or 0 for none.")
 
 
-def _progress(step: int, seconds: float, params: Any) -> float:
+def _progress(step: int, seconds: float, params: TrainParams) -> float:
     """Part of the budget that is spent, from 0 to 1: of the minutes where they are set, else of the steps."""
     return seconds / (60 * params.minutes) if params.minutes else step / params.steps
 
@@ -229,11 +235,12 @@ def _last_numbers(metrics: Path) -> dict[str, float]:
     return {key: round(float(np.mean([r[key] for r in records])), 4) for key in keys} if records else {}
 
 
-TRAIN = Stage(
+TRAIN: Stage[TrainParams] = Stage(
     name="train",
     version=3,
-    needs=("undistort",),
-    params="train",
+    settings=lambda config: config.train,
     run=run,
+    reads=(SCENE, PINHOLE_PHOTOS),
+    writes=(FIELD, METRICS, PREVIEWS, HELD_OUT),
     summary="learn a signed distance field and its colours from the posed images",
 )

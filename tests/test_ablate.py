@@ -236,8 +236,11 @@ def _stub_stages(monkeypatch):
         (context.out / "file").write_text("")
         return {"psnr": 31.25, "held_out_psnr": 28.5}
 
-    needs = {"train": ("undistort",), "extract": ("undistort", "train")}
-    stages = [Stage(name, 1, needs[name], name, run) for name in needs]
+    reads = {"train": (artifacts.SCENE,), "extract": (artifacts.CAMERAS, artifacts.FIELD)}
+    stages = [
+        Stage("train", 1, lambda config: config.train, run, reads["train"]),
+        Stage("extract", 1, lambda config: config.extract, run, reads["extract"]),
+    ]
     monkeypatch.setattr(ablate, "measured_stages", lambda truth: stages)
     monkeypatch.setattr(ablate, "score_clean_mesh", lambda *_: {"mean": 0.5})
     return calls
@@ -312,7 +315,7 @@ def test_the_mesh_is_scored_in_the_world_frame(here, monkeypatch):
     corners = np.eye(3)
     artifacts.save_mesh(folder / "cleanup", corners, np.array([[0, 1, 2]]))
     world = Similarity(2.0, np.eye(3), np.array([1.0, 0.0, 0.0]))
-    monkeypatch.setattr(artifacts, "load_scene", lambda path: SimpleNamespace(world_from_scene=world))
+    monkeypatch.setattr(artifacts, "load_scene", lambda path: SimpleNamespace(poses_from_scene=world))
     seen = {}
 
     def score_mesh(mesh, model, where, known_stem):

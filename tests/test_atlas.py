@@ -9,7 +9,7 @@ import pytest
 
 from configs.params import AtlasParams
 from stages import artifacts
-from stages.atlas import ATLAS
+from stages.atlas import ATLAS_STAGE
 from stages.engine.stage import StageContext
 from stages.errors import ReconstructionError
 from stages.surface.isosurface import extract_isosurface
@@ -210,7 +210,7 @@ def run_stage(tmp_path, mesh, **params):
     out.mkdir()
     artifacts.save_mesh(cleanup, *mesh)
     context = StageContext({"cleanup": cleanup}, {}, out, tmp_path, AtlasParams(**params))
-    return ATLAS.run(context), artifacts.load_atlas(out)
+    return ATLAS_STAGE.run(context), artifacts.load_atlas(out)
 
 
 def test_stage_uses_xatlas(tmp_path, mesh):

@@ -12,7 +12,7 @@ import pytest
 from configs.params import BakeParams
 from stages import artifacts
 from stages.artifacts import AtlasMesh, write_png
-from stages.bake import BAKE, load_photo
+from stages.bake import BAKE
 from stages.drawing.rendering import look_at
 from stages.engine.stage import StageContext
 from stages.errors import ReconstructionError, WorkspaceError
@@ -119,8 +119,7 @@ def test_a_mask_hides_what_lies_outside_it(context):
         path = artifacts.mask_path(context.inputs["undistort"], name)
         path.parent.mkdir(parents=True, exist_ok=True)
         write_png(path, np.zeros((40, 48), np.uint8))
-    cameras = artifacts.load_scene(context.inputs["undistort"]).cameras
-    _, mask = load_photo(context.inputs["undistort"], cameras, 1)
+    _, mask = context.read(artifacts.PINHOLE_PHOTOS).masked("sub/two.png")
     assert mask is not None
     assert not mask.any()
     assert BAKE.run(context)["seen_share"] == 0

@@ -37,16 +37,17 @@ from stages.geometry.place import Place
 from stages.geometry.similarity import Similarity
 from stages.ingest import INGEST
 from stages.neural.drawing import FieldDrawing
+from stages.place import PLACE_STAGE
 from stages.sfm import SFM
 from stages.undistort import UNDISTORT
 
 
 def clean_ball(context: StageContext) -> dict[str, Any]:
     """The cleanup stage's stand-in: the true ball, in the scene frame."""
-    scene = artifacts.load_scene(context.inputs["undistort"])
+    scene = context.read(artifacts.SCENE)
     ball = trimesh.creation.icosphere(4, RADIUS)
-    vertices = scene.world_from_scene.inverse().apply(np.asarray(ball.vertices))
-    artifacts.save_mesh(context.out, vertices, np.asarray(ball.faces))
+    vertices = scene.poses_from_scene.inverse().apply(np.asarray(ball.vertices))
+    context.write(artifacts.CLEAN_MESH, (vertices, np.asarray(ball.faces)))
     return {"seed": context.params.seed}
 
 
@@ -55,16 +56,15 @@ def posed(context: StageContext) -> dict[str, Any]:
     if "poses" in context.sources:
         return SFM.run(context)
     truth = context.inputs["ingest"].parents[4] / "data" / "ball" / "transforms.json"
-    return SFM.run(
-        StageContext(context.inputs, {"poses": truth}, context.out, context.scratch, context.params, workers=1)
-    )
+    return SFM.run(replace(context, sources={"poses": truth}, workers=1))
 
 
 PIPELINE = (
     INGEST,
-    Stage("sfm", 1, ("ingest",), "sfm", posed, sources=("poses",)),
+    replace(SFM, run=posed),
+    PLACE_STAGE,
     UNDISTORT,
-    Stage("cleanup", 1, ("undistort",), "train", clean_ball),
+    Stage("cleanup", 1, lambda config: config.train, clean_ball, (artifacts.SCENE,), (artifacts.CLEAN_MESH,)),
 )
 
 
@@ -100,7 +100,7 @@ def test_a_scene_of_every_suite_comes_to_its_undistorted_photos_without_its_test
     true = cameras()
     for i, name in enumerate(posed_scene.cameras.names):
         number = int("".join(filter(str.isdigit, Path(name).stem)))
-        in_poses = posed_scene.world_from_scene.apply(posed_scene.cameras.centers[i])
+        in_poses = posed_scene.poses_from_scene.apply(posed_scene.cameras.centers[i])
         np.testing.assert_allclose(in_poses, true.centers[number], atol=1e-5)
     if suite == "nerf-synthetic":  # alpha is the mask
         assert artifacts.load_mask(place / "undistort", posed_scene.cameras.names[0]) is not None
@@ -115,7 +115,7 @@ def test_one_json_a_run_with_settings_costs_and_scores(data: Path):
     assert result["settings"]["undistort.max_side"] == 64
     assert result["settings"]["train.steps"] == 500
     assert "train.holdout" not in result["settings"]
-    assert [stage["name"] for stage in result["stages"]] == ["ingest", "sfm", "undistort", "cleanup"]
+    assert [stage["name"] for stage in result["stages"]] == ["ingest", "sfm", "place", "undistort", "cleanup"]
     assert result["wall_s"] > 0
     assert result["wall_after_poses_s"] == pytest.approx(result["stages"][-1]["wall_s"], abs=0.01)
     assert result["peak_rss"] > 1 << 20
@@ -189,14 +189,15 @@ def test_a_scene_that_fails_does_not_stop_the_others(data: Path):
 
 def test_a_mesh_is_scored_in_the_frame_of_its_poses_whatever_gps_made_of_the_world(tmp_path: Path):
     moved = Place(Similarity(2.0, np.eye(3), np.array([10.0, 0, 0])), metric=True, scale_from="GPS")
-    scene = replace(sphere_scene(ring_of_cameras()), place=moved)
+    scene = sphere_scene(ring_of_cameras())
     workspace = Workspace.open(tmp_path / "workspace", create=True)
-    for name in ("undistort", "cleanup"):
+    for name in ("place", "undistort", "cleanup"):
         workspace.stage_folder(name).mkdir(parents=True)
+    artifacts.save_place(workspace.stage_folder("place"), moved)
     artifacts.save_scene(workspace.stage_folder("undistort"), scene)
     corners = np.eye(3)
     artifacts.save_mesh(workspace.stage_folder("cleanup"), corners, np.array([[0, 1, 2]]))
-    world = scene.world_from_scene.apply(corners)
+    world = scene.world_from_scene(moved).apply(corners)
     ours = result_mesh(workspace, {"cleanup"}, tmp_path / "ours.ply")
     assert ours is not None
     np.testing.assert_allclose(read_mesh(ours)[0], (world - [10, 0, 0]) / 2, atol=1e-5)
@@ -226,12 +227,12 @@ def test_test_photos_show_the_ball_where_the_scene_has_it(data: Path, suite: str
     trained = artifacts.load_scene(workspace.stage_folder("undistort"))
     apart = np.linalg.norm(photos.cameras.centers[:, None] - trained.cameras.centers[None], axis=2)
     assert apart.min() > 0.1
-    world_from_scene = trained.world_from_scene
+    poses_from_scene = trained.poses_from_scene
     for index in range(len(photos.cameras)):
         pixels, mask = photos.load(index)
         height, width = pixels.shape[:2]
         assert (width, height) == tuple(photos.cameras.sizes[index])
-        center, _ = photos.cameras.project(index, world_from_scene.inverse().apply(np.zeros((1, 3))))
+        center, _ = photos.cameras.project(index, poses_from_scene.inverse().apply(np.zeros((1, 3))))
         np.testing.assert_allclose(center[0], [width / 2, height / 2], atol=0.05)
         ball = np.abs(pixels.astype(int) - pixels[0, 0]).max(2) > 20
         y, x = np.nonzero(ball)
@@ -253,12 +254,12 @@ def test_test_photos_have_the_masks_that_the_scene_is_run_with(data: Path, suite
     assert scene.views is not None
     workspace = Workspace.open(Path("bench") / suite / scene.name / "tiny-seed0")
     photos = TestPhotos(scene.views, workspace, scene.masks)
-    world_from_scene = artifacts.load_scene(workspace.stage_folder("undistort")).world_from_scene
+    poses_from_scene = artifacts.load_scene(workspace.stage_folder("undistort")).poses_from_scene
     for index in range(len(photos.cameras)):
         pixels, mask = photos.load(index)
         assert mask is not None
         assert mask.shape == pixels.shape[:2]
-        center, _ = photos.cameras.project(index, world_from_scene.inverse().apply(np.zeros((1, 3))))
+        center, _ = photos.cameras.project(index, poses_from_scene.inverse().apply(np.zeros((1, 3))))
         y, x = np.nonzero(mask)
         np.testing.assert_allclose([x.mean() + 0.5, y.mean() + 0.5], center[0], atol=1)
 
@@ -275,8 +276,13 @@ class GreyBall:
 def test_views_of_nerf_synthetic_are_whole_photos_on_white(data: Path, monkeypatch: pytest.MonkeyPatch):
     write_suite("nerf-synthetic", data)
     monkeypatch.setattr(scoring, "field_drawer", lambda workspace, device: GreyBall())
-    train = Stage("train", 1, ("undistort",), "train", lambda context: (context.out / "field").write_text("") and {})
-    (result,) = results_of("nerf-synthetic", str(data), pipeline=(*PIPELINE[:3], train))
+
+    def no_training(context: StageContext) -> dict[str, Any]:
+        context.to_write(artifacts.FIELD).write_text("")
+        return {}
+
+    train = Stage("train", 1, lambda config: config.train, no_training, (artifacts.SCENE,), (artifacts.FIELD,))
+    (result,) = results_of("nerf-synthetic", str(data), pipeline=(*PIPELINE[:4], train))
     views = result["scores"]["views"]
     assert (views["counted"], set(views["mean"])) == (2, {"field"})
     scene = find_scenes(SUITES["nerf-synthetic"], data, Wanted())[0]

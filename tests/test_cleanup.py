@@ -13,6 +13,7 @@ from stages.cleanup import CLEANUP
 from stages.engine.stage import StageContext
 from stages.errors import ReconstructionError
 from stages.geometry.cameras import PinholeCameras, PosedScene
+from stages.geometry.place import given_region
 from stages.geometry.plane import Plane
 from stages.geometry.similarity import Similarity
 from stages.surface import triangle_mesh
@@ -58,15 +59,16 @@ def join(*meshes):
 @pytest.fixture
 def stage(tmp_path):
     """Runs cleanup on a mesh; returns its numbers, vertices and faces."""
-    undistort, extract, out = (tmp_path / name for name in ("undistort", "extract", "out"))
+    undistort, extract, place, out = (tmp_path / name for name in ("undistort", "extract", "place", "out"))
 
-    def run(vertices, faces, masks=None, scene_extras=None, **params):
-        for folder in (undistort, extract, out):
+    def run(vertices, faces, masks=None, scene_extras=None, region=None, **params):
+        for folder in (undistort, extract, place, out):
             folder.mkdir()
         cameras = ring_of_cameras()
         empty = np.zeros((0, 2), dtype=np.int32)
         scene = PosedScene(cameras, Similarity.identity(), np.zeros((0, 3)), np.zeros(0), empty, np.array([0, 0, 1.0]))
         artifacts.save_scene(undistort, replace(scene, **(scene_extras or {})))
+        artifacts.save_given_region(place, region)
         artifacts.save_mesh(extract, vertices, faces)
         if masks is not None:
             import cv2
@@ -76,7 +78,7 @@ def stage(tmp_path):
                 path.parent.mkdir(exist_ok=True)
                 cv2.imwrite(str(path), mask.astype(np.uint8) * 255)
         context = StageContext(
-            inputs={"undistort": undistort, "extract": extract},
+            inputs={"undistort": undistort, "extract": extract, "place": place},
             sources={},
             out=out,
             scratch=tmp_path,
@@ -384,7 +386,7 @@ def test_stage_removes_the_ground_on_request(stage, keep_closed):
     [
         ({}, {}),
         ({"ground": Plane(np.array([0.0, 0, 1]), -0.35, 0.01, 0.5)}, {"remove_ground": True}),
-        ({"box": np.array([[-0.6, -0.2, -0.38], [0.3, 0.7, 0.2]])}, {}),
+        ({}, {"region": given_region("box", (-0.6, -0.2, -0.38, 0.3, 0.7, 0.2), Similarity.identity())}),
         ({}, {"mask_hull": True}),
     ],
     ids=["ball", "ground", "box", "masks"],
@@ -443,14 +445,16 @@ def test_stage_keeps_the_ground_where_none_was_found_and_says_so(stage, caplog):
 
 def test_stage_crops_to_the_box_of_the_world(stage):
     turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
-    world = Similarity(2.0, turn, np.array([10.0, 0, 0]))
-    box = np.array([[9.6, -1.0, -0.2], [10.4, 0.4, 5.0]])
-    _, vertices, _ = stage(*ball(0.5, resolution=64), scene_extras={"world_from_scene": world, "box": box})
-    corners = world.apply(vertices.astype(float))
+    world_from_poses = Similarity(0.5, np.eye(3), np.array([7.0, 0, 0]))
+    poses_from_scene = Similarity(4.0, turn, np.array([6.0, 0, 0]))
+    region = given_region("box", (9.6, -1.0, -0.2, 10.4, 0.4, 5.0), world_from_poses)
+    extras = {"poses_from_scene": poses_from_scene}
+    _, vertices, _ = stage(*ball(0.5, resolution=64), scene_extras=extras, region=region)
+    corners = world_from_poses.compose(poses_from_scene).apply(vertices.astype(float))
     np.testing.assert_allclose(corners.min(0), [9.6, -1.0, -0.2], atol=0.01)
     np.testing.assert_allclose(corners.max(0), [10.4, 0.4, 1.0], atol=0.01)
 
 
 def test_stage_says_when_the_box_is_empty(stage):
     with pytest.raises(ReconstructionError, match="inside the box"):
-        stage(*ball(), scene_extras={"box": np.array([[0.7, 0.7, 0.7], [0.8, 0.8, 0.8]])})
+        stage(*ball(), region=given_region("box", (0.7, 0.7, 0.7, 0.8, 0.8, 0.8), Similarity.identity()))

@@ -44,7 +44,7 @@ def test_every_setting_is_described() -> None:
 
 
 def test_yaml_round_trip(tmp_path: Path) -> None:
-    config = load_config("tiny", sets=["train.minutes=2.5", "export.formats=[glb]", "undistort.up=+y"])
+    config = load_config("tiny", sets=["train.minutes=2.5", "export.formats=[glb]", "place.up=+y"])
     file = tmp_path / "config.yaml"
     file.write_text(config_yaml(config))
     assert load_config(file=file) == config
@@ -58,7 +58,7 @@ def test_yaml_round_trip(tmp_path: Path) -> None:
         ("train.minutes=1e-1", 0.1),
         ("bake.gain=false", False),
         ("export.formats=[glb, ply]", ("glb", "ply")),
-        ("undistort.up=-z", "-z"),
+        ("place.up=-z", "-z"),
         (" sfm.seed = 3", 3),
     ],
 )
@@ -153,21 +153,21 @@ def test_an_unknown_backbone_is_refused_with_those_there_are():
 
 @pytest.mark.parametrize("text", ["auto", "sphere 1 -2.5 3e1 0.5", "box -1 -1 0 1 1 2"])
 def test_regions(text: str) -> None:
-    assert load_config(sets=[f"undistort.region={text}"]).undistort.region == text
+    assert load_config(sets=[f"place.region={text}"]).place.region == text
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("undistort.region=ball 1 2 3 4", "it must be auto, 'sphere X Y Z RADIUS' or 'box X0 Y0 Z0 X1 Y1 Z1'"),
-        ("undistort.region=sphere 1 2 3", "'sphere' takes 4 numbers, got 3"),
-        ("undistort.region=sphere 1 2 3 -1", "the sphere's radius must be positive, not -1"),
-        ("undistort.region=box 0 0 0 1 1 0", "each of the box's X1 Y1 Z1 must be larger"),
-        ("undistort.region=box 0 0 0 1 1 wide", "'box' takes 6 numbers, got '0 0 0 1 1 wide'"),
-        ("undistort.region=sphere 0 0 0 .inf", "'sphere' takes 4 numbers, got"),
-        ("undistort.known_distance=0 0 0 1 0 0", "takes 7 numbers, got 6"),
-        ("undistort.known_distance=0 0 0 0 0 0 2", "the two points must not be the same"),
-        ("undistort.known_distance=0 0 0 1 0 0 0", "the distance must be positive, not 0 metres"),
+        ("place.region=ball 1 2 3 4", "it must be auto, 'sphere X Y Z RADIUS' or 'box X0 Y0 Z0 X1 Y1 Z1'"),
+        ("place.region=sphere 1 2 3", "'sphere' takes 4 numbers, got 3"),
+        ("place.region=sphere 1 2 3 -1", "the sphere's radius must be positive, not -1"),
+        ("place.region=box 0 0 0 1 1 0", "each of the box's X1 Y1 Z1 must be larger"),
+        ("place.region=box 0 0 0 1 1 wide", "'box' takes 6 numbers, got '0 0 0 1 1 wide'"),
+        ("place.region=sphere 0 0 0 .inf", "'sphere' takes 4 numbers, got"),
+        ("place.known_distance=0 0 0 1 0 0", "takes 7 numbers, got 6"),
+        ("place.known_distance=0 0 0 0 0 0 2", "the two points must not be the same"),
+        ("place.known_distance=0 0 0 1 0 0 0", "the distance must be positive, not 0 metres"),
     ],
 )
 def test_wrong_regions_and_distances_are_refused(text: str, message: str) -> None:

@@ -8,11 +8,12 @@ import os
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
-from toy_pipeline import TOY, failing, with_stage
+from toy_pipeline import LETTERS, MODEL, POSES, TOY, failing, text_artifact, with_stage
 
 from configs.load import load_config
 from configs.params import Config
@@ -21,6 +22,7 @@ from stages.engine.fingerprint import SourceDigests, file_sha256
 from stages.engine.manifest import MANIFEST, Manifest, ManifestDamaged, OutputFile, load_manifest
 from stages.engine.resources import ResourceMeter
 from stages.engine.runner import StageOutcome, run_pipeline
+from stages.engine.stage import StageContext
 from stages.engine.status import pipeline_status
 from stages.engine.workspace import FORMAT, Workspace
 from stages.errors import ConfigError, HineusError, InputError, SystemRequirementError, WorkspaceError
@@ -85,7 +87,7 @@ def test_changed_parameter_is_named_and_stops_where_outputs_are_the_same(bench: 
     # undistort writes the same bit for fewer features, so export stays fresh
     assert ran == {
         "sfm": "parameter sfm.max_features changed 8192 -> 4096",
-        "undistort": "input stage sfm changed",
+        "undistort": "input sfm/model/poses.txt changed",
     }
 
 
@@ -450,7 +452,7 @@ def test_manifest_records_what_it_was_made_from(bench: Bench) -> None:
     data = json.loads((bench.root / "sfm" / MANIFEST).read_text())
     ingest = json.loads((bench.root / "ingest" / MANIFEST).read_text())
     assert data["params"]["max_features"] == 8192
-    assert data["inputs"] == {"ingest": ingest["outputs_digest"]}
+    assert data["inputs"] == {"ingest/letters.txt": ingest["outputs_digest"]}
     assert set(ingest["sources"]["photos"]) == {"IMG_0.jpg", "IMG_1.jpg", "IMG_2.jpg"}
     assert data["outputs"]["model/poses.txt"]["size"] == 3 * 81
     assert data["peak_rss"] > 1_000_000
@@ -495,3 +497,75 @@ def test_a_workspace_below_a_file_is_named(tmp_path: Path) -> None:
     with pytest.raises(WorkspaceError, match=r"photo\.jpg/ws cannot be written") as caught, workspace.lock():
         pass
     assert "--workspace" in caught.value.hint
+
+
+# ---------------------------------------------------------------- declared artifacts
+def test_a_read_that_was_not_declared_is_refused(bench: Bench) -> None:
+    def peek(context: StageContext) -> dict[str, Any]:
+        context.write(MODEL, context.read(LETTERS))
+        return {}
+
+    with pytest.raises(ValueError, match=r"ingest/letters\.txt is read without being declared"):
+        bench.run(with_stage("export", run=peek))
+    bench.run(with_stage("export", run=peek, reads=(LETTERS,)))
+    assert (bench.root / "export" / "model.glb").read_text() == "abc"
+
+
+def test_what_is_published_is_what_was_declared(bench: Bench) -> None:
+    def more(context: StageContext) -> dict[str, Any]:
+        (context.out / "extra.txt").write_text("x")
+        return {}
+
+    with pytest.raises(ValueError, match=r"extra\.txt.* without declaring it, and did not write .*export/model\.glb"):
+        bench.run(with_stage("export", run=more))
+    assert bench.workspace.published("export") is None
+
+
+def test_only_the_artifacts_that_are_read_make_a_stage_stale(bench: Bench) -> None:
+    note = text_artifact("sfm", "note.txt")
+
+    def noted(context: StageContext) -> dict[str, Any]:
+        context.write(note, str(context.params.max_features))
+        (context.out / "model").mkdir()
+        context.write(POSES, context.read(LETTERS))
+        return {}
+
+    pipeline = with_stage("sfm", run=noted, writes=(POSES, note))
+    bench.run(pipeline)
+    assert list(bench.ran(pipeline, sets=("sfm.max_features=4096",))) == ["sfm"]  # the note changed, the poses did not
+    reader = tuple(replace(stage, reads=(POSES, note)) if stage.name == "undistort" else stage for stage in pipeline)
+    bench.run(reader, sets=("sfm.max_features=4096",))
+    assert bench.ran(reader, sets=("sfm.max_features=2048",))["undistort"] == "input sfm/note.txt changed"
+
+
+def test_a_stage_that_reads_manifests_or_the_run_follows_them(bench: Bench) -> None:
+    seen: dict[str, Any] = {}
+
+    def look(context: StageContext) -> dict[str, Any]:
+        seen.update(cost=context.manifests["sfm"].wall_s, record=context.record, config=context.config)
+        context.write(MODEL, "seen")
+        return {}
+
+    pipeline = with_stage("export", run=look, reads_manifests=("sfm",), reads_run=True)
+    bench.run(pipeline)
+    assert seen["cost"] > 0
+    assert seen["record"].sources["photos"] == str(bench.photos)
+    assert seen["config"].sfm.max_features == 8192
+    assert bench.ran(pipeline) == {}
+    assert bench.ran(pipeline, force=["sfm"])["export"] == "sfm was made again"
+    assert bench.ran(pipeline, sets=("report.thumbnails=7",)) == {"export": "the run was started otherwise"}
+    assert seen["config"].report.thumbnails == 7
+
+
+def test_a_workspace_of_the_first_version_goes_on(bench: Bench) -> None:
+    """0.1.0 wrote one digest for all that a stage published."""
+    bench.run()
+    for stage, before in (("sfm", "ingest"), ("undistort", "sfm"), ("export", "undistort")):
+        manifest = bench.workspace.published(stage)
+        digest = bench.workspace.published(before).outputs_digest
+        old = replace(manifest, identity=replace(manifest.identity, inputs={before: digest}))
+        (bench.root / stage / MANIFEST).write_text(old.to_json())
+    assert bench.ran() == {}
+    for path in bench.photos.iterdir():
+        path.write_text("other" + path.name)
+    assert list(bench.ran()) == ["ingest", "sfm", "undistort"]

@@ -144,6 +144,8 @@ def test_a_workspace_is_judged_in_the_frame_of_its_poses(tmp_path):
     from stages.engine.fingerprint import Identity
     from stages.engine.manifest import Manifest
     from stages.engine.workspace import Workspace
+    from stages.geometry.place import Place
+    from stages.geometry.similarity import Similarity
 
     cameras = ring_of_cameras()
     scene = sphere_scene(cameras)
@@ -153,8 +155,11 @@ def test_a_workspace_is_judged_in_the_frame_of_its_poses(tmp_path):
         out, _ = workspace.begin("undistort", "")
         artifacts.save_scene(out, scene)
         workspace.publish("undistort", Manifest(Identity("undistort", 1, {}), {}))
+        out, _ = workspace.begin("place", "")
+        artifacts.save_place(out, Place(Similarity.identity()))
+        workspace.publish("place", Manifest(Identity("place", 1, {}), {}))
     mesh = ball(RADIUS)
-    mesh.vertices = scene.world_from_scene.apply(mesh.vertices)
+    mesh.vertices = scene.poses_from_scene.apply(mesh.vertices)
     write_mesh(artifacts.ply_path(workspace.root / "export"), mesh)
     true = write_mesh(tmp_path / "true.ply", ball(RADIUS))
     poses = write_transforms(tmp_path / "true.json", cameras)
@@ -162,9 +167,9 @@ def test_a_workspace_is_judged_in_the_frame_of_its_poses(tmp_path):
     assert found["chamfer"] < 1e-3
     known = reading.workspace_cameras(workspace.root)
     np.testing.assert_allclose(
-        np.stack(list(known.centers.values())), scene.world_from_scene.apply(cameras.centers), atol=1e-9
+        np.stack(list(known.centers.values())), scene.poses_from_scene.apply(cameras.centers), atol=1e-9
     )
-    pixels, _ = known.pinhole.project(2, scene.world_from_scene.apply(scene.points.astype(float)))
+    pixels, _ = known.pinhole.project(2, scene.poses_from_scene.apply(scene.points.astype(float)))
     np.testing.assert_allclose(pixels, cameras.project(2, scene.points.astype(float))[0], atol=1e-6)
 
 

@@ -18,6 +18,8 @@ from hypothesis import strategies as st
 from configs.params import ExportParams
 from stages import artifacts
 from stages.artifacts import AtlasMesh
+from stages.engine.fingerprint import Identity
+from stages.engine.manifest import Manifest
 from stages.engine.stage import StageContext
 from stages.errors import ReconstructionError, SystemRequirementError
 from stages.export import EXPORT, unit_normals
@@ -76,7 +78,7 @@ def exported(tmp_path) -> tuple[Path, dict]:
 def workspace(tmp_path: Path, params: ExportParams | None = None) -> StageContext:
     from stages.artifacts import write_png
 
-    folders = {name: tmp_path / name for name in ("undistort", "atlas", "bake", "out", "scratch")}
+    folders = {name: tmp_path / name for name in ("undistort", "place", "atlas", "bake", "out", "scratch")}
     for folder in folders.values():
         folder.mkdir()
     atlas, texture = tetrahedron()
@@ -85,6 +87,7 @@ def workspace(tmp_path: Path, params: ExportParams | None = None) -> StageContex
     )
     scene = PosedScene(cameras, WORLD, np.zeros((1, 3)), np.zeros(1), np.zeros((1, 2)), UP)
     artifacts.save_scene(folders["undistort"], scene)
+    artifacts.save_place(folders["place"], Place(Similarity.identity()))
     artifacts.save_atlas(folders["atlas"], atlas)
     write_png(artifacts.base_color_path(folders["bake"]), texture)
     write_png(artifacts.normal_map_path(folders["bake"]), np.full((32, 32, 3), (128, 128, 255), np.uint8))
@@ -252,12 +255,11 @@ def test_without_coacd_the_command_to_get_it_is_named(tmp_path, monkeypatch):
 
 def test_the_glb_says_its_units_and_where_on_earth_it_is(tmp_path):
     context = workspace(tmp_path)
-    scene = artifacts.load_scene(context.inputs["undistort"])
     assert extras_of(context)["units"] == "arbitrary units"
     model = Similarity(3.0, np.eye(3), np.array([1.0, 2, 3]))
     located = Place(model, True, "GPS", 0.01, (47.0, 8.5, 400.0), 1.2)
     for place, units in ((Place(model), "arbitrary units"), (located, "metres")):
-        artifacts.save_scene(context.inputs["undistort"], replace(scene, place=place))
+        artifacts.save_place(context.inputs["place"], place)
         extras = extras_of(context)
         assert extras["units"] == units
         np.testing.assert_allclose(extras["world_from_model"], model.matrix())
@@ -432,8 +434,8 @@ def test_glb_tells_the_way_back_to_the_world(exported):
 def test_glb_names_the_run_it_comes_from(tmp_path):
     context = workspace(tmp_path)
     assert "run" not in extras_of(context)
-    (context.inputs["bake"] / "manifest.json").write_text('{"fingerprint": "c0ffee"}')
-    assert extras_of(context)["run"] == "c0ffee"
+    baked = Manifest(Identity("bake", 1, {}), {})
+    assert extras_of(replace(context, manifests={"bake": baked}))["run"] == baked.identity.fingerprint
 
 
 def test_gltf_validator_finds_nothing(tmp_path):

@@ -9,7 +9,7 @@ from rigs import UP, capture, flight, look_at, ring
 
 from stages.geometry.markers import detect_markers, measure_markers
 from stages.geometry.normalisation import into_scene, rotation_onto
-from stages.geometry.place import Place, east_north_up, locate
+from stages.geometry.place import Place, east_north_up, given_region, locate
 from stages.geometry.similarity import Similarity
 from stages.geometry.up import angle_deg
 
@@ -46,11 +46,11 @@ def test_a_flight_gets_its_metres_and_its_north(noise: float):
     model = model_of(cameras)
     found = locate(model.centers, gps_of(cameras.centers, noise))
     assert found.used > 0.8 * len(model)
-    assert found.world_from_model.scale == pytest.approx(TRUE.scale, rel=1e-6 + 4 * found.scale_error)
+    assert found.world_from_poses.scale == pytest.approx(TRUE.scale, rel=1e-6 + 4 * found.scale_error)
     assert found.scale_error < 0.01
     assert angle_deg(found.up, TRUE.rotation[2]) < 0.01 + 4 * found.tilt_error_deg
     truth = east_north_up(gps_of(cameras.centers), found.origin)
-    assert np.linalg.norm(found.world_from_model.apply(model.centers) - truth, axis=1).max() < 0.02 + 2 * noise
+    assert np.linalg.norm(found.world_from_poses.apply(model.centers) - truth, axis=1).max() < 0.02 + 2 * noise
     if noise:
         assert found.residual == pytest.approx(np.sqrt(3) * noise, rel=0.25)
 
@@ -60,7 +60,7 @@ def test_wild_positions_do_not_move_the_place():
     model, positions = model_of(cameras), gps_of(cameras.centers, 0.5)
     positions[::5, :2] += 0.01  # a kilometre off
     found = locate(model.centers, positions)
-    assert found.world_from_model.scale == pytest.approx(TRUE.scale, rel=0.01)
+    assert found.world_from_poses.scale == pytest.approx(TRUE.scale, rel=0.01)
     assert found.used <= 0.8 * len(model) + 1
 
 
@@ -151,10 +151,10 @@ def test_a_far_origin_moves_near_and_a_near_one_stays():
     assert place.near(np.array([30.0, 2.0, 1.0]), 5.0) is place
     utm = np.array([465123.25, 5247811.5, 410.0])
     moved = place.near(utm, 5.0)
-    np.testing.assert_allclose(moved.world_from_model.apply(utm), [0.25, -0.5, 0.0], atol=0.51)
+    np.testing.assert_allclose(moved.world_from_poses.apply(utm), [0.25, -0.5, 0.0], atol=0.51)
     corner = utm + 1e-3
-    there = moved.world_from_model.apply(corner).astype(np.float32)
-    np.testing.assert_allclose(there - moved.world_from_model.apply(utm), 1e-3, atol=1e-6)
+    there = moved.world_from_poses.apply(corner).astype(np.float32)
+    np.testing.assert_allclose(there - moved.world_from_poses.apply(utm), 1e-3, atol=1e-6)
 
 
 def test_what_the_record_says():
@@ -163,6 +163,27 @@ def test_what_the_record_says():
     assert "metres ± 0.4 %, from GPS" in text
     assert "latitude 47.376900" in text
     known = Place(TRUE).rescaled(2.0, "a known distance", None)
-    assert known.world_from_model.scale == pytest.approx(2 * TRUE.scale)
-    np.testing.assert_allclose(known.world_from_model.apply(np.ones(3)), 2 * TRUE.apply(np.ones(3)))
+    assert known.world_from_poses.scale == pytest.approx(2 * TRUE.scale)
+    np.testing.assert_allclose(known.world_from_poses.apply(np.ones(3)), 2 * TRUE.apply(np.ones(3)))
     assert known.describe() == "Lengths are in metres, from a known distance."
+
+
+def test_a_given_box_and_sphere():
+    still = Similarity.identity()
+    sphere = given_region("sphere", (1, 2, 3, 4), still)
+    assert (*sphere.center, sphere.radius) == (1, 2, 3, 4)
+    box = given_region("box", (0, 0, 0, 2, 4, 4), still)
+    np.testing.assert_array_equal(box.box, [[0, 0, 0], [2, 4, 4]])
+    np.testing.assert_array_equal(box.center, [1, 2, 2])
+    assert 3.0 / box.radius < 0.98  # the corners survive the cut near the sphere
+
+
+def test_a_region_given_in_metres_is_brought_into_the_frame_of_the_poses():
+    world_from_poses = Similarity(2.0, np.eye(3)[[1, 2, 0]], np.array([10.0, 20, 30]))
+    sphere = given_region("sphere", (10, 20, 30, 4), world_from_poses)
+    np.testing.assert_allclose((*sphere.center, sphere.radius), (0, 0, 0, 2), atol=1e-12)
+    box = given_region("box", (10, 20, 30, 12, 22, 34), world_from_poses)
+    corners = world_from_poses.apply(box.box_corners())
+    np.testing.assert_allclose(corners.min(0), [10, 20, 30])
+    np.testing.assert_allclose(corners.max(0), [12, 22, 34])
+    np.testing.assert_allclose(np.linalg.norm(box.box_corners() - box.center, axis=1), box.radius / 1.05)

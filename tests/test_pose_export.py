@@ -49,7 +49,7 @@ def test_colmap_export_reads_back(tmp_path: Path):
 
     folder, sfm = captured(tmp_path, masks=True)
     out = tmp_path / "exported"
-    numbers = write_colmap(folder, sfm, out)
+    numbers = write_colmap(folder, sfm, tmp_path / "place", out)
     assert numbers == {"images": NUM_CAMERAS, "points": len(DOTS), "observations": NUM_CAMERAS * len(DOTS)}
     assert len(list((out / "masks").iterdir())) == NUM_CAMERAS
     for suffix in (".bin", ".txt"):
@@ -75,7 +75,7 @@ def test_transforms_export_reads_back(tmp_path: Path):
 
     folder, sfm = captured(tmp_path, masks=True)
     out = tmp_path / "exported"
-    write_transforms(folder, sfm, out)
+    write_transforms(folder, sfm, tmp_path / "place", out)
     poses = read_poses(out)
     assert {camera.model for camera in poses.cameras} == {"PINHOLE"}
     assert_dots_are_where_the_poses_say(poses, out / "images")
@@ -93,15 +93,16 @@ def test_transforms_export_reads_back(tmp_path: Path):
 def test_both_exports_say_the_same_and_that_of_the_scene(tmp_path: Path):
     folder, sfm = captured(tmp_path)
     (tmp_path / "other").mkdir()
-    write_colmap(folder, sfm, tmp_path / "exported")
-    write_transforms(folder, sfm, tmp_path / "other")
+    write_colmap(folder, sfm, tmp_path / "place", tmp_path / "exported")
+    write_transforms(folder, sfm, tmp_path / "place", tmp_path / "other")
     scene = artifacts.load_scene(folder)
+    world = scene.world_from_scene(artifacts.load_place(tmp_path / "place"))
     colmap, transforms = (read_poses(tmp_path / name) for name in ("exported", "other"))
     for i, (one, other) in enumerate(zip(colmap.cameras, transforms.cameras, strict=True)):
         np.testing.assert_allclose(one.cam_from_world, other.cam_from_world, atol=1e-9)
         np.testing.assert_allclose(one.params, other.params)
-        at_center = one.cam_from_world[:, :3] @ scene.world_from_scene.apply(np.zeros(3)) + one.cam_from_world[:, 3]
-        expected = scene.cameras.cam_from_scene[i, :, 3] * scene.world_from_scene.scale
+        at_center = one.cam_from_world[:, :3] @ world.apply(np.zeros(3)) + one.cam_from_world[:, 3]
+        expected = scene.cameras.cam_from_scene[i, :, 3] * world.scale
         np.testing.assert_allclose(at_center, expected, atol=1e-9)
 
 

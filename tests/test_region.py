@@ -22,7 +22,7 @@ from rigs import (
 
 from stages.geometry.normalisation import rotation_onto
 from stages.geometry.plane import find_ground
-from stages.geometry.region import find_region, given_region, grown_alone
+from stages.geometry.region import find_region, grown_alone
 from stages.geometry.similarity import Similarity
 from stages.geometry.up import Up, angle_deg, choose_up, estimate_up
 
@@ -77,15 +77,6 @@ def test_a_facade_without_the_trees_behind():
     assert region.kind == "forward"
     assert inside(region, points[:2500]) > 0.97
     assert region.radius < 13  # half the diagonal is 10.8
-
-
-def test_a_given_box_and_sphere():
-    sphere = given_region("sphere", (1, 2, 3, 4), "object")
-    assert (*sphere.center, sphere.radius) == (1, 2, 3, 4)
-    box = given_region("box", (0, 0, 0, 2, 4, 4), "object")
-    np.testing.assert_array_equal(box.box, [[0, 0, 0], [2, 4, 4]])
-    np.testing.assert_array_equal(box.center, [1, 2, 2])
-    assert 3.0 / box.radius < 0.98  # the corners survive the cut near the sphere
 
 
 # ---------------------------------------------------------------- ground
@@ -164,15 +155,15 @@ def test_a_long_object_that_fills_the_frame_is_taken_whole_without_its_table():
 def test_up_of_a_drone_that_flies_to_and_fro():
     for tilt in (0.5, 5.0):
         _, _, _, up, ground = found(flight(tilt_deg=tilt))
-        chosen = choose_up(up, None if ground is None else ground.normal, None, 0.0)
+        chosen = choose_up(up, None if ground is None else ground.normal)
         assert angle_deg(chosen.direction, UP) < 5
 
 
 def test_level_ground_refines_the_cameras_up_and_a_slope_does_not():
     held = Up(_leaning(4), "level cameras")
-    assert choose_up(held, UP, None, 0.0).source == "the ground's plane"
-    np.testing.assert_array_equal(choose_up(held, UP, None, 0.0).direction, UP)
-    assert choose_up(held, _leaning(-20), None, 0.0) is held
+    assert choose_up(held, UP).source == "the ground's plane"
+    np.testing.assert_array_equal(choose_up(held, UP).direction, UP)
+    assert choose_up(held, _leaning(-20)) is held
 
 
 def test_ground_is_believed_where_the_cameras_do_not_know():
@@ -180,14 +171,13 @@ def test_ground_is_believed_where_the_cameras_do_not_know():
     held = estimate_up(cameras)
     assert not held.sure
     assert angle_deg(held.direction, UP) > 10
-    np.testing.assert_array_equal(choose_up(held, UP, None, 0.0).direction, UP)
+    np.testing.assert_array_equal(choose_up(held, UP).direction, UP)
 
 
-def test_gps_is_believed_before_all_else_where_it_is_sure():
+def test_the_cameras_are_believed_where_there_is_no_ground():
     held = Up(_leaning(5), "level cameras")
-    assert choose_up(held, _leaning(3), UP, 0.5).source == "GPS"
-    assert choose_up(held, _leaning(3), UP, 5.0).source == "the ground's plane"
-    assert choose_up(held, None, None, 0.0) is held
+    assert choose_up(held, _leaning(3)).source == "the ground's plane"
+    assert choose_up(held, None) is held
 
 
 def test_up_of_level_cameras_says_that_it_is_sure():

@@ -13,15 +13,27 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from configs.load import config_yaml, load_config
+from configs.load import load_config
 from configs.params import ReportParams
 from stages import artifacts
-from stages.artifacts import AtlasMesh, ImageRecord, ImageSet, SkippedImage, VertexQuality, write_png
+from stages.artifacts import (
+    AtlasMesh,
+    ImageRecord,
+    ImageSet,
+    Registration,
+    SkippedImage,
+    Unregistered,
+    VertexQuality,
+    write_png,
+)
+from stages.engine.fingerprint import Identity
+from stages.engine.manifest import Manifest
 from stages.engine.stage import StageContext
+from stages.engine.workspace import Record
 from stages.geometry.cameras import PinholeCameras, PosedScene
 from stages.geometry.orientation import y_up_rotation
 from stages.geometry.overview import overview_svg
-from stages.geometry.place import Place
+from stages.geometry.place import Place, given_region
 from stages.geometry.plane import Plane
 from stages.geometry.similarity import Similarity
 from stages.report import REPORT, THREE
@@ -32,6 +44,7 @@ from stages.reporting.view3d import NO_VALUE, pack_mesh, pack_overlays, pack_sce
 
 ROOT = Path(__file__).parents[1]
 UP = np.array([0.0, 0, 1])
+BOX = np.array([[-0.5, -0.5, -0.2], [0.5, 0.5, 0.6]])
 
 
 def pyramid() -> AtlasMesh:
@@ -48,12 +61,10 @@ def quality() -> VertexQuality:
     return VertexQuality(tip.astype(np.uint16), 0.9 * tip, 0 * tip, 50 * tip, 100 + 0 * tip, 1 - tip)
 
 
-def manifest(stage: str, **numbers) -> str:
-    return json.dumps(
-        {
-            "stage": stage, "version": 1, "params": {"speed": 3}, "numbers": numbers, "wall_s": 75.0, "cpu_s": 100.5,
-            "peak_rss": 2**30, "versions": {"hineus": "0.1.0"}, "created": "2024-01-01T00:00:00+00:00",
-        }
+def manifest(stage: str, **numbers) -> Manifest:
+    return Manifest(
+        Identity(stage, 1, {"speed": 3}), {}, numbers, wall_s=75.0, cpu_s=100.5, peak_rss=2**30,
+        versions={"hineus": "0.1.0"}, created="2024-01-01T00:00:00+00:00",
     )  # fmt: skip
 
 
@@ -68,6 +79,8 @@ def context(tmp_path) -> StageContext:
     cameras = PinholeCameras(("a.png",), np.array([[16, 16]]), K[None], pose)
     scene = PosedScene(cameras, Similarity.identity(), np.zeros((1, 3)), np.zeros(1), np.zeros((1, 2)), UP)
     artifacts.save_scene(folders["undistort"], scene)
+    artifacts.save_place(folders["place"], Place(Similarity.identity()))
+    artifacts.save_given_region(folders["place"], None)
     artifacts.save_atlas(folders["atlas"], pyramid())
     texture = np.zeros((16, 16, 3), np.uint8)
     texture[:8], texture[8:] = (230, 40, 40), (40, 70, 220)
@@ -95,10 +108,10 @@ def full(context) -> StageContext:
     artifacts.save_image_set(inputs["ingest"], ImageSet(tuple(records), skipped))
     artifacts.save_registration(
         inputs["sfm"],
-        {
-            "registered": ["a.png", "c.png"],
-            "unregistered": [{"name": "b <odd>.png", "reason": "only 3 matches"}],
-        },
+        Registration(
+            registered=("a.png", "c.png"),
+            unregistered=(Unregistered(name="b <odd>.png", reason="only 3 matches"),),
+        ),
     )
     lines = [{"step": 10 * i, "psnr": 10 + i, "loss": 0.5 / (i + 1), "rgb": None, "mask": 0.0} for i in range(50)]
     text = "\n".join(json.dumps(line) for line in lines) + '\n{"step": 500, "psn'
@@ -113,18 +126,18 @@ def full(context) -> StageContext:
     scene = replace(
         artifacts.load_scene(inputs["undistort"]),
         points=random.normal(size=(300, 3)),
-        place=Place(Similarity.identity(), True, "2 markers (8 sides)", 0.0042),
         ground=Plane(UP, -0.2, 0.01, 0.5),
-        box=np.array([[-0.5, -0.5, -0.2], [0.5, 0.5, 0.6]]),
     )
     artifacts.save_scene(inputs["undistort"], scene)
-    artifacts.overview_path(inputs["undistort"]).write_text(overview_svg(scene))
+    still = Similarity.identity()
+    artifacts.save_place(inputs["place"], Place(still, True, "2 markers (8 sides)", 0.0042))
+    region = given_region("box", BOX.ravel(), still)
+    artifacts.save_given_region(inputs["place"], region)
+    artifacts.overview_path(inputs["undistort"]).write_text(overview_svg(scene, region.box_corners()))
     artifacts.save_quality(inputs["bake"], quality())
     artifacts.save_held_out(inputs["train"], ["a.png"])
     write_png(artifacts.image_path(inputs["undistort"], "a.png"), np.full((16, 16, 3), 77, np.uint8))
-    for stage in REPORT.needs:
-        (inputs[stage] / "manifest.json").write_text(manifest(stage, faces=1234, share=0.123456))
-    return context
+    return replace(context, manifests={name: manifest(name, faces=1234, share=0.123456) for name in REPORT.needs})
 
 
 class Links(HTMLParser):
@@ -217,15 +230,16 @@ def test_the_overview_shows_each_camera_from_both_sides(full):
 
 
 def test_the_size_is_told_in_metres_where_they_are_known(full):
-    sized = full.inputs["export"] / "manifest.json"
-    sized.write_text(manifest("export", extent=[0.31234, 0.2, 12.0], units="metres"))
-    assert "0.312 x 0.2 x 12 m" in page(full)
-    sized.write_text(manifest("export", extent=[0.31234, 0.2, 12.0], units="arbitrary units"))
-    assert "0.312 x" not in page(full)
+    def sized(units: str) -> StageContext:
+        exported = manifest("export", extent=[0.31234, 0.2, 12.0], units=units)
+        return replace(full, manifests={**full.manifests, "export": exported})
+
+    assert "0.312 x 0.2 x 12 m" in page(sized("metres"))
+    assert "0.312 x" not in page(sized("arbitrary units"))
 
 
 def test_photos_left_out_come_first_and_pictures_are_capped(full):
-    html = page(StageContext(full.inputs, {}, full.out, full.scratch, ReportParams(thumbnails=1)))
+    html = page(replace(full, params=ReportParams(thumbnails=1)))
     shown = html[html.index('class="thumbs"') :]
     assert shown.count("<figure") == 3
     assert [part.split('"')[0] for part in shown.split('data-state="')[1:]] == ["out", "held", "used"]
@@ -247,7 +261,7 @@ def test_a_report_from_almost_nothing(context):
 
 
 def test_damaged_inputs_are_left_out(full):
-    (full.inputs["train"] / "manifest.json").write_text("{")
+    full = replace(full, manifests={name: full.manifests[name] for name in full.manifests if name != "train"})
     artifacts.image_path(full.inputs["ingest"], "c.png").write_text("not an image")
     artifacts.provenance_path(full.inputs["bake"]).write_text("not an image")
     html = page(full)
@@ -302,19 +316,16 @@ def test_drawn_cameras_look_where_the_photos_look(full):
 
 
 def test_the_region_is_its_box_or_the_unit_sphere(full):
-    scene = artifacts.load_scene(full.inputs["undistort"])
-    edges = region_lines(scene)
+    edges = region_lines(full.read(artifacts.GIVEN_REGION).box_corners())
     assert edges.shape == (24, 3)
-    np.testing.assert_allclose([edges.min(0), edges.max(0)], scene.box)
+    np.testing.assert_allclose([edges.min(0), edges.max(0)], BOX)
     assert set(np.count_nonzero(edges[::2] != edges[1::2], axis=1)) == {1}
-    np.testing.assert_allclose(np.linalg.norm(region_lines(replace(scene, box=None)), axis=1), 1)
+    np.testing.assert_allclose(np.linalg.norm(region_lines(None), axis=1), 1)
 
 
-def test_the_page_says_how_to_run_it_again(full, tmp_path):
-    record = {"format": 1, "sources": {"photos": "/my photos", "masks": None}, "preset": "tiny"}
-    (tmp_path / "workspace.json").write_text(json.dumps(record))
-    (tmp_path / "config.yaml").write_text(config_yaml(load_config("tiny", sets=["train.steps=123"])))
-    html = page(full)
+def test_the_page_says_how_to_run_it_again(full):
+    record = Record(sources={"photos": "/my photos", "masks": None}, preset="tiny")
+    html = page(replace(full, record=record, config=load_config("tiny", sets=["train.steps=123"])))
     expected = "hineus run '/my photos' --preset tiny --workspace again_hineus --set train.steps=123"
     assert f'<pre id="replay">{expected.replace(chr(39), "&#39;")}</pre>' in html
 
@@ -347,4 +358,4 @@ def test_chart_of_a_constant_and_of_decades():
 
 
 def test_durations_are_readable():
-    assert [duration(s) for s in (None, 3.21, 61)] == ["-", "3.2 s", "1 min 01 s"]
+    assert [duration(s) for s in (3.21, 61)] == ["3.2 s", "1 min 01 s"]

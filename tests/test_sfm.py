@@ -10,7 +10,7 @@ import pytest
 
 from configs.params import SfmParams
 from stages import artifacts
-from stages.artifacts import ImageRecord, ImageSet
+from stages.artifacts import ImageRecord, ImageSet, Unregistered
 from stages.engine.stage import StageContext
 from stages.errors import InputError, ReconstructionError
 from stages.posing.evidence import Evidence
@@ -106,10 +106,10 @@ def test_rendered_capture_gives_back_its_cameras(tmp_path: Path):
     assert numbers["registered"] == len(poses)
     assert numbers["attempts"] == 1
     registration = artifacts.load_registration(out)
-    assert registration["matcher"] == "exhaustive"
-    assert [item["name"] for item in registration["unregistered"]] == [f"{len(poses):03d}.png"]
-    assert "matches no other photo" in registration["unregistered"][0]["reason"]
-    assert registration["mean_reprojection_error_px"] < 1.0
+    assert registration.matcher == "exhaustive"
+    assert [item.name for item in registration.unregistered] == [f"{len(poses):03d}.png"]
+    assert "matches no other photo" in registration.unregistered[0].reason
+    assert registration.mean_reprojection_error_px < 1.0
 
     model = pycolmap.Reconstruction(str(artifacts.model_path(out)))
     found = {image.name: image.cam_from_world().matrix() for image in model.images.values()}
@@ -187,7 +187,7 @@ def test_photos_that_show_different_things(tmp_path: Path):
 def test_too_few_registered_photos_are_an_error_with_numbers_attempts_and_a_way_out():
     from stages.sfm import _hint, _too_few, _tried
 
-    left_out = [{"name": f"{i}.jpg", "reason": "blurred"} for i in range(7, 40)]
+    left_out = [Unregistered(name=f"{i}.jpg", reason="blurred") for i in range(7, 40)]
     steps = [Step("exhaustive matching", 7, 900, 0.5, 12.0, True), Step("global mapper", 0, 0, None, 3.0, False)]
     error = _too_few(7, left_out, 20, _tried(steps), _hint(steps, SfmParams()))
     assert error.message == (

@@ -60,8 +60,8 @@ def test_poses_stay_and_points_are_found(tmp_path: Path, exhaustive_max: int):
     assert len(points) > 300
     # of the printed floor and box: nothing below the floor, nothing above the box
     assert np.mean((points[:, 2] > -0.02) & (points[:, 2] < 0.92)) > 0.98
-    assert artifacts.load_registration(out)["registered"] == sorted(f"{i:03d}.png" for i in range(len(POSES)))
-    assert artifacts.load_known_poses(out) == {"origin": "transforms.json", "region": None}
+    assert artifacts.load_registration(out).registered == tuple(sorted(f"{i:03d}.png" for i in range(len(POSES))))
+    assert artifacts.load_given_poses(out) == artifacts.GivenPoses(origin="transforms.json")
 
 
 def test_plain_photos_are_a_warning_and_no_error(tmp_path: Path, caplog: pytest.LogCaptureFixture):

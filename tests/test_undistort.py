@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-from configs.params import UndistortParams
+from configs.params import PlaceParams, UndistortParams
 from stages import artifacts
 from stages.artifacts import ImageRecord, ImageSet
 from stages.engine.stage import StageContext
-from stages.errors import ConfigError, InputError
+from stages.errors import ConfigError, InputError, WorkspaceError
 from stages.geometry.cameras import PinholeCameras, PosedScene
-from stages.geometry.place import Place
+from stages.geometry.place import Place, given_region
 from stages.geometry.plane import Plane
-from stages.undistort import UNDISTORT, _png_names
+from stages.geometry.similarity import Similarity
+from stages.place import PLACE_STAGE
+from stages.posing.undistortion import png_names
+from stages.undistort import UNDISTORT
 
 WIDTH, HEIGHT, FOCAL = 320, 240, 300.0
 CENTER, UP = np.array([2.0, -1.0, 0.5]), np.array([0.0, -1.0, 0.0])  # COLMAP's world often has y down
@@ -85,11 +88,23 @@ def write_capture(root: Path, model_name: str, parameters: list[float], masks: b
 
 
 def undistort(inputs: dict[str, Path], root: Path, **params: object) -> tuple[PosedScene, Path, dict[str, object]]:
-    out = root / "undistort"
-    out.mkdir()
-    context = StageContext(inputs, {}, out, root, UndistortParams(**params), workers=2)  # type: ignore[arg-type]
-    numbers = UNDISTORT.run(context)
-    return artifacts.load_scene(out), out, numbers
+    """Place and undistort; settings of either. Scene, folder and numbers of both."""
+    out, place = root / "undistort", root / "place"
+    for folder in (out, place):
+        folder.mkdir()
+    placing = PlaceParams(**{key: params[key] for key in params if key in PlaceParams.model_fields})  # type: ignore[arg-type]
+    rest = UndistortParams(**{key: params[key] for key in params if key not in PlaceParams.model_fields})  # type: ignore[arg-type]
+    placed = PLACE_STAGE.run(StageContext(inputs, {}, place, root, placing))
+    numbers = UNDISTORT.run(StageContext({**inputs, "place": place}, {}, out, root, rest, workers=2))
+    return artifacts.load_scene(out), out, {**numbers, **{key: value for key, value in placed.items() if value != ""}}
+
+
+def place_of(root: Path) -> Place:
+    return artifacts.load_place(root / "place")
+
+
+def world_from(scene: PosedScene, root: Path) -> Similarity:
+    return scene.world_from_scene(place_of(root))
 
 
 def dots_seen(photo: np.ndarray, expected: np.ndarray) -> np.ndarray:
@@ -121,7 +136,7 @@ def test_points_appear_where_the_scene_cameras_project_them(
     scene, out, numbers = undistort(inputs, tmp_path, max_side=max_side)
     assert numbers["images"] == NUM_CAMERAS
     assert scene.cameras.sizes.max() <= max_side
-    np.testing.assert_allclose(scene.world_from_scene.apply(scene.points.astype(float)), DOTS, atol=1e-5)
+    np.testing.assert_allclose(world_from(scene, tmp_path).apply(scene.points.astype(float)), DOTS, atol=1e-5)
     for i, name in enumerate(scene.cameras.names):
         photo = cv2.imread(str(artifacts.image_path(out, name)), cv2.IMREAD_GRAYSCALE)
         assert photo.shape[::-1] == tuple(scene.cameras.sizes[i])
@@ -150,8 +165,8 @@ def test_masks_are_warped_by_the_same_maps(tmp_path: Path, model_name: str, para
     inputs = write_capture(tmp_path, model_name, parameters, masks=True)
     scene, out, numbers = undistort(inputs, tmp_path, mask_erode=0, max_side=max_side)
     assert numbers["masks"] == NUM_CAMERAS
-    center = scene.world_from_scene.inverse().apply(CENTER)
-    radius = BALL / scene.world_from_scene.scale
+    center = world_from(scene, tmp_path).inverse().apply(CENTER)
+    radius = BALL / world_from(scene, tmp_path).scale
     for i, name in enumerate(scene.cameras.names):
         mask = cv2.imread(str(artifacts.mask_path(out, name)), cv2.IMREAD_UNCHANGED)
         assert mask.shape[::-1] == tuple(scene.cameras.sizes[i])
@@ -173,12 +188,12 @@ def test_masks_set_the_region_and_shrink_by_the_erosion(tmp_path: Path):
     inputs = write_capture(tmp_path, *MODELS[1], masks=True)
     scene, out, numbers = undistort(inputs, tmp_path, mask_erode=3)
     assert numbers["region_from"] == "the visual hull of the masks"
-    assert 0.6 < BALL / scene.world_from_scene.scale < 0.95
-    assert np.linalg.norm(scene.world_from_scene.inverse().apply(CENTER)) < 0.1
+    assert 0.6 < BALL / world_from(scene, tmp_path).scale < 0.95
+    assert np.linalg.norm(world_from(scene, tmp_path).inverse().apply(CENTER)) < 0.1
     i, name = 0, scene.cameras.names[0]
     mask = cv2.imread(str(artifacts.mask_path(out, name)), cv2.IMREAD_UNCHANGED) > 0
     full = ball_mask(
-        scene.cameras, i, scene.world_from_scene.inverse().apply(CENTER), BALL / scene.world_from_scene.scale
+        scene.cameras, i, world_from(scene, tmp_path).inverse().apply(CENTER), BALL / world_from(scene, tmp_path).scale
     )
     loss = np.sqrt(full.sum() / np.pi) - np.sqrt(mask.sum() / np.pi)
     assert loss == pytest.approx(3.0, abs=0.7)
@@ -188,8 +203,8 @@ def test_scene_frame_has_z_up_and_the_object_at_the_origin(tmp_path: Path):
     inputs = write_capture(tmp_path, *MODELS[0], masks=False)
     scene, _, numbers = undistort(inputs, tmp_path)
     assert scene.kind == numbers["kind"] == "object"
-    np.testing.assert_allclose(scene.world_from_scene.rotation @ [0, 0, 1], UP, atol=1e-6)
-    np.testing.assert_allclose(scene.world_from_scene.translation, CENTER, atol=1e-6)
+    np.testing.assert_allclose(world_from(scene, tmp_path).rotation @ [0, 0, 1], UP, atol=1e-6)
+    np.testing.assert_allclose(world_from(scene, tmp_path).translation, CENTER, atol=1e-6)
     np.testing.assert_array_equal(scene.up, [0, 0, 1])
     assert (scene.cameras.centers[:, 2] > 0).all()
 
@@ -209,23 +224,24 @@ def test_up_axis_and_region_size_can_be_set(tmp_path: Path):
     (tmp_path / "b").mkdir()
     plain, _, _ = undistort(inputs, tmp_path / "a")
     turned, _, _ = undistort(inputs, tmp_path / "b", up="-x", roi_scale=1.5)
-    np.testing.assert_allclose(turned.world_from_scene.rotation @ [0, 0, 1], [-1, 0, 0], atol=1e-9)
-    assert turned.world_from_scene.scale == pytest.approx(1.5 * plain.world_from_scene.scale)
+    world = world_from(turned, tmp_path / "b")
+    np.testing.assert_allclose(world.rotation @ turned.up_in(place_of(tmp_path / "b")), [-1, 0, 0], atol=1e-9)
+    assert world.scale == pytest.approx(1.5 * world_from(plain, tmp_path / "a").scale)
 
 
 def test_png_names_stay_unique():
-    assert _png_names(["a.jpg", "b.png", "c/a.jpg"]) == ["a.png", "b.png", "c/a.png"]
-    assert _png_names(["a.jpg", "a.png", "b.jpg"]) == ["a.jpg.png", "a.png.png", "b.png"]
-    assert _png_names(["a.jpg", "a.png", "a.jpg.png"]) == ["a.jpg.png", "a.png.png", "a.jpg.png.png"]
+    assert png_names(["a.jpg", "b.png", "c/a.jpg"]) == ["a.png", "b.png", "c/a.png"]
+    assert png_names(["a.jpg", "a.png", "b.jpg"]) == ["a.jpg.png", "a.png.png", "b.png"]
+    assert png_names(["a.jpg", "a.png", "a.jpg.png"]) == ["a.jpg.png", "a.png.png", "a.jpg.png.png"]
 
 
 # ---------------------------------------------------------------- region, scale and place
 def test_a_given_sphere_is_the_unit_sphere(tmp_path: Path):
     inputs = write_capture(tmp_path, *MODELS[0], masks=False)
     scene, out, numbers = undistort(inputs, tmp_path, region="sphere 2.5 -1 0.5 0.75", roi_scale=3.0)
-    assert scene.world_from_scene.scale == 0.75
-    np.testing.assert_allclose(scene.world_from_scene.translation, [2.5, -1, 0.5])
-    assert scene.box is None
+    assert world_from(scene, tmp_path).scale == 0.75
+    np.testing.assert_allclose(world_from(scene, tmp_path).translation, [2.5, -1, 0.5])
+    assert artifacts.load_given_region(tmp_path / "place").box is None
     assert numbers["region_from"] == "the given sphere"
     assert artifacts.overview_path(out).read_text().startswith("<svg")
 
@@ -240,8 +256,9 @@ def test_a_region_that_no_camera_sees_is_refused(tmp_path: Path):
 def test_a_given_box_is_kept_for_the_crop(tmp_path: Path):
     inputs = write_capture(tmp_path, *MODELS[0], masks=False)
     scene, _, _ = undistort(inputs, tmp_path, region="box 1 -2 0 3 0 1")
-    np.testing.assert_array_equal(scene.box, [[1, -2, 0], [3, 0, 1]])
-    corners = scene.world_from_scene.inverse().apply(scene.box)
+    given = artifacts.load_given_region(tmp_path / "place")
+    np.testing.assert_array_equal(given.box, [[1, -2, 0], [3, 0, 1]])
+    corners = scene.poses_from_scene.inverse().apply(given.box_corners())
     assert np.linalg.norm(corners, axis=1).max() < 0.98
 
 
@@ -269,13 +286,13 @@ def test_gps_makes_the_world_metric_with_z_up(tmp_path: Path):
     scene, _, numbers = undistort(inputs, tmp_path)
     assert (numbers["units"], numbers["scale_from"], numbers["up_from"]) == ("metres", "GPS", "GPS")
     assert 0.02 < numbers["gps_residual_m"] < 0.2
-    world = scene.world_from_scene
-    assert scene.place.world_from_model.scale == pytest.approx(GROWTH, rel=0.02)
-    np.testing.assert_allclose(world.rotation @ [0, 0, 1], [0, 0, 1], atol=1e-6)
+    world = world_from(scene, tmp_path)
+    assert place_of(tmp_path).world_from_poses.scale == pytest.approx(GROWTH, rel=0.02)
+    np.testing.assert_allclose(world.rotation @ scene.up_in(place_of(tmp_path)), [0, 0, 1], atol=1e-6)
     dots = world.apply(scene.points.astype(float))
     expected = GROWTH * (DOTS - DOTS[0]) @ np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0.0]])  # east, north, up
     np.testing.assert_allclose(dots - dots[0], expected, atol=0.1)
-    assert scene.place.origin == pytest.approx((47.0, 8.5, 400.0), abs=10)
+    assert place_of(tmp_path).origin == pytest.approx((47.0, 8.5, 400.0), abs=10)
     assert np.abs(world.translation).max() < 30
     for i in range(len(scene.cameras)):  # the photos still agree
         pixels, _ = scene.cameras.project(i, scene.points)
@@ -287,11 +304,20 @@ def test_gps_makes_the_world_metric_with_z_up(tmp_path: Path):
 def test_gps_worse_than_the_spread_is_not_used(tmp_path: Path, caplog):
     inputs = write_capture(tmp_path, *MODELS[0], masks=False)
     with_gps(inputs, noise=20.0)
-    scene, _, numbers = undistort(inputs, tmp_path)
+    _, _, numbers = undistort(inputs, tmp_path)
     assert "GPS is not used: GPS positions miss the cameras" in caplog.text
     assert numbers["units"] == "arbitrary units"
-    np.testing.assert_array_equal(scene.place.world_from_model.matrix(), np.eye(4))
-    assert scene.place.origin is None
+    np.testing.assert_array_equal(place_of(tmp_path).world_from_poses.matrix(), np.eye(4))
+    assert place_of(tmp_path).origin is None
+
+
+def test_up_is_that_of_gps_only_where_it_is_sure(tmp_path: Path, monkeypatch):
+    monkeypatch.setattr("stages.place.MAX_GPS_TILT_DEG", 0.0)
+    inputs = write_capture(tmp_path, *MODELS[0], masks=False)
+    with_gps(inputs, noise=0.05)
+    _, _, numbers = undistort(inputs, tmp_path)
+    assert (numbers["scale_from"], numbers["up_from"]) == ("GPS", "level cameras")
+    assert place_of(tmp_path).up is None
 
 
 def test_gps_can_be_left_out(tmp_path: Path):
@@ -323,9 +349,9 @@ def test_a_marker_gives_the_scale_with_its_error(tmp_path: Path):
     scene, _, numbers = undistort(inputs, tmp_path, marker_size=0.3, marker_dictionary="5X5_100")
     assert numbers["units"] == "metres"
     assert numbers["scale_from"] == "1 marker (4 sides)"
-    assert scene.place.world_from_model.scale == pytest.approx(0.25, rel=0.01)
-    assert 0 < scene.place.scale_error < 0.02
-    np.testing.assert_allclose(scene.world_from_scene.apply(scene.points.astype(float)), 0.25 * DOTS, atol=0.02)
+    assert place_of(tmp_path).world_from_poses.scale == pytest.approx(0.25, rel=0.01)
+    assert 0 < place_of(tmp_path).scale_error < 0.02
+    np.testing.assert_allclose(world_from(scene, tmp_path).apply(scene.points.astype(float)), 0.25 * DOTS, atol=0.02)
 
 
 def test_missing_markers_are_an_error(tmp_path: Path):
@@ -340,7 +366,7 @@ def test_a_known_distance_gives_the_scale(tmp_path: Path):
     a, b = DOTS[0], DOTS[1]  # 0.4 apart
     text = " ".join(f"{value}" for value in [*a, *b, 1.0])
     scene, _, numbers = undistort(inputs, tmp_path, known_distance=text)
-    dots = scene.world_from_scene.apply(scene.points.astype(float))
+    dots = world_from(scene, tmp_path).apply(scene.points.astype(float))
     assert np.linalg.norm(dots[0] - dots[1]) == pytest.approx(1.0, rel=1e-5)
     assert numbers["scale_from"] == "a known distance"
     assert numbers["scale_error_percent"] is None
@@ -349,10 +375,10 @@ def test_a_known_distance_gives_the_scale(tmp_path: Path):
 def test_a_distance_that_contradicts_gps_is_believed_and_told(tmp_path: Path, caplog):
     inputs = write_capture(tmp_path, *MODELS[0], masks=False)
     with_gps(inputs, noise=0.01)
-    scene, _, _ = undistort(inputs, tmp_path, known_distance="0 0 0 1 0 0 1.2")
+    undistort(inputs, tmp_path, known_distance="0 0 0 1 0 0 1.2")
     assert "The known distance and GPS disagree on the scale by 20.0 %" in caplog.text
-    assert scene.place.world_from_model.scale == pytest.approx(1.2 * GROWTH, rel=0.01)
-    assert scene.place.origin is not None
+    assert place_of(tmp_path).world_from_poses.scale == pytest.approx(1.2 * GROWTH, rel=0.01)
+    assert place_of(tmp_path).origin is not None
 
 
 def test_coordinates_far_from_the_origin_keep_their_precision(tmp_path: Path, monkeypatch):
@@ -361,22 +387,57 @@ def test_coordinates_far_from_the_origin_keep_their_precision(tmp_path: Path, mo
     monkeypatch.setitem(globals(), "DOTS", DOTS + far)
     inputs = write_capture(tmp_path, *MODELS[0], masks=False)
     scene, _, _ = undistort(inputs, tmp_path)
-    model_from_world = scene.place.world_from_model.inverse()
-    assert np.abs(scene.world_from_scene.translation).max() < 5
-    world = scene.world_from_scene.apply(scene.points.astype(float)).astype(np.float32)
+    model_from_world = place_of(tmp_path).world_from_poses.inverse()
+    assert np.abs(world_from(scene, tmp_path).translation).max() < 5
+    world = world_from(scene, tmp_path).apply(scene.points.astype(float)).astype(np.float32)
     np.testing.assert_allclose(model_from_world.apply(world.astype(float)), DOTS, atol=1e-5)
+
+
+def test_a_known_distance_changes_nothing_of_the_scene(tmp_path: Path):
+    inputs = write_capture(tmp_path, *MODELS[0], masks=False)
+    (tmp_path / "a").mkdir()
+    (tmp_path / "b").mkdir()
+    _, one, _ = undistort(inputs, tmp_path / "a")
+    _, other, _ = undistort(inputs, tmp_path / "b", known_distance="0 0 0 1 0 0 3.3")
+    for file in ("cameras.json", "scene.json", "overview.svg"):
+        assert (one / file).read_bytes() == (other / file).read_bytes()
+    assert place_of(tmp_path / "b").metric
+    assert not place_of(tmp_path / "a").metric
 
 
 def test_scene_records_survive_saving(tmp_path: Path):
     inputs = write_capture(tmp_path, *MODELS[0], masks=False)
     scene, _, _ = undistort(inputs, tmp_path)
-    place = Place(scene.world_from_scene, True, "GPS", 0.01, (47.0, 8.5, 400.0), 1.5)
-    full = replace(scene, place=place, ground=Plane(np.array([0.0, 0, 1]), -0.3, 0.01, 0.4), box=np.eye(3)[:2])
+    full = replace(scene, ground=Plane(np.array([0.0, 0, 1]), -0.3, 0.01, 0.4))
     artifacts.save_scene(tmp_path, full)
     loaded = artifacts.load_scene(tmp_path)
     np.testing.assert_array_equal(loaded.ground.normal, [0, 0, 1])
     assert (loaded.ground.offset, loaded.ground.rms, loaded.ground.share) == (-0.3, 0.01, 0.4)
-    np.testing.assert_array_equal(loaded.box, full.box)
-    np.testing.assert_array_equal(loaded.place.world_from_model.matrix(), place.world_from_model.matrix())
-    assert tuple(loaded.place.origin) == place.origin
-    assert loaded.place.describe() == place.describe()
+    for one, other in ((loaded.cameras, full.cameras), (loaded, full)):
+        for field in fields(one):
+            before, after = getattr(one, field.name), getattr(other, field.name)
+            if isinstance(before, np.ndarray):
+                np.testing.assert_array_equal(before, after)
+
+
+def test_places_and_regions_survive_saving(tmp_path: Path):
+    moved = Similarity(2.0, np.eye(3)[[1, 2, 0]], np.array([1.0, 2, 3]))
+    place = Place(moved, True, "GPS", 0.01, (47.0, 8.5, 400.0), 1.5, np.array([0.0, 0, 1]))
+    artifacts.save_place(tmp_path, place)
+    loaded = artifacts.load_place(tmp_path)
+    np.testing.assert_array_equal(loaded.world_from_poses.matrix(), moved.matrix())
+    np.testing.assert_array_equal(loaded.up, place.up)
+    assert tuple(loaded.origin) == place.origin
+    assert loaded.describe() == place.describe()
+    artifacts.save_given_region(tmp_path, None)
+    assert artifacts.load_given_region(tmp_path) is None
+    given = given_region("box", (0, 0, 0, 1, 2, 3), moved)
+    artifacts.save_given_region(tmp_path, given)
+    np.testing.assert_array_equal(artifacts.load_given_region(tmp_path).box_corners(), given.box_corners())
+
+
+def test_a_damaged_record_is_named(tmp_path: Path):
+    (tmp_path / "place.json").write_text('{"metric": "perhaps"}')
+    with pytest.raises(WorkspaceError, match=r"place\.json cannot be read: .*world_from_poses") as caught:
+        artifacts.load_place(tmp_path)
+    assert "--force" in caught.value.hint

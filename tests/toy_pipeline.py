@@ -16,15 +16,31 @@ from pathlib import Path
 from typing import Any
 
 from configs.params import Config
+from stages.artifacts.artifact import Artifact
 from stages.engine.runner import run_pipeline
 from stages.engine.stage import Stage, StageContext
 from stages.engine.workspace import Workspace
 
 
+def text_artifact(stage: str, file: str) -> Artifact[str]:
+    return Artifact(
+        stage,
+        (file,),
+        lambda folder: (folder / file).read_text(),
+        lambda folder, text: (folder / file).write_text(text),
+    )
+
+
+LETTERS = text_artifact("ingest", "letters.txt")
+POSES = text_artifact("sfm", "model/poses.txt")
+LONG = text_artifact("undistort", "long.txt")
+MODEL = text_artifact("export", "model.glb")
+
+
 def ingest(context: StageContext) -> dict[str, Any]:
     photos = sorted(context.sources["photos"].iterdir())
     text = "".join(path.read_text()[0] for path in photos)
-    (context.out / "letters.txt").write_text(text)
+    context.write(LETTERS, text)
     return {"photos": len(photos), "masked": "masks" in context.sources}
 
 
@@ -41,26 +57,34 @@ def sfm(context: StageContext) -> dict[str, Any]:
             os.kill(os.getpid(), signal.SIGKILL)
     time.sleep(float(os.environ.get("TOY_SLEEP", "0")))
     (context.out / "model").mkdir()
-    (context.out / "model" / "poses.txt").write_text((context.inputs["ingest"] / "letters.txt").read_text() * end)
+    context.write(POSES, context.read(LETTERS) * end)
     return {"started_at": start, "ended_at": end}
 
 
 def undistort(context: StageContext) -> dict[str, Any]:
-    poses = (context.inputs["sfm"] / "model" / "poses.txt").read_text()
-    (context.out / "long.txt").write_text(str(len(poses) > 10))
+    context.write(LONG, str(len(context.read(POSES)) > 10))
     return {}
 
 
 def export(context: StageContext) -> dict[str, Any]:
-    (context.out / "model.glb").write_text((context.inputs["undistort"] / "long.txt").read_text())
+    context.write(MODEL, context.read(LONG))
     return {"nan": float("nan")}
 
 
 TOY: tuple[Stage, ...] = (
-    Stage("ingest", 1, (), "ingest", ingest, sources=("photos", "masks"), summary="photos to letters"),
-    Stage("sfm", 1, ("ingest",), "sfm", sfm, summary="letters to poses"),
-    Stage("undistort", 1, ("sfm",), "undistort", undistort, summary="poses to one bit"),
-    Stage("export", 1, ("undistort",), "export", export, summary="one bit to a file"),
+    Stage(
+        "ingest",
+        1,
+        lambda config: config.ingest,
+        ingest,
+        (),
+        (LETTERS,),
+        ("photos", "masks"),
+        summary="photos to letters",
+    ),
+    Stage("sfm", 1, lambda config: config.sfm, sfm, (LETTERS,), (POSES,), summary="letters to poses"),
+    Stage("undistort", 1, lambda config: config.undistort, undistort, (POSES,), (LONG,), summary="poses to one bit"),
+    Stage("export", 1, lambda config: config.export, export, (LONG,), (MODEL,), summary="one bit to a file"),
 )
 
 

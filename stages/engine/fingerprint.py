@@ -21,6 +21,8 @@ RACY_NS = 2_000_000_000
 
 MAX_NAMED = 3  # changed files named one by one; past it they are counted
 
+RUN_KEY = "run"  # what the run was started with: photos, preset, settings
+
 FileDigests = dict[str, str]
 """Relative posix path -> sha256 of the contents."""
 
@@ -35,7 +37,8 @@ class Identity:
         stage: the stage's name.
         version: the stage's version.
         params: the stage's settings, as JSON-able values.
-        inputs: needed stage -> digest of its published outputs.
+        inputs: artifact that is read ("undistort/cameras.json") -> digest of its files as published. Also what
+            `manifest_key` and RUN_KEY stand for, where a stage reads those.
         sources: outside path ("photos") -> its files' digests, None where it was not given.
     """
 
@@ -60,18 +63,30 @@ class Identity:
     def fingerprint(self) -> str:
         return digest(self.parts)
 
-    def changes_since(self, before: Identity, section: str) -> list[str]:
-        """What differs from `before`, in words. `section` is the config section the settings belong to."""
+    def changes_since(self, before: Identity) -> list[str]:
+        """What differs from `before`, in words."""
         changes = []
         if before.version != self.version:
             changes.append(f"stage version {before.version} -> {self.version}")
-        changes += _setting_changes(flatten(before.params, section), flatten(self.params, section))
+        changes += _setting_changes(flatten(before.params, self.stage), flatten(self.params, self.stage))
         for name in sorted({*before.sources, *self.sources}):
             changes += _source_changes(name, before.sources.get(name), self.sources.get(name))
         for name in sorted({*before.inputs, *self.inputs}):
             if before.inputs.get(name) != self.inputs.get(name):
-                changes.append(f"input stage {name} changed")
+                changes.append(_input_change(name))
         return changes
+
+
+def manifest_key(stage: str) -> str:
+    """Under which a stage's inputs name another one's manifest."""
+    return f"{stage}/manifest"
+
+
+def _input_change(name: str) -> str:
+    if name == RUN_KEY:
+        return "the run was started otherwise"
+    stage, _, rest = name.partition("/")
+    return f"{stage} was made again" if name == manifest_key(stage) else f"input {stage}/{rest} changed"
 
 
 def _setting_changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:

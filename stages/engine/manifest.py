@@ -12,6 +12,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+from stages.artifacts.artifact import Artifact
 from stages.engine.fingerprint import Identity, digest, file_sha256
 
 MANIFEST = "manifest.json"
@@ -65,8 +66,12 @@ class Manifest:
 
     @property
     def outputs_digest(self) -> str:
-        """One hash of all outputs: what the stages after this one depend on."""
+        """One hash of all outputs."""
         return digest({path: file.sha256 for path, file in self.outputs.items()})
+
+    def artifact_digest(self, artifact: Artifact[Any]) -> str:
+        """One hash of an artifact's files: what the stages that read it depend on."""
+        return digest({path: file.sha256 for path, file in self.outputs.items() if artifact.covers(path)})
 
     @property
     def size(self) -> int:

@@ -47,28 +47,28 @@ class StageOutcome:
 class Listener(Protocol):
     """Told what the runner does. The console draws it."""
 
-    def stage_started(self, stage: Stage, reason: str) -> None: ...
+    def stage_started(self, stage: Stage[Any], reason: str) -> None: ...
 
-    def stage_progress(self, stage: Stage, done: float, total: float, note: str) -> None: ...
+    def stage_progress(self, stage: Stage[Any], done: float, total: float, note: str) -> None: ...
 
-    def stage_finished(self, stage: Stage, outcome: StageOutcome) -> None: ...
+    def stage_finished(self, stage: Stage[Any], outcome: StageOutcome) -> None: ...
 
 
 class Silent:
     """The listener that ignores everything."""
 
-    def stage_started(self, stage: Stage, reason: str) -> None:
+    def stage_started(self, stage: Stage[Any], reason: str) -> None:
         """Ignored."""
 
-    def stage_progress(self, stage: Stage, done: float, total: float, note: str) -> None:
+    def stage_progress(self, stage: Stage[Any], done: float, total: float, note: str) -> None:
         """Ignored."""
 
-    def stage_finished(self, stage: Stage, outcome: StageOutcome) -> None:
+    def stage_finished(self, stage: Stage[Any], outcome: StageOutcome) -> None:
         """Ignored."""
 
 
 def run_pipeline(
-    pipeline: Sequence[Stage],
+    pipeline: Sequence[Stage[Any]],
     workspace: Workspace,
     config: BaseModel,
     sources: Mapping[str, Path | None],
@@ -129,8 +129,8 @@ def run_pipeline(
 
 
 def _select(
-    pipeline: Sequence[Stage], from_stage: str | None, until: str | None, force: Sequence[str]
-) -> tuple[Sequence[Stage], dict[str, str]]:
+    pipeline: Sequence[Stage[Any]], from_stage: str | None, until: str | None, force: Sequence[str]
+) -> tuple[Sequence[Stage[Any]], dict[str, str]]:
     """The stages up to `until`, and for each that must run even if fresh, the reason."""
     names = [stage.name for stage in pipeline]
     for option, name in [("--from", from_stage), ("--until", until), *(("--force", name) for name in force)]:
@@ -152,7 +152,7 @@ def _select(
 
 
 def _run_stage(
-    stage: Stage,
+    stage: Stage[Any],
     workspace: Workspace,
     config: BaseModel,
     digests: SourceDigests,
@@ -179,7 +179,7 @@ def _run_stage(
 
     out, scratch = workspace.begin(stage.name, identity.fingerprint)
     context = StageContext(
-        inputs={name: workspace.stage_folder(name) for name in stage.needs},
+        inputs={artifact.stage: workspace.stage_folder(artifact.stage) for artifact in stage.reads},
         sources=given,
         out=out,
         scratch=scratch,
@@ -187,15 +187,21 @@ def _run_stage(
         device=device,
         workers=workers,
         progress=progress,
+        digests={name: files for name in given if (files := digests.files(name)) is not None},
+        reads=stage.reads,
+        manifests={name: manifest for name in stage.reads_manifests if (manifest := workspace.published(name))},
+        record=workspace.record if stage.reads_run else None,
+        config=config if stage.reads_run else None,
     )
     with ResourceMeter() as meter:
         numbers = _call(stage, context, workspace, status)
     manifest = _describe(identity, out, numbers, meter, workspace)
+    _check_outputs(stage, manifest)
     workspace.publish(stage.name, manifest)
     return manifest
 
 
-def _call(stage: Stage, context: StageContext, workspace: Workspace, status: StageStatus) -> Mapping[str, Any]:
+def _call(stage: Stage[Any], context: StageContext, workspace: Workspace, status: StageStatus) -> Mapping[str, Any]:
     """Run the stage; tell of a full disk, a missing library or exhausted memory in the user's terms."""
     try:
         return stage.run(context) or {}
@@ -215,6 +221,18 @@ def _call(stage: Stage, context: StageContext, workspace: Workspace, status: Sta
         if wanted := requirement_error(error, stage.name):
             raise wanted from error
         raise
+
+
+def _check_outputs(stage: Stage[Any], manifest: Manifest) -> None:
+    """Raises ValueError where the stage published other things than it declares."""
+    strange = [path for path in manifest.outputs if not any(artifact.covers(path) for artifact in stage.writes)]
+    missing = [
+        artifact.name
+        for artifact in stage.writes
+        if not artifact.optional and not any(artifact.covers(path) for path in manifest.outputs)
+    ]
+    if strange or missing:
+        raise ValueError(f"stage {stage.name} wrote {strange} without declaring it, and did not write {missing}")
 
 
 def _describe(identity: Identity, out: Path, numbers: Mapping[str, Any], meter: Any, workspace: Workspace) -> Manifest:

@@ -5,10 +5,20 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
+
+from stages.artifacts.artifact import Artifact
 
 if TYPE_CHECKING:  # pydantic takes a tenth of a second that `hineus --help` need not wait for
     from pydantic import BaseModel
+
+    from stages.engine.fingerprint import FileDigests
+    from stages.engine.manifest import Manifest
+    from stages.engine.workspace import Record
+
+T = TypeVar("T")
+P = TypeVar("P")
+P_co = TypeVar("P_co", covariant=True)
 
 
 class Progress(Protocol):
@@ -22,11 +32,11 @@ def no_progress(done: float, total: float, note: str = "") -> None:
 
 
 @dataclass(frozen=True)
-class StageContext:
+class StageContext(Generic[P_co]):
     """All a running stage may touch.
 
     Attributes:
-        inputs: stage name -> its published folder, for each name in `Stage.needs`. Read only.
+        inputs: stage name -> its published folder, for each stage whose artifacts are read. For `read` alone.
         sources: paths outside the workspace ("photos", "masks"), only for stages that name them. Read only.
         out: empty folder that becomes the published one when `run` returns. Write here only.
         scratch: folder that survives a kill and is emptied when the stage is published or its fingerprint
@@ -35,40 +45,74 @@ class StageContext:
         device: "cpu" or "cuda".
         workers: how many CPU threads to use.
         progress: listener, see `Progress`.
+        digests: source name -> sha256 of its files, as far as they are known already.
+        reads: what `read` may give; None: anything (for a stage that is called by itself).
+        manifests: stage name -> its manifest, for `Stage.reads_manifests`.
+        record, config: of the workspace, for `Stage.reads_run`.
     """
 
     inputs: Mapping[str, Path]
     sources: Mapping[str, Path]
     out: Path
     scratch: Path
-    params: Any
+    params: P_co
     device: str = "cpu"
     workers: int = 1
     progress: Progress = no_progress
+    digests: Mapping[str, FileDigests] = field(default_factory=dict)
+    reads: tuple[Artifact[Any], ...] | None = None
+    manifests: Mapping[str, Manifest] = field(default_factory=dict)
+    record: Record | None = None
+    config: BaseModel | None = None
+
+    def read(self, artifact: Artifact[T]) -> T:
+        """The artifact as an earlier stage published it.
+
+        Raises:
+            ValueError: the stage did not declare that it reads it.
+        """
+        if self.reads is not None and artifact not in self.reads:
+            raise ValueError(f"{artifact.name} is read without being declared")
+        return artifact.load(self.inputs[artifact.stage])
+
+    def write(self, artifact: Artifact[T], value: T) -> None:
+        """Put an artifact of this stage into its folder."""
+        artifact.save(self.out, value)
+
+    def to_write(self, artifact: Artifact[T]) -> T:
+        """An artifact of this stage whose value is a place: where to write its files."""
+        return artifact.load(self.out)
 
 
 @dataclass(frozen=True)
-class Stage:
-    """One step of the pipeline: files in, files out.
+class Stage(Generic[P]):
+    """One step of the pipeline: artifacts in, artifacts out.
 
     Attributes:
-        name: folder name in the workspace and subcommand name.
+        name: folder name in the workspace, subcommand name, and the config section of its settings.
         version: raise it when the same inputs and settings would give another result; enters the fingerprint.
-        needs: names of the earlier stages whose published folders `run` reads.
-        params: name of the config section handed to `run`; all of it enters the fingerprint.
+        settings: its section of the whole config; all of it enters the fingerprint.
         run: does the work; returns the numbers a person wants to see (JSON-able). A failure raises.
+        reads: artifacts of earlier stages. Their contents enter the fingerprint, and nothing else of those stages.
+        writes: all that it publishes.
         sources: names of outside paths ("photos", "masks") whose contents enter the fingerprint.
+        reads_manifests: stages whose manifests it reads: what they cost, and with which settings they were made.
+        reads_run: whether it reads what the run was started with: the workspace's record and the whole config.
         summary: one line for `--help` and the progress bar.
     """
 
     name: str
     version: int
-    needs: tuple[str, ...]
-    params: str
-    run: Callable[[StageContext], dict[str, Any]]
-    sources: tuple[str, ...] = field(default=())
+    settings: Callable[[Any], P]
+    run: Callable[[StageContext[P]], dict[str, Any]]
+    reads: tuple[Artifact[Any], ...] = ()
+    writes: tuple[Artifact[Any], ...] = ()
+    sources: tuple[str, ...] = ()
+    reads_manifests: tuple[str, ...] = ()
+    reads_run: bool = False
     summary: str = ""
 
-    def settings(self, config: BaseModel) -> BaseModel:
-        """This stage's section of the whole config."""
-        return getattr(config, self.params)
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """Names of the earlier stages that must be up to date, in the order in which they are first named."""
+        return tuple(dict.fromkeys([artifact.stage for artifact in self.reads] + list(self.reads_manifests)))

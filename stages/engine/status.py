@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, replace
+from typing import Any, Literal
 
 from pydantic import BaseModel
 
-from stages.engine.fingerprint import FileDigests, Identity, SourceDigests
+from stages.engine.fingerprint import RUN_KEY, FileDigests, Identity, SourceDigests, digest, manifest_key
 from stages.engine.manifest import Manifest, ManifestDamaged, jsonable, output_problem
 from stages.engine.stage import Stage
 from stages.engine.workspace import Workspace
@@ -39,7 +39,7 @@ class StageStatus:
 
 
 def stage_status(
-    stage: Stage,
+    stage: Stage[Any],
     workspace: Workspace,
     config: BaseModel,
     digests: SourceDigests,
@@ -58,19 +58,13 @@ def stage_status(
     manifest, damage = _publication(stage, workspace, hashes)
     waiting = [earlier[name] for name in stage.needs if earlier[name].state != "fresh"]
     before = manifest.identity if manifest else None
-    identity = _identity_now(stage, config, digests, earlier, before)
+    identity = _identity_now(stage, workspace, config, digests, earlier, before)
     reasons = [damage] if damage else []
     if before is not None:
         # Of a stage that will run again only the run itself can tell whether its outputs change.
-        settled = {status.name for status in waiting}
-        now = Identity(
-            identity.stage,
-            identity.version,
-            identity.params,
-            {**identity.inputs, **{name: before.inputs[name] for name in settled & set(before.inputs)}},
-            identity.sources,
-        )
-        reasons += now.changes_since(before, stage.params)
+        before = replace(before, inputs=_by_artifact(before.inputs, stage, earlier))
+        unsettled = {name: old for name, old in before.inputs.items() if _owner(name) in {s.name for s in waiting}}
+        reasons += replace(identity, inputs={**identity.inputs, **unsettled}).changes_since(before)
         reasons += [f"input stage {status.name} is {status.state}" for status in waiting]
     elif not damage:
         reasons.append("not made yet")
@@ -82,7 +76,7 @@ def stage_status(
 
 
 def pipeline_status(
-    pipeline: Sequence[Stage],
+    pipeline: Sequence[Stage[Any]],
     workspace: Workspace,
     config: BaseModel,
     digests: SourceDigests,
@@ -95,7 +89,23 @@ def pipeline_status(
     return list(statuses.values())
 
 
-def _publication(stage: Stage, workspace: Workspace, hashes: bool) -> tuple[Manifest | None, str | None]:
+def replaced_inputs(stage: Stage[Any], workspace: Workspace) -> list[str]:
+    """The artifacts that the publication of `stage` was made from and that are no longer those in the workspace.
+
+    Raises:
+        ManifestDamaged: of a manifest that cannot be read.
+    """
+    manifest = workspace.published(stage.name)
+    made_from = manifest.identity.inputs if manifest else {}
+    replaced = []
+    for artifact in stage.reads:
+        now = workspace.published(artifact.stage)
+        if now is None or made_from.get(artifact.name) != now.artifact_digest(artifact):
+            replaced.append(artifact.name)
+    return replaced
+
+
+def _publication(stage: Stage[Any], workspace: Workspace, hashes: bool) -> tuple[Manifest | None, str | None]:
     try:
         manifest = workspace.published(stage.name)
     except ManifestDamaged as error:
@@ -106,20 +116,46 @@ def _publication(stage: Stage, workspace: Workspace, hashes: bool) -> tuple[Mani
 
 
 def _identity_now(
-    stage: Stage,
+    stage: Stage[Any],
+    workspace: Workspace,
     config: BaseModel,
     digests: SourceDigests,
     earlier: Mapping[str, StageStatus],
     before: Identity | None,
 ) -> Identity:
-    published = {name: earlier[name].manifest for name in stage.needs}
+    inputs = _artifact_digests(stage, earlier)
+    for name in stage.reads_manifests:
+        if manifest := earlier[name].manifest:
+            inputs[manifest_key(name)] = digest(manifest.to_json())
+    if stage.reads_run:
+        started = [dict(workspace.record.sources), workspace.record.preset, config.model_dump(mode="json")]
+        inputs[RUN_KEY] = digest(jsonable(started))
     return Identity(
         stage=stage.name,
         version=stage.version,
         params=jsonable(stage.settings(config).model_dump(mode="json")),
-        inputs={name: manifest.outputs_digest for name, manifest in published.items() if manifest},
+        inputs=inputs,
         sources={name: _source_files(name, digests, before) for name in stage.sources},
     )
+
+
+def _artifact_digests(stage: Stage[Any], earlier: Mapping[str, StageStatus]) -> dict[str, str]:
+    found = ((artifact, earlier[artifact.stage].manifest) for artifact in stage.reads)
+    return {artifact.name: manifest.artifact_digest(artifact) for artifact, manifest in found if manifest}
+
+
+def _owner(name: str) -> str:
+    """The stage that an input is from."""
+    return name.partition("/")[0]
+
+
+def _by_artifact(inputs: Mapping[str, str], stage: Stage[Any], earlier: Mapping[str, StageStatus]) -> dict[str, str]:
+    """Inputs as they are written now; 0.1.0 wrote one digest for all that a stage published."""
+    whole = {name for name, value in inputs.items() if "/" not in name and name != RUN_KEY}
+    known = {name: manifest for name in whole & set(earlier) if (manifest := earlier[name].manifest)}
+    same = {name for name, manifest in known.items() if manifest.outputs_digest == inputs[name]}
+    kept = {name: value for name, value in inputs.items() if name not in same}
+    return kept | {name: value for name, value in _artifact_digests(stage, earlier).items() if _owner(name) in same}
 
 
 def _source_files(name: str, digests: SourceDigests, before: Identity | None) -> FileDigests | None:

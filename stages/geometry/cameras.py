@@ -85,29 +85,28 @@ class PosedScene:
 
     Attributes:
         cameras: the registered, undistorted images.
-        world_from_scene: similarity from the normalised frame to the world frame, that of the results.
+        poses_from_scene: similarity from the normalised frame to the one in which the poses were found or given.
         points: [P, 3] float32 sparse points in the scene frame.
         point_errors: [P] float32 mean reprojection error in pixels.
         observations: [M, 2] int32 rows (image index, point index): which image saw which point.
         up: [3] unit vector, the estimated up direction in the scene frame.
         kind: "object" (cameras around one thing) or "forward" (a room, a facade, a survey flight).
-        place: how the world frame stands to the poses' own frame, to metres and to the Earth; None: not looked for.
         ground: plane of the ground or table in the scene frame, or None where none was found.
-        box: [2, 3] lowest and highest corner in the world frame of the box the mesh is cropped to, or None.
     """
 
     cameras: PinholeCameras
-    world_from_scene: Similarity
+    poses_from_scene: Similarity
     points: np.ndarray
     point_errors: np.ndarray
     observations: np.ndarray
     up: np.ndarray
     kind: str = "object"
-    place: Place | None = None
     ground: Plane | None = None
-    box: np.ndarray | None = None
 
-    @property
-    def poses_from_world(self) -> Similarity:
-        """From the frame of the results, which GPS or markers may have moved, to that the poses were given in."""
-        return Similarity.identity() if self.place is None else self.place.world_from_model.inverse()
+    def world_from_scene(self, place: Place) -> Similarity:
+        """To the frame of the results."""
+        return place.world_from_poses.compose(self.poses_from_scene)
+
+    def up_in(self, place: Place) -> np.ndarray:
+        """[3] unit, scene frame: up as the place tells it, else as the capture does."""
+        return self.up if place.up is None else place.up @ self.world_from_scene(place).rotation

@@ -13,16 +13,19 @@ MIN_REACH, MAX_REACH, AIR = 1.3, 12.0, 1.08
 COLORS = {"point": "#8a94a3", "inside": "#3c8d5a", "camera": "#2f6fb0", "region": "#d9822b", "ground": "#a0522d"}
 
 
-def overview_svg(scene: PosedScene) -> str:
-    """An SVG with two views of the scene frame side by side: from above (x right, y up), from the side (x, z)."""
+def overview_svg(scene: PosedScene, box_corners: np.ndarray | None = None) -> str:
+    """An SVG with two views of the scene frame side by side: from above (x right, y up), from the side (x, z).
+
+    Args:
+        box_corners: [8, 3] scene frame, of the box that the mesh is cropped to; see `GivenRegion.box_corners`.
+    """
     centers = scene.cameras.centers
     reach = float(np.clip(AIR * np.abs(centers).max(), MIN_REACH, MAX_REACH))
     thinned = scene.points[:: max(1, -(-len(scene.points) // MAX_POINTS))]
-    corners = None if scene.box is None else _box_corners(scene)
     views = []
     for column, (axis, title) in enumerate(((1, "from above"), (2, "from the side"))):
         left = column * (SIDE + 12)
-        shapes = [_points(thinned, axis, reach), _region(corners, axis, reach)]
+        shapes = [_points(thinned, axis, reach), _region(box_corners, axis, reach)]
         if axis == 2 and scene.ground is not None:
             shapes.append(_ground(scene, reach))
         shapes.append(_cameras(centers, scene.cameras.forward, axis, reach))
@@ -65,13 +68,6 @@ def _region(box_corners: np.ndarray | None, axis: int, reach: float) -> str:
         path = "".join(f"M{page[i, 0]:.1f} {page[i, 1]:.1f}L{page[j, 0]:.1f} {page[j, 1]:.1f}" for i, j in edges)
         shapes += f'<path d="{path}" {stroke}/>'
     return shapes
-
-
-def _box_corners(scene: PosedScene) -> np.ndarray:
-    """[8, 3] corners of the box in the scene frame; bit k of a corner's number is its side of axis k."""
-    assert scene.box is not None
-    picks = np.array([[i >> k & 1 for k in range(3)] for i in range(8)])
-    return scene.world_from_scene.inverse().apply(np.take_along_axis(scene.box, picks, axis=0))
 
 
 def _ground(scene: PosedScene, reach: float) -> str:

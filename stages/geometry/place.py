@@ -1,12 +1,13 @@
 """Where on Earth and how large: from the frame of the poses to a local frame in metres.
 
-The poses' own frame is called "model". "world" is the frame of the results: that of the model where nothing is known,
-else metres, and with GPS east, north, up from an origin near the photos.
+"poses" is the frame in which the camera poses were found or given. "world" is the frame of the results: that of the
+poses where nothing is known, else metres, and with GPS east, north, up from an origin near the photos.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -24,6 +25,8 @@ MAX_RESIDUAL = 0.25
 SAMPLES, OUTLIER_SIGMAS = 500, 3.0
 # Coordinates keep this part of the region's radius in 32 bits; where they would not, the origin moves.
 PRECISION = 1e-5
+# The sphere about a given box has some air at the corners, because the mesh is cut off near the sphere.
+BOX_MARGIN = 1.05
 
 
 @dataclass(frozen=True)
@@ -31,21 +34,23 @@ class Place:
     """How the world of the results stands to the poses' own frame, to metres and to the Earth.
 
     Attributes:
-        world_from_model: from the frame of the poses.
+        world_from_poses: from the frame of the poses.
         metric: whether world units are metres.
         scale_from: what the scale was found from, in words; empty where it is not known.
         scale_error: relative standard error of the scale, or None where it is not known.
         origin: latitude and longitude in degrees and altitude in metres of the world's origin (x east, y north,
             z up), or None.
         gps_residual: root mean square distance in metres of the cameras from their GPS positions, or None.
+        up: [3] unit, in the world, where GPS or the settings tell it; None: as the scene has it.
     """
 
-    world_from_model: Similarity
+    world_from_poses: Similarity
     metric: bool = False
     scale_from: str = ""
     scale_error: float | None = None
     origin: tuple[float, float, float] | None = None
     gps_residual: float | None = None
+    up: np.ndarray | None = None
 
     @property
     def units(self) -> str:
@@ -68,16 +73,54 @@ class Place:
     def rescaled(self, factor: float, scale_from: str, scale_error: float | None) -> Place:
         """The same place with all lengths multiplied by `factor`, the origin where it was."""
         stretch = Similarity(factor, np.eye(3), np.zeros(3))
-        world_from_model = stretch.compose(self.world_from_model)
-        return Place(world_from_model, True, scale_from, scale_error, self.origin, self.gps_residual)
+        return replace(
+            self,
+            world_from_poses=stretch.compose(self.world_from_poses),
+            metric=True,
+            scale_from=scale_from,
+            scale_error=scale_error,
+        )
 
     def near(self, center: np.ndarray, radius: float) -> Place:
         """The same place with its origin near `center` (world) where 32-bit coordinates would lose precision."""
         if np.abs(center).max() * np.finfo(np.float32).eps < PRECISION * radius:
             return self
         shift = Similarity(1.0, np.eye(3), -np.round(center))
-        moved = shift.compose(self.world_from_model)
-        return Place(moved, self.metric, self.scale_from, self.scale_error, None, self.gps_residual)
+        return replace(self, world_from_poses=shift.compose(self.world_from_poses), origin=None)
+
+
+@dataclass(frozen=True)
+class GivenRegion:
+    """The region of interest that the user gave, brought into the frame of the poses.
+
+    Attributes:
+        center: [3] of the sphere. radius: of it, or of the sphere about the box.
+        box: [2, 3] lowest and highest corner in the world of the box that the mesh is cropped to, or None.
+        world_from_poses: as it was when the region was given.
+    """
+
+    center: np.ndarray
+    radius: float
+    box: np.ndarray | None
+    world_from_poses: Similarity
+
+    def box_corners(self) -> np.ndarray | None:
+        """[8, 3] corners of the box in the frame of the poses; bit k of a corner's number is its side of axis k."""
+        if self.box is None:
+            return None
+        picks = np.array([[i >> k & 1 for k in range(3)] for i in range(8)])
+        return self.world_from_poses.inverse().apply(np.take_along_axis(self.box, picks, axis=0))
+
+
+def given_region(form: str, numbers: Sequence[float], world_from_poses: Similarity) -> GivenRegion:
+    """The region a user wrote: "sphere" (x, y, z, radius) or "box" (x0, y0, z0, x1, y1, z1), in the world."""
+    values, box = np.array(numbers, dtype=np.float64), None
+    center, radius = values[:3], float(values[3])
+    if form == "box":
+        box = values.reshape(2, 3)
+        center, radius = box.mean(0), BOX_MARGIN * float(np.linalg.norm(box[1] - box[0])) / 2
+    poses_from_world = world_from_poses.inverse()
+    return GivenRegion(poses_from_world.apply(center), poses_from_world.scale * radius, box, world_from_poses)
 
 
 # ---------------------------------------------------------------- GPS
@@ -86,7 +129,7 @@ class Located:
     """A model aligned to GPS.
 
     Attributes:
-        world_from_model: to metres east, north, up of `origin`.
+        world_from_poses: to metres east, north, up of `origin`.
         origin: latitude, longitude (degrees), altitude (metres).
         residual: root mean square distance in metres of the photos used, corrected for the freedom of the fit.
         scale_error: relative standard error of the scale.
@@ -94,7 +137,7 @@ class Located:
         used: photos whose position fits, of those that carry one.
     """
 
-    world_from_model: Similarity
+    world_from_poses: Similarity
     origin: tuple[float, float, float]
     residual: float
     scale_error: float
@@ -104,7 +147,7 @@ class Located:
     @property
     def up(self) -> np.ndarray:
         """[3] unit, in the model's frame."""
-        return self.world_from_model.rotation[2]
+        return self.world_from_poses.rotation[2]
 
 
 def east_north_up(positions: np.ndarray, origin: tuple[float, float, float]) -> np.ndarray:
@@ -150,8 +193,8 @@ def locate(centers: np.ndarray, positions: np.ndarray, seed: int = 0) -> Located
     kept = _agreeing(centers, targets, seed)
     if kept.sum() < max(MIN_LOCATED, MIN_AGREEING * len(centers)):
         raise ValueError(f"only {kept.sum()} of {len(centers)} GPS positions agree with the cameras and each other")
-    world_from_model = align_points(centers[kept], targets[kept])
-    misses = world_from_model.apply(centers[kept]) - targets[kept]
+    world_from_poses = align_points(centers[kept], targets[kept])
+    misses = world_from_poses.apply(centers[kept]) - targets[kept]
     count = int(kept.sum())
     # a similarity has seven parameters: with few photos it bends to their errors
     freedom = np.sqrt(3 * count / (3 * count - 7))
@@ -165,7 +208,7 @@ def locate(centers: np.ndarray, positions: np.ndarray, seed: int = 0) -> Located
         )
     vertical = freedom * np.sqrt((misses[:, 2] ** 2).mean())  # GPS knows heights less well than the rest
     tilt = np.degrees(vertical / np.sqrt(count) / max(float(spread[1]), 1e-9))
-    return Located(world_from_model, origin, residual, residual / np.sqrt(3 * count) / total, float(tilt), count)
+    return Located(world_from_poses, origin, residual, residual / np.sqrt(3 * count) / total, float(tilt), count)
 
 
 def _agreeing(centers: np.ndarray, targets: np.ndarray, seed: int) -> np.ndarray:

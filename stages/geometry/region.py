@@ -1,6 +1,6 @@
-"""Which part of the world is reconstructed: a sphere, found from cameras, sparse points and masks, or given.
+"""Which part of the world is reconstructed: a sphere, found from cameras, sparse points and masks.
 
-Cameras are given in the world frame, as `PinholeCameras` whose "scene" is the world.
+Cameras and points are given in the frame of the poses.
 
 Two kinds of capture:
 - "object": the cameras look at one place. The sphere is centred where their optical axes meet and a little
@@ -57,8 +57,6 @@ FORWARD_MARGIN = 1.05
 FORWARD_DEPTHS = 4.0
 # Points in the frames of fewer photos than this part of the median are the rim of a capture, where little can be known.
 FORWARD_FRAMES, MAX_COUNTED = 0.25, 20_000
-# The sphere about a given box has some air at the corners, because the mesh is cut off near the sphere.
-BOX_MARGIN = 1.05
 FROM_FRUSTA, FROM_POINTS = "the frusta of the cameras", "the sparse points"
 IRLS_STEPS = 30
 TINY = 1e-12  # keeps divisions finite; far below any length that occurs
@@ -69,18 +67,16 @@ class RegionOfInterest:
     """The sphere that becomes the unit sphere.
 
     Attributes:
-        center: [3] world frame.
-        radius: world units.
+        center: [3] in the frame of the poses.
+        radius: in its units.
         kind: "object" or "forward".
         source: what the sphere was found from, in words.
-        box: [2, 3] lowest and highest corner in the world frame of the box that the sphere encloses, or None.
     """
 
     center: np.ndarray
     radius: float
     kind: str
     source: str
-    box: np.ndarray | None = None
 
 
 def meeting_point(origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -181,8 +177,8 @@ def find_region(
     """The sphere the capture is about; of an object without ground, see `grown_alone`.
 
     Args:
-        cameras: at least two, in the world frame.
-        points: [P, 3] sparse points in the world frame.
+        cameras: at least two, in the frame of the poses.
+        points: [P, 3] sparse points, likewise.
         masks: one [H, W] silhouette per camera (or None for it), or None without masks.
         stated: what the poses' file says; taken unless the silhouettes' hull is smaller, for both hold the object.
 
@@ -242,15 +238,6 @@ def grown_alone(region: RegionOfInterest, points: np.ndarray, ground: Plane | No
         return region
     source = "the sparse points of an object alone" if ground is None else "the sparse points above the ground"
     return RegionOfInterest(center, ALONE_MARGIN * radius, "object", source)
-
-
-def given_region(form: str, numbers: Sequence[float], kind: str) -> RegionOfInterest:
-    """The region a user wrote: "sphere" (x, y, z, radius) or "box" (x0, y0, z0, x1, y1, z1), in the world frame."""
-    if form == "sphere":
-        return RegionOfInterest(np.array(numbers[:3]), float(numbers[3]), kind, "the given sphere")
-    box = np.array(numbers, dtype=np.float64).reshape(2, 3)
-    radius = BOX_MARGIN * float(np.linalg.norm(box[1] - box[0])) / 2
-    return RegionOfInterest(box.mean(0), radius, kind, "the given box", box)
 
 
 class _Meeting(NamedTuple):

@@ -1,4 +1,4 @@
-"""Which way is up: from GPS, from the ground's plane, or from how the cameras are held.
+"""Which way is up: from the ground's plane, or from how the cameras are held. GPS tells it better, see `place`.
 
 EXIF carries no gravity that could be trusted: its orientation flag is a multiple of 90 degrees. Ingest turns the
 photos by it, and that is what makes the cameras' own up worth something.
@@ -18,8 +18,6 @@ TINY = 1e-12  # keeps divisions finite; far below any length that occurs
 MIN_MEAN_UP = 0.3
 # The ground is level where it agrees with the cameras to this; beyond it is a slope, and the cameras are believed.
 MAX_SLOPE_DEG = 10.0
-# GPS is believed where it knows up to this.
-MAX_GPS_TILT_DEG = 2.0
 
 
 @dataclass(frozen=True)
@@ -36,7 +34,7 @@ class Up:
 
 
 def estimate_up(cameras: PinholeCameras) -> Up:
-    """Up in the world frame, from how cameras are held.
+    """Up in the frame of the poses, from how cameras are held.
 
     People hold cameras level: image rows are horizontal, so up is perpendicular to all camera x axes whatever
     the pitch. Where the x axes do not span a plane (photos from one side) it is the mean of the cameras' up, or,
@@ -56,17 +54,13 @@ def estimate_up(cameras: PinholeCameras) -> Up:
     return Up(up if up @ mean_up > 0 else -up, "level cameras")
 
 
-def choose_up(cameras: Up, ground: np.ndarray | None, gps: np.ndarray | None, gps_tilt_deg: float) -> Up:
-    """Which to believe: GPS where it is sure, then level ground, then the cameras.
+def choose_up(cameras: Up, ground: np.ndarray | None) -> Up:
+    """Which to believe: level ground, then the cameras.
 
     Args:
         cameras: see `estimate_up`.
         ground: [3] unit normal of the ground's plane, or None.
-        gps: [3] unit direction away from the Earth, or None.
-        gps_tilt_deg: standard error of `gps`, degrees.
     """
-    if gps is not None and gps_tilt_deg <= MAX_GPS_TILT_DEG:
-        return Up(gps, "GPS")
     if ground is not None and (not cameras.sure or angle_deg(ground, cameras.direction) <= MAX_SLOPE_DEG):
         return Up(ground, "the ground's plane")
     return cameras

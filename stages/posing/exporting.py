@@ -14,20 +14,21 @@ import numpy as np
 from stages import artifacts
 from stages.geometry.cameras import PosedScene
 from stages.geometry.normalisation import into_scene
+from stages.geometry.place import Place
 
 SPARSE, TRANSFORMS, POINTS = "sparse", "transforms.json", "sparse_pc.ply"
 
 
-def write_colmap(undistort: Path, sfm: Path, out: Path) -> dict[str, Any]:
+def write_colmap(undistort: Path, sfm: Path, place: Path, out: Path) -> dict[str, Any]:
     """Write images/, masks/ (where there are any) and sparse/ (.bin and .txt), as COLMAP's own undistorter does.
 
     Args:
-        undistort, sfm: folders of these stages. out: exists.
+        undistort, sfm, place: folders of these stages. out: exists.
 
     Returns:
         Numbers of images, points and observations.
     """
-    _, model = _images_and_model(undistort, sfm, out)
+    _, model = _images_and_model(undistort, sfm, artifacts.load_place(place), out)
     folder = out / SPARSE
     folder.mkdir()
     model.write_binary(str(folder))
@@ -35,18 +36,19 @@ def write_colmap(undistort: Path, sfm: Path, out: Path) -> dict[str, Any]:
     return _numbers(model)
 
 
-def write_transforms(undistort: Path, sfm: Path, out: Path) -> dict[str, Any]:
+def write_transforms(undistort: Path, sfm: Path, place: Path, out: Path) -> dict[str, Any]:
     """Write images/, masks/ (where there are any), transforms.json and a PLY of the sparse points.
 
     Args:
-        undistort, sfm: folders of these stages. out: exists.
+        undistort, sfm, place: folders of these stages. out: exists.
 
     Returns:
         Numbers of images, points and observations.
     """
-    scene, model = _images_and_model(undistort, sfm, out)
+    in_world = artifacts.load_place(place)
+    scene, model = _images_and_model(undistort, sfm, in_world, out)
     model.export_PLY(str(out / POINTS))
-    cameras = into_scene(scene.cameras, scene.world_from_scene.inverse())
+    cameras = into_scene(scene.cameras, scene.world_from_scene(in_world).inverse())
     frames = []
     for i, name in enumerate(cameras.names):
         cam_from_world = np.vstack([cameras.cam_from_scene[i], [0, 0, 0, 1]])
@@ -66,21 +68,20 @@ def write_transforms(undistort: Path, sfm: Path, out: Path) -> dict[str, Any]:
         if mask.exists():
             frame["mask_path"] = mask.relative_to(out).as_posix()
         frames.append(frame)
-    units = "arbitrary units" if scene.place is None else scene.place.units
     artifacts.write_json(
-        out / TRANSFORMS, {"camera_model": "OPENCV", "units": units, "ply_file_path": POINTS, "frames": frames}
+        out / TRANSFORMS, {"camera_model": "OPENCV", "units": in_world.units, "ply_file_path": POINTS, "frames": frames}
     )
     return _numbers(model)
 
 
-def _images_and_model(undistort: Path, sfm: Path, out: Path) -> tuple[PosedScene, Any]:
+def _images_and_model(undistort: Path, sfm: Path, place: Place, out: Path) -> tuple[PosedScene, Any]:
     """Copy images and masks to `out`; the scene, and the pycolmap model of it."""
     scene = artifacts.load_scene(undistort)
     _copy_images(scene, undistort, out)
-    return scene, undistorted_model(scene, sfm, out / artifacts.IMAGES)
+    return scene, undistorted_model(scene, place, sfm, out / artifacts.IMAGES)
 
 
-def undistorted_model(scene: PosedScene, sfm: Path, images_folder: Path) -> Any:
+def undistorted_model(scene: PosedScene, in_world: Place, sfm: Path, images_folder: Path) -> Any:
     """The pycolmap model of the pinhole images, with the points' colours and tracks.
 
     Where the features were seen comes from the model of `sfm`, whose photos and points are in the scene's order.
@@ -89,7 +90,7 @@ def undistorted_model(scene: PosedScene, sfm: Path, images_folder: Path) -> Any:
 
     source = pycolmap.Reconstruction(str(artifacts.model_path(sfm)))
     photos = sorted((source.images[i] for i in source.reg_image_ids()), key=lambda image: image.name)
-    cameras = into_scene(scene.cameras, scene.world_from_scene.inverse())
+    cameras = into_scene(scene.cameras, scene.world_from_scene(in_world).inverse())
     model = pycolmap.Reconstruction()
     camera_ids: dict[tuple[Any, ...], int] = {}
     for i, (photo, name) in enumerate(zip(photos, cameras.names, strict=True)):
@@ -112,7 +113,7 @@ def undistorted_model(scene: PosedScene, sfm: Path, images_folder: Path) -> Any:
             pycolmap.Rigid3d(pycolmap.Rotation3d(pose[:, :3]), pose[:, 3]),
         )
     index_of = {photo.image_id: i + 1 for i, photo in enumerate(photos)}
-    points = scene.world_from_scene.apply(scene.points.astype(np.float64))
+    points = scene.world_from_scene(in_world).apply(scene.points.astype(np.float64))
     for point_id, xyz in zip(sorted(source.points3D), points, strict=True):
         track = pycolmap.Track()
         for element in source.points3D[point_id].track.elements:

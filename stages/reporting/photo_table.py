@@ -7,8 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from stages import artifacts
-from stages.artifacts import ImageRecord
+from stages.artifacts import ImageRecord, ImageSet, Pictures, Registration
 from stages.posing.photo_fits import PhotoFit, photo_fits
 from stages.reporting.pictures import jpeg_uri, read_rgb, shrink
 
@@ -39,26 +38,31 @@ class PhotoResult:
         return "out" if self.reason else "held" if self.held_out else "used"
 
 
-def photo_results(ingest: Path, sfm: Path, cameras: Sequence[str], held_out: Sequence[str]) -> list[PhotoResult]:
-    """All photos, by name; none where ingest left no list.
+def photo_results(
+    image_set: ImageSet | None,
+    registration: Registration | None,
+    model: Path,
+    cameras: Sequence[str],
+    held_out: Sequence[str],
+) -> list[PhotoResult]:
+    """All photos, by name; none where their list is missing.
 
     Args:
-        ingest, sfm: folders of those stages.
+        model: folder of the COLMAP model.
         cameras: names of the scene's cameras: the photos' with `.png`.
         held_out: those of them that were kept back.
     """
-    try:
-        records = artifacts.load_image_set(ingest).images
-    except (OSError, ValueError, KeyError, TypeError):
+    if image_set is None:
         return []
-    reasons = {item["name"]: item.get("reason", "") or "no pose" for item in registration(sfm).get("unregistered", [])}
+    unregistered = registration.unregistered if registration else ()
+    reasons = {item.name: item.reason or "no pose" for item in unregistered}
     try:
-        fits = photo_fits(artifacts.model_path(sfm))
+        fits = photo_fits(model)
     except ValueError:
         fits = {}
     numbers = {name: number for number, name in enumerate(cameras)}
     results = []
-    for record in sorted(records, key=lambda record: record.name):
+    for record in sorted(image_set.images, key=lambda record: record.name):
         short = PurePosixPath(record.name).with_suffix(".png").as_posix()
         camera = next((numbers[name] for name in (f"{record.name}.png", short) if name in numbers), None)
         kept_back = camera is not None and cameras[camera] in held_out
@@ -67,22 +71,21 @@ def photo_results(ingest: Path, sfm: Path, cameras: Sequence[str], held_out: Seq
     return results
 
 
-def registration(sfm: Path) -> dict[str, Any]:
-    try:
-        return artifacts.load_registration(sfm)
-    except (OSError, ValueError):
-        return {}
-
-
-def describe_photos(results: Sequence[PhotoResult], ingest: Path, sfm: Path, most: int) -> dict[str, Any]:
+def describe_photos(
+    results: Sequence[PhotoResult],
+    image_set: ImageSet | None,
+    registration: Registration | None,
+    pictures: Pictures,
+    most: int,
+) -> dict[str, Any]:
     """The page's photos, those left out first; at most `most` have a picture. And the files never used."""
-    if not results:
+    if not results or image_set is None:
         return {}
     ordered = sorted(results, key=lambda result: result.state != "out")
     photos = [
         {
             "name": result.record.name,
-            "image": _thumbnail(ingest, result.record) if number < most else "",
+            "image": _thumbnail(pictures, result.record) if number < most else "",
             "state": result.state,
             "reason": result.reason,
             "error": result.fit.error_px if result.fit else None,
@@ -95,16 +98,15 @@ def describe_photos(results: Sequence[PhotoResult], ingest: Path, sfm: Path, mos
     summary = f"{placed} of {len(results)} photos were placed."
     if held := sum(result.held_out for result in results):
         summary += f" {held} were kept back from training and texture."
-    attempts = [f"{step['rung']} {step['registered']}" for step in registration(sfm).get("ladder", [])]
+    attempts = [f"{step['rung']} {step['registered']}" for step in (registration.ladder if registration else ())]
     if len(attempts) > 1:
         summary += f" Attempts, with the photos each placed: {', '.join(attempts)}."
     if len(results) > most:
         summary += f" The first {most} have a picture."
-    skipped = artifacts.load_image_set(ingest).skipped
     return {
         "photos": photos,
         "photo_summary": summary,
-        "skipped": [{"source": item.source, "reason": item.reason} for item in skipped],
+        "skipped": [{"source": item.source, "reason": item.reason} for item in image_set.skipped],
     }
 
 
@@ -126,8 +128,8 @@ def camera_captions(results: Sequence[PhotoResult], cameras: Sequence[str]) -> l
     return captions
 
 
-def _thumbnail(ingest: Path, record: ImageRecord) -> str:
+def _thumbnail(pictures: Pictures, record: ImageRecord) -> str:
     try:
-        return jpeg_uri(shrink(read_rgb(artifacts.image_path(ingest, record.name)), THUMBNAIL_SIDE), 75)
+        return jpeg_uri(shrink(read_rgb(pictures.path(record.name)), THUMBNAIL_SIDE), 75)
     except (OSError, ValueError):
         return ""

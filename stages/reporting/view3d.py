@@ -63,12 +63,17 @@ def pack_overlays(quality: VertexQuality) -> list[dict[str, Any]]:
 
 
 def pack_scene(
-    scene: PosedScene, captions: Sequence[dict[str, Any]], next_views: Sequence[NextView], atlas: AtlasMesh
+    scene: PosedScene,
+    captions: Sequence[dict[str, Any]],
+    next_views: Sequence[NextView],
+    atlas: AtlasMesh,
+    box_corners: np.ndarray | None = None,
 ) -> dict[str, Any]:
     """Cameras and suggested ones as pyramids, sparse points, a grid on the ground, the region's outline.
 
     Args:
         captions: for each camera of the scene what the view says of it: "name", "held_out", "error", "points".
+        box_corners: see `region_lines`.
     """
     turn, cameras = y_up_rotation(scene.up), scene.cameras
     distance = float(np.median(np.linalg.norm(cameras.centers, axis=1))) if len(cameras) else 1.0
@@ -91,18 +96,16 @@ def pack_scene(
         ],
         "points": _pack_positions(thinned @ turn.T) if len(thinned) else None,
         "ground": _plain(_ground_grid(scene, atlas) @ turn.T) if scene.ground is not None else None,
-        "region": _plain(region_lines(scene) @ turn.T),
+        "region": _plain(region_lines(box_corners) @ turn.T),
     }
 
 
-def region_lines(scene: PosedScene) -> np.ndarray:
-    """Line segments [2 L, 3]: the box where there is one, else three great circles of the unit sphere."""
-    if scene.box is not None:
-        corners = scene.world_from_scene.inverse().apply(
-            np.stack([scene.box[[i & 1, i >> 1 & 1, i >> 2 & 1], [0, 1, 2]] for i in range(8)])
-        )
+def region_lines(box_corners: np.ndarray | None) -> np.ndarray:
+    """Line segments [2 L, 3]: the box of these corners [8, 3] (bit k of a corner's number is its side of axis k), or
+    three great circles of the unit sphere."""
+    if box_corners is not None:
         edges = [(i, i | bit) for i in range(8) for bit in (1, 2, 4) if not i & bit]
-        return corners[np.array(edges).ravel()]
+        return box_corners[np.array(edges).ravel()]
     angles = np.linspace(0, 2 * np.pi, 65)
     circle = np.stack([np.cos(angles), np.sin(angles), np.zeros(65)], 1)
     segments = np.stack([circle[:-1], circle[1:]], 1).reshape(-1, 3)

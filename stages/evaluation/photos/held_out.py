@@ -8,15 +8,19 @@ from typing import Any
 import numpy as np
 
 from stages import artifacts
-from stages.engine.manifest import Manifest
+from stages.atlas import ATLAS_STAGE
+from stages.bake import BAKE
+from stages.engine.status import replaced_inputs
 from stages.engine.workspace import Workspace
 from stages.errors import InputError, WorkspaceError
 from stages.evaluation.photos.images import find_lpips
 from stages.evaluation.photos.scoring import score_photos
 from stages.reconstruct import choose_device
+from stages.train import TRAIN
+from stages.undistort import UNDISTORT
 
 # The stages that drawings are made from, in order.
-DRAWN_FROM = ("undistort", "train", "atlas", "bake")
+DRAWN_FROM = (UNDISTORT, TRAIN, ATLAS_STAGE, BAKE)
 
 
 def evaluate_views(workspace: Path, renders: Path | None = None, device: str = "auto") -> dict[str, Any]:
@@ -71,16 +75,13 @@ def _whole(workspace: Path) -> Workspace:
     """A workspace whose stages that drawings are made from are all there, and of one run."""
     opened = Workspace.open(workspace)
     hint = f"Make it: `hineus run --workspace {workspace}`."
-    manifests: dict[str, Manifest] = {}
+    names = [stage.name for stage in DRAWN_FROM]
     for stage in DRAWN_FROM:
-        manifest = opened.published(stage)
-        if manifest is None:
-            raise WorkspaceError(f"{workspace} has no result of the stage {stage}.", hint)
-        for before in DRAWN_FROM:
-            made_of = manifest.identity.inputs.get(before)
-            if made_of is not None and made_of != manifests[before].outputs_digest:
-                raise WorkspaceError(
-                    f"The stage {stage} of {workspace} is of another {before} than the one there.", hint
-                )
-        manifests[stage] = manifest
+        if opened.published(stage.name) is None:
+            raise WorkspaceError(f"{workspace} has no result of the stage {stage.name}.", hint)
+        made_from = (artifact.partition("/")[0] for artifact in replaced_inputs(stage, opened))
+        if before := next((name for name in made_from if name in names), None):
+            raise WorkspaceError(
+                f"The stage {stage.name} of {workspace} is of another {before} than the one there.", hint
+            )
     return opened

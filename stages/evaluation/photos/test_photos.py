@@ -19,7 +19,7 @@ from stages.ingest import find_masks, read_mask_file
 from stages.posing.known import image_size, match_photos
 from stages.posing.reading import read_poses
 from stages.posing.triangulation import fitted_camera
-from stages.undistort import pinhole_camera, pinhole_photo
+from stages.posing.undistortion import pinhole_camera, pinhole_photo
 
 OPAQUE = 127  # alpha above this is the object, as ingest has it
 
@@ -75,7 +75,7 @@ class TestPhotos:
             intrinsics=np.stack(intrinsics),
             cam_from_scene=np.stack([known.cam_from_world for known in matched.values()]),
         )
-        self.cameras = into_scene(in_poses, scene.poses_from_world.compose(scene.world_from_scene))
+        self.cameras = into_scene(in_poses, scene.poses_from_scene)
 
     def load(self, index: int) -> tuple[np.ndarray, np.ndarray | None]:
         """Photo [H, W, 3] uint8 (on white, where that is the suite's background) and mask [H, W] bool or None."""

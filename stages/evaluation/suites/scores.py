@@ -52,14 +52,14 @@ def result_mesh(workspace: Workspace, fresh: set[str], out: Path) -> Path | None
         return None
     vertices, faces = artifacts.load_mesh(workspace.stage_folder("cleanup"))
     scene = artifacts.load_scene(workspace.stage_folder("undistort"))
-    _write(scene.poses_from_world.compose(scene.world_from_scene), (vertices, faces), out)
+    _write(scene.poses_from_scene, (vertices, faces), out)
     return out
 
 
 def posed_mesh(workspace: Workspace, mesh: Path, out: Path) -> Path:
     """Write a mesh that is in the world frame of a workspace, in the frame of its poses, to `out`."""
-    scene = artifacts.load_scene(workspace.stage_folder("undistort"))
-    _write(scene.poses_from_world, read_mesh(mesh), out)
+    place = artifacts.load_place(workspace.stage_folder("place"))
+    _write(place.world_from_poses.inverse(), read_mesh(mesh), out)
     return out
 
 

@@ -1,0 +1,72 @@
+"""What ingest publishes: upright photos, their masks, and what is known of each."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+from stages.artifacts.artifact import Artifact
+from stages.artifacts.json_files import read_json, write_json
+from stages.artifacts.pictures import pictures_of
+
+IMAGE_RECORDS = "images.json"
+
+
+@dataclass(frozen=True)
+class ImageRecord:
+    """One photo that was taken in.
+
+    Attributes:
+        name: relative posix path under `images/`; the source's own path when the file could be kept as it is.
+        source: path of the photo relative to the photo folder.
+        width, height: upright size in pixels.
+        focal_px: focal length prior in pixels, or None.
+        camera: photos with the same value share one camera's intrinsics.
+        blur: variance of the Laplacian of the grey image at <= 1 megapixel; low is blurred.
+        has_mask: whether `masks/<name>.png` exists.
+        sha256: hash of the source file.
+        gps: latitude and longitude in degrees (WGS 84) and altitude in metres, where EXIF has all three.
+    """
+
+    name: str
+    source: str
+    width: int
+    height: int
+    focal_px: float | None
+    camera: str
+    blur: float
+    has_mask: bool
+    sha256: str
+    gps: tuple[float, float, float] | None = None
+
+
+@dataclass(frozen=True)
+class SkippedImage:
+    """A file that was left out, and why, in words."""
+
+    source: str
+    reason: str
+
+
+@dataclass(frozen=True)
+class ImageSet:
+    """All that ingest found: photos kept (sorted by name) and files left out."""
+
+    images: tuple[ImageRecord, ...]
+    skipped: tuple[SkippedImage, ...] = field(default=())
+
+
+def save_image_set(folder: Path, image_set: ImageSet) -> None:
+    write_json(folder / IMAGE_RECORDS, asdict(image_set))
+
+
+def load_image_set(folder: Path) -> ImageSet:
+    data = read_json(folder / IMAGE_RECORDS)
+    return ImageSet(
+        tuple(ImageRecord(**record) for record in data["images"]),
+        tuple(SkippedImage(**record) for record in data["skipped"]),
+    )
+
+
+PHOTOS = pictures_of("ingest")
+IMAGE_SET = Artifact("ingest", (IMAGE_RECORDS,), load_image_set, save_image_set)

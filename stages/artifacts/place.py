@@ -1,0 +1,68 @@
+"""What place publishes: how the frame of the poses lies in the world, and the region that the user gave."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from stages.artifacts.artifact import Artifact
+from stages.artifacts.json_files import Array, Record, read_record, write_record
+from stages.geometry.place import GivenRegion, Place
+from stages.geometry.similarity import Similarity
+
+PLACE_FILE = "place.json"
+REGION_FILE = "given_region.json"
+
+
+class SimilarityRecord(Record):
+    """See `Similarity`."""
+
+    scale: float
+    rotation: Array
+    translation: Array
+
+    def similarity(self) -> Similarity:
+        return Similarity(self.scale, self.rotation, self.translation)
+
+
+class _PlaceRecord(Record):
+    world_from_poses: SimilarityRecord
+    metric: bool
+    scale_from: str
+    scale_error: float | None
+    origin: tuple[float, float, float] | None
+    gps_residual: float | None
+    up: Array | None
+
+
+class _RegionRecord(Record):
+    """Null throughout where the region is to be found."""
+
+    center: Array | None = None
+    radius: float | None = None
+    box: Array | None = None
+    world_from_poses: SimilarityRecord | None = None
+
+
+def save_place(folder: Path, place: Place) -> None:
+    write_record(folder / PLACE_FILE, _PlaceRecord.model_validate(place))
+
+
+def load_place(folder: Path) -> Place:
+    record = read_record(folder / PLACE_FILE, _PlaceRecord)
+    return Place(**{**dict(record), "world_from_poses": record.world_from_poses.similarity()})
+
+
+def save_given_region(folder: Path, region: GivenRegion | None) -> None:
+    write_record(folder / REGION_FILE, _RegionRecord() if region is None else _RegionRecord.model_validate(region))
+
+
+def load_given_region(folder: Path) -> GivenRegion | None:
+    """None where none was given."""
+    record = read_record(folder / REGION_FILE, _RegionRecord)
+    if record.center is None or record.radius is None or record.world_from_poses is None:
+        return None
+    return GivenRegion(record.center, record.radius, record.box, record.world_from_poses.similarity())
+
+
+PLACE = Artifact("place", (PLACE_FILE,), load_place, save_place)
+GIVEN_REGION = Artifact("place", (REGION_FILE,), load_given_region, save_given_region)
