@@ -185,6 +185,17 @@ class ProgressDisplay:
 
 
 # ---------------------------------------------------------------- tables
+def table_of(first: str, *numbers: str) -> Table:
+    """An empty table: a column of names, and columns of numbers."""
+    from rich.table import Table
+
+    table = Table(header_style="bold")
+    table.add_column(first)
+    for heading in numbers:
+        table.add_column(heading, justify="right")
+    return table
+
+
 def outcome_table(outcomes: Sequence[StageOutcome], width: int) -> Table:
     """Stage, what became of it and why, its cost, where there is room its key numbers. The total is of what ran now."""
     from rich.table import Table

@@ -50,4 +50,4 @@ class Session:
 
 def print_json(answer: Mapping[str, Any], ok: bool = True) -> None:
     """One object on stdout."""
-    typer.echo(json.dumps({"ok": ok, **answer}, default=str))
+    typer.echo(json.dumps({"ok": ok, **answer}))

@@ -6,8 +6,9 @@ import ctypes
 import logging
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 from configs.load import load_config
 from configs.params import Config
@@ -67,6 +68,18 @@ class Reconstruction:
     device: str
     workers: int
     outcomes: tuple[StageOutcome, ...]
+
+    def as_dict(self) -> dict[str, Any]:
+        """JSON-able."""
+        return {
+            "workspace": str(self.workspace.root),
+            "preset": self.preset,
+            "device": self.device,
+            "workers": self.workers,
+            "stages": [asdict(outcome) for outcome in self.outcomes],
+            "glb": str(self.glb) if self.glb else None,
+            "report": str(self.report) if self.report else None,
+        }
 
     @property
     def glb(self) -> Path | None:

@@ -15,15 +15,16 @@ from toy_pipeline import TOY, failing, with_stage
 from typer.testing import CliRunner, Result
 
 from configs.load import describe_settings
-from hineus_cli import doctor, options
+from hineus_cli import options
 from hineus_cli.app import build_app
 from hineus_cli.console import key_numbers, outcome_table, status_table
-from hineus_cli.doctor import Finding
+from stages import machine_check as doctor
 from stages import reconstruct
 from stages.engine.runner import StageOutcome
 from stages.engine.status import StageStatus
 from stages.engine.workspace import Workspace
 from stages.errors import ConfigError, InputError, ReconstructionError
+from stages.machine_check import Finding
 
 REPOSITORY = Path(__file__).parents[1]
 

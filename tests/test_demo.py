@@ -11,6 +11,7 @@ from configs.load import load_config
 from stages import artifacts
 from stages.errors import InputError
 from stages.pipeline import PIPELINE
+from stages.reconstruct import Reconstruction
 from stages.scenes import demo
 
 SCORE = {
@@ -36,9 +37,7 @@ def stand_ins(monkeypatch):
         if made.ply:
             artifacts.ply_path(export).write_text("ply")
         workspace = SimpleNamespace(root=request.workspace, stage_folder=lambda name: request.workspace / name)
-        return SimpleNamespace(
-            workspace=workspace, outcomes=(), glb=None, report=None, preset=request.preset, device="cpu"
-        )
+        return Reconstruction(workspace, load_config(request.preset), request.preset, "cpu", 2, ())
 
     monkeypatch.setattr(demo, "reconstruct", reconstruct)
     monkeypatch.setattr(demo, "score_mesh", lambda mesh, model, truth: dict(SCORE))

@@ -30,7 +30,7 @@ def scene(figurine):
 
 
 def test_figurine_rests_on_the_ground_with_extent_one(figurine):
-    low, high = figurine.bounds
+    low, high = figurine.vertices.min(0), figurine.vertices.max(0)
     assert low[2] == pytest.approx(0.0, abs=1e-12)
     assert (high - low).max() == pytest.approx(1.0)
 

@@ -21,7 +21,7 @@ def doctor(
     as_json: Json = False,
 ) -> None:
     """Is this machine fit? Versions, missing libraries, GPU, memory, disk, and what to install."""
-    from hineus_cli.doctor import examine
+    from stages.machine_check import examine
 
     findings = examine(folder.absolute())
     lacking = [finding for finding in findings if finding.state == "missing"]

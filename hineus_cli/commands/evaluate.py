@@ -112,7 +112,7 @@ def evaluate_mesh(
         )
         return evaluate_mesh(predicted, truth, options)
 
-    _run(context, as_json, evaluate, _show_surfaces)
+    _run(context, evaluate, _show_surfaces)
 
 
 def compare(
@@ -128,7 +128,7 @@ def compare(
     from stages.evaluation.reading import mesh_path
 
     options = MeshOptions(icp="rigid" if icp else None, distance_map=distance_map)
-    _run(context, as_json, lambda: evaluate_mesh(mesh_path(first), mesh_path(second), options), _show_surfaces)
+    _run(context, lambda: evaluate_mesh(mesh_path(first), mesh_path(second), options), _show_surfaces)
 
 
 @evaluate_app.command("dtu")
@@ -143,7 +143,7 @@ def evaluate_dtu(
     """DTU's protocol: observed cells, plane cut, distances below 20 mm. DATA has ObsMask/ and Points/stl/."""
     from stages.evaluation.protocols.dtu import evaluate_dtu as score
 
-    _run(context, as_json, lambda: score(predicted, data, scan, seed), _show_numbers)
+    _run(context, lambda: score(predicted, data, scan, seed), _show_numbers)
 
 
 @evaluate_app.command("glossy")
@@ -161,7 +161,7 @@ def evaluate_glossy(
     """GlossySynthetic's protocol: points of what the test views see. DATA is an object's folder, e.g. bell."""
     from stages.evaluation.protocols.glossy import evaluate_glossy as score
 
-    _run(context, as_json, lambda: score(predicted, data, split), _show_numbers)
+    _run(context, lambda: score(predicted, data, split), _show_numbers)
 
 
 @evaluate_app.command("tanks")
@@ -181,12 +181,7 @@ def evaluate_tanks(
     """Tanks and Temples' protocol: F-score at tau in the crop volume. DATA is a scene's folder, e.g. Ignatius."""
     from stages.evaluation.protocols.tanks import evaluate_tanks as score
 
-    _run(
-        context,
-        as_json,
-        lambda: score(predicted, data, cameras, tau, refine, matrix, seed),
-        _show_numbers,
-    )
+    _run(context, lambda: score(predicted, data, cameras, tau, refine, matrix, seed), _show_numbers)
 
 
 @evaluate_app.command("views")
@@ -202,13 +197,12 @@ def evaluate_views(
     """Photos held back from training, against drawings of the field and of the textured mesh."""
     from stages.evaluation.photos.held_out import evaluate_views as score
 
-    _run(context, as_json, lambda: score(workspace, renders, device), _show_views)
+    _run(context, lambda: score(workspace, renders, device), _show_views)
 
 
 # ---------------------------------------------------------------- running, showing
 def _run(
     context: typer.Context,
-    as_json: bool,
     evaluate: Callable[[], dict[str, Any]],
     show: Callable[[dict[str, Any]], None],
 ) -> None:
@@ -216,7 +210,7 @@ def _run(
 
     with context.obj.working():
         found = evaluate()
-    if as_json:
+    if context.obj.json:
         print_json(found)
         return
     show(found)
@@ -226,16 +220,11 @@ def _run(
 
 
 def _show_surfaces(found: dict[str, Any]) -> None:
-    from rich.table import Table
-
-    from hineus_cli.console import product
+    from hineus_cli.console import product, table_of
 
     console = product()
     ways = ("accuracy", "completeness")
-    table = Table(header_style="bold")
-    table.add_column("distance")
-    for heading in ("accuracy", "completeness", "accuracy, % of the extent", "completeness, % of the extent"):
-        table.add_column(heading, justify="right")
+    table = table_of("distance", *ways, *(f"{way}, % of the extent" for way in ways))
     for key in ("mean", "rms", "median", "p90", "p95", "p99", "max"):
         values = [found[way][key] for way in ways]
         parts = [f"{100 * value / found['extent']:.3f}" for value in values]
@@ -245,9 +234,7 @@ def _show_surfaces(found: dict[str, Any]) -> None:
         f"chamfer {found['chamfer']:.5g} ({100 * found['chamfer'] / found['extent']:.3f} % of the extent, "
         f"{found['extent']:.5g}), sum {found['chamfer_sum']:.5g}"
     )
-    table = Table(header_style="bold")
-    for heading in ("threshold", "precision %", "recall %", "F-score %"):
-        table.add_column(heading, justify="right")
+    table = table_of("threshold", "precision %", "recall %", "F-score %")
     for score in found["f_scores"]:
         shares = [f"{score[key]:.2f}" for key in ("precision", "recall", "f_score")]
         table.add_row(f"{score['threshold']:.5g}", *shares)
@@ -263,13 +250,9 @@ def _show_surfaces(found: dict[str, Any]) -> None:
 
 def _show_numbers(found: dict[str, Any]) -> None:
     """The plain numbers of a protocol."""
-    from rich.table import Table
+    from hineus_cli.console import product, table_of
 
-    from hineus_cli.console import product
-
-    table = Table(header_style="bold")
-    table.add_column("number")
-    table.add_column(f"unit: {found['unit']}, shares in %", justify="right")
+    table = table_of("number", f"unit: {found['unit']}, shares in %")
     for key, value in found.items():
         if isinstance(value, int | float):
             table.add_row(key.replace("_", " "), f"{value:.5g}" if isinstance(value, float) else str(value))
@@ -277,9 +260,7 @@ def _show_numbers(found: dict[str, Any]) -> None:
 
 
 def _show_views(found: dict[str, Any]) -> None:
-    from rich.table import Table
-
-    from hineus_cli.console import product
+    from hineus_cli.console import product, table_of
 
     rows = [*found["photos"], {"name": "mean", **found["mean"]}]
     columns = [
@@ -289,10 +270,7 @@ def _show_views(found: dict[str, Any]) -> None:
         for key in ("psnr", "ssim", "lpips")
         if any(row[what][region] is not None and row[what][region][key] is not None for row in rows)
     ]
-    table = Table(header_style="bold")
-    table.add_column("photo")
-    for column in columns:
-        table.add_column(" ".join(column), justify="right")
+    table = table_of("photo", *(" ".join(column) for column in columns))
     for row in rows:
         table.add_row(row["name"], *(_cell(row[what][region], key) for what, region, key in columns))
     product().print(table)

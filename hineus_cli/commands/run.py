@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, replace
+from dataclasses import replace
 from typing import Annotated
 
 import typer
@@ -55,17 +55,7 @@ def _run(session: Session, request: Request, verbose: bool) -> None:
         result = reconstruct(request, session.pipeline, progress)
     _show(result)
     if session.json:
-        print_json(
-            {
-                "workspace": str(result.workspace.root),
-                "preset": result.preset,
-                "device": result.device,
-                "workers": result.workers,
-                "stages": [asdict(outcome) for outcome in result.outcomes],
-                "glb": result.glb,
-                "report": result.report,
-            }
-        )
+        print_json(result.as_dict())
 
 
 def _show(result: Reconstruction) -> None:

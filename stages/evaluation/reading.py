@@ -9,9 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from stages import artifacts
+from stages.engine.workspace import Workspace
 from stages.errors import InputError, WorkspaceError
 from stages.evaluation.surfaces import Surface
-from stages.geometry.cameras import PinholeCameras, PosedScene
+from stages.geometry.cameras import PinholeCameras
 from stages.geometry.normalisation import into_scene
 
 CLOUDS = (".pcd", ".xyz", ".pts")
@@ -71,7 +72,7 @@ def read_prediction(place: Path) -> tuple[Path, Surface]:
     surface = read_surface(path)
     if not place.is_dir():
         return path, surface
-    poses_from_world = artifacts.load_place(place / "place").world_from_poses.inverse()
+    poses_from_world = artifacts.load_place(Workspace.open(place).stage_folder("place")).world_from_poses.inverse()
     return path, surface.moved(poses_from_world.matrix())
 
 
@@ -151,7 +152,12 @@ def workspace_cameras(workspace: Path) -> Cameras:
     Raises:
         WorkspaceError: there is none, or it has no undistorted photos.
     """
-    scene = _posed_scene(workspace)
+    opened = Workspace.open(workspace)
+    if opened.published("undistort") is None:
+        raise WorkspaceError(
+            f"{workspace} has no undistorted photos.", f"Make them: `hineus undistort --workspace {workspace}`."
+        )
+    scene = artifacts.load_scene(opened.stage_folder("undistort"))
     return Cameras(str(workspace), into_scene(scene.cameras, scene.poses_from_scene.inverse()))
 
 
@@ -160,17 +166,6 @@ def own_cameras(predicted: Path, given: Path | None) -> Cameras | None:
     if given is not None:
         return read_cameras(given)
     return workspace_cameras(predicted) if predicted.is_dir() else None
-
-
-def _posed_scene(workspace: Path) -> PosedScene:
-    from stages.engine.workspace import Workspace
-
-    opened = Workspace.open(workspace)
-    if opened.published("undistort") is None:
-        raise WorkspaceError(
-            f"{workspace} has no undistorted photos.", f"Make them: `hineus undistort --workspace {workspace}`."
-        )
-    return artifacts.load_scene(opened.stage_folder("undistort"))
 
 
 def read_masks(folder: Path, cameras: PinholeCameras) -> Iterator[tuple[int, np.ndarray]]:

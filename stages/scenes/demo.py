@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -41,19 +41,13 @@ class Demo:
 
     def as_dict(self) -> dict[str, Any]:
         """JSON-able: the score, seconds, paths, and the stages' numbers."""
-        result = self.result
         return {
             "mean_distance_percent": self.score["mean"],
             "accuracy_percent": self.score["accuracy"],
             "completeness_percent": self.score["completeness"],
             "seconds": round(self.seconds, 1),
             "score": self.score,
-            "glb": str(result.glb) if result.glb else None,
-            "report": str(result.report) if result.report else None,
-            "workspace": str(result.workspace.root),
-            "preset": result.preset,
-            "device": result.device,
-            "stages": [asdict(outcome) for outcome in result.outcomes],
+            **self.result.as_dict(),
         }
 
 

@@ -74,11 +74,6 @@ class Figurine:
     normals: np.ndarray
     design: np.ndarray
 
-    @property
-    def bounds(self) -> np.ndarray:
-        """[2, 3] lowest and highest corner."""
-        return np.stack([self.vertices.min(0), self.vertices.max(0)])
-
 
 def make_figurine(cell: float = MESH_CELL) -> Figurine:
     """Mesh the bird with grid cells of `cell` design units, polished by two Newton steps."""

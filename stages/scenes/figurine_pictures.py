@@ -97,7 +97,6 @@ class LitScene:
         cloth: [H, W, 3] outgoing radiance of the cloth.
         floor: [3] outgoing radiance of the floor around the cloth.
         sharp, soft: environment maps for polished and for painted parts.
-        bounds: [2, 3] of the figurine.
     """
 
     raycaster: Any
@@ -110,7 +109,6 @@ class LitScene:
     floor: np.ndarray
     sharp: np.ndarray
     soft: np.ndarray
-    bounds: np.ndarray
 
 
 def _subdivide(faces: np.ndarray, attributes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -167,7 +165,6 @@ def light_scene(figurine: Figurine, seed: int, light_samples: int = 128, cloth_s
         floor=(0.32 * ground_light[0, 0] / np.pi).astype(np.float32),
         sharp=_blur_environment(environment, 1.0),
         soft=_blur_environment(environment, 8.0),
-        bounds=figurine.bounds,
     )
 
 
@@ -239,15 +236,6 @@ def _shade_figurine(
     return _interpolate(scene, hit, chosen, scene.diffuse) + strength * fresnel * mirror
 
 
-def _box_on_screen(bounds: np.ndarray, cam_from_world: np.ndarray, focal: float, width: int, height: int) -> tuple:
-    """Columns and rows [x0, x1), [y0, y1) that can show the bird."""
-    corners = np.array([[bounds[i, 0], bounds[j, 1], bounds[k, 2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
-    in_cam = corners @ cam_from_world[:3, :3].T + cam_from_world[:3, 3]
-    pixels = focal * in_cam[:, :2] / in_cam[:, 2:] + [width / 2, height / 2]
-    low, high = np.floor(pixels.min(0)).astype(int) - 1, np.ceil(pixels.max(0)).astype(int) + 1
-    return max(low[0], 0), min(high[0], width), max(low[1], 0), min(high[1], height)
-
-
 def render(scene: LitScene, cam_from_world: np.ndarray, focal: float, size: tuple[int, int]) -> np.ndarray:
     """Linear radiance [height, width, 3] of one photograph, averaged over 2x2 samples a pixel."""
     width, height = (SUPERSAMPLING * side for side in size)
@@ -257,15 +245,11 @@ def render(scene: LitScene, cam_from_world: np.ndarray, focal: float, size: tupl
     x, y = np.meshgrid((np.arange(width) + 0.5 - width / 2) / focal, (np.arange(height) + 0.5 - height / 2) / focal)
     directions = np.stack([x, y, np.ones_like(x)], -1) @ rotation
     directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
-    flat = directions.reshape(-1, 3)
-    image = _surroundings(scene, np.broadcast_to(center, flat.shape), flat, scene.sharp).reshape(height, width, 3)
-
-    x0, x1, y0, y1 = _box_on_screen(scene.bounds, cam_from_world, focal, width, height)
-    views = directions[y0:y1, x0:x1].reshape(-1, 3)
-    hit, chosen = _cast(scene, np.broadcast_to(center, views.shape), views)
+    views = directions.reshape(-1, 3)
+    centers = np.broadcast_to(center, views.shape)
+    image = _surroundings(scene, centers, views, scene.sharp)
+    hit, chosen = _cast(scene, centers, views)
     points = center + hit["t_hit"].numpy()[chosen, None] * views[chosen]
-    box = image[y0:y1, x0:x1].reshape(-1, 3)
-    box[chosen] = _shade_figurine(scene, hit, chosen, points, views[chosen])
-    image[y0:y1, x0:x1] = box.reshape(y1 - y0, x1 - x0, 3)
+    image[chosen] = _shade_figurine(scene, hit, chosen, points, views[chosen])
     shape = (size[1], SUPERSAMPLING, size[0], SUPERSAMPLING, 3)
     return image.reshape(shape).mean((1, 3))

@@ -99,21 +99,21 @@ def evaluate_glossy(predicted: Path, data: Path, split: Path | None = None) -> d
     Raises:
         InputError: a file cannot be read, or nothing is left to measure.
     """
-    truth, (path, ours) = read_glossy(data, split), read_prediction(predicted)
+    (cameras, depths), (path, ours) = read_glossy(data, split), read_prediction(predicted)
     try:
-        found = glossy_score(ours, truth.cameras, visible_points(truth.cameras, truth.depths))
+        found = glossy_score(ours, cameras, visible_points(cameras, depths))
     except ValueError as error:
         raise InputError(
             f"{path} cannot be held against {data}: {error}.",
             f"Reconstruct with the data set's own poses: `hineus run {data} --poses {data}`.",
         ) from error
-    views = f"all {len(truth.cameras)} views" if split is None else f"the {len(truth.cameras)} test views of {split}"
+    views = f"all {len(cameras)} views" if split is None else f"the {len(cameras)} test views of {split}"
     return {
         "predicted": str(path),
         "truth": str(data),
         "unit": "the data set's (the object lies in the unit sphere)",
         **asdict(found),
-        "views": len(truth.cameras),
+        "views": len(cameras),
         "done": [
             "protocol: GlossySynthetic, as NeRO's eval_synthetic_shape.py",
             "alignment: none, the frame of the data set's cameras",
@@ -123,16 +123,8 @@ def evaluate_glossy(predicted: Path, data: Path, split: Path | None = None) -> d
     }
 
 
-@dataclass(frozen=True)
-class GlossyTruth:
-    """Cameras of an object's test views, and the depth of each, [H, W], infinite off the object."""
-
-    cameras: PinholeCameras
-    depths: list[np.ndarray]
-
-
-def read_glossy(data: Path, split: Path | None) -> GlossyTruth:
-    """The test views of an object of GlossySynthetic; all views without a split.
+def read_glossy(data: Path, split: Path | None) -> tuple[PinholeCameras, list[np.ndarray]]:
+    """Cameras of an object's test views (all without a split), and the depth of each, [H, W], infinite off the object.
 
     Raises:
         InputError: cameras or depth images are missing or cannot be read.
@@ -152,4 +144,4 @@ def read_glossy(data: Path, split: Path | None) -> GlossyTruth:
             "Unpack GlossySynthetic again, or name the split that belongs to it.",
         )
     cameras = found.select([stems.index(stem) for stem in wanted])
-    return GlossyTruth(cameras, [nero.read_depth(data / f"{stem}{nero.DEPTH}") for stem in wanted])
+    return cameras, [nero.read_depth(data / f"{stem}{nero.DEPTH}") for stem in wanted]
