@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from rigs import scene_without_points
+from rigs import scene_without_points, three_rings
 
 from configs.params import CleanupParams
 from stages import artifacts
@@ -23,27 +23,6 @@ from stages.surface.isosurface import extract_isosurface
 from stages.surface.solids import extract_solid
 
 SIZE = 160
-
-
-def ring_of_cameras(count=12, distance=2.5, elevations=(15, 45, 75)):
-    """Cameras around and above the origin, looking at it."""
-    extrinsics = []
-    for i in range(count):
-        turn, rise = 2 * np.pi * i / count, np.radians(elevations[i % len(elevations)])
-        center = distance * np.array([np.cos(turn) * np.cos(rise), np.sin(turn) * np.cos(rise), np.sin(rise)])
-        z = -center / distance
-        x = np.cross(z, [0, 0, 1.0])
-        x /= np.linalg.norm(x)
-        rotation = np.stack([x, np.cross(z, x), z])
-        extrinsics.append(np.column_stack([rotation, -rotation @ center]))
-    focal = 0.45 * SIZE * np.sqrt(distance**2 - 1)
-    K = np.array([[focal, 0, SIZE / 2], [0, focal, SIZE / 2], [0, 0, 1]])
-    return PinholeCameras(
-        names=tuple(f"{i:02d}.png" for i in range(count)),
-        sizes=np.full((count, 2), SIZE),
-        intrinsics=np.repeat(K[None], count, 0),
-        cam_from_scene=np.array(extrinsics),
-    )
 
 
 def ball(radius=0.5, center=(0, 0, 0), resolution=32):
@@ -65,7 +44,7 @@ def stage(tmp_path):
     def run(vertices, faces, masks=None, scene_extras=None, region=None, **params):
         for folder in (undistort, extract, place, out):
             folder.mkdir()
-        cameras = ring_of_cameras()
+        cameras = three_rings()
         artifacts.save_scene(undistort, replace(scene_without_points(cameras), **(scene_extras or {})))
         artifacts.save_given_region(place, region)
         artifacts.save_mesh(extract, vertices, faces)
@@ -98,7 +77,7 @@ def test_small_pieces_go_and_their_number_is_told():
 
 def test_views_of_a_ball_are_those_on_its_near_side():
     vertices, faces = ball()
-    cameras = ring_of_cameras(count=1, elevations=(0,))  # at +x
+    cameras = three_rings(count=1, elevations=(0,))  # at +x
     seen = selection.count_views(vertices, faces, cameras, enough=1) > 0
     horizon = 0.5**2 / 2.5  # the tangent cone touches the ball at x = r^2 / d
     assert seen[vertices[:, 0] > horizon + 0.06].all()
@@ -107,7 +86,7 @@ def test_views_of_a_ball_are_those_on_its_near_side():
 
 def test_views_are_counted_up_to_enough():
     vertices, faces = ball()
-    cameras = ring_of_cameras()
+    cameras = three_rings()
     top = vertices[:, 2].argmax()
     assert selection.count_views(vertices, faces, cameras, enough=3)[top] == 3
     assert selection.count_views(vertices, faces, cameras, enough=99)[top] == len(cameras)
@@ -115,7 +94,7 @@ def test_views_are_counted_up_to_enough():
 
 def test_what_lies_outside_the_image_is_not_seen():
     vertices, faces = ball()
-    cameras = ring_of_cameras(count=1, elevations=(0,))
+    cameras = three_rings(count=1, elevations=(0,))
     narrow = PinholeCameras(cameras.names, np.array([[SIZE // 2, SIZE]]), cameras.intrinsics, cameras.cam_from_scene)
     seen = selection.count_views(vertices, faces, narrow, enough=1) > 0
     pixels, _ = cameras.project(0, vertices)
@@ -255,7 +234,7 @@ def test_decimation_refuses_an_impossible_target():
 
 
 def test_hull_drops_what_most_masks_exclude_but_trusts_no_single_mask():
-    cameras = ring_of_cameras()
+    cameras = three_rings()
     points = np.array([[0, 0, 0], [0.8, 0, 0.0], [0, 0, 0.3]])
     disk = silhouettes(cameras)
     assert selection.outside_hull(points, cameras, disk, 0.1).tolist() == [False, True, False]

@@ -7,8 +7,7 @@ import types
 
 import numpy as np
 import pytest
-from rigs import scene_without_points
-from test_cleanup import ring_of_cameras
+from rigs import scene_without_points, three_rings
 
 from configs.params import ExtractParams
 from stages import artifacts
@@ -27,7 +26,7 @@ def stage(tmp_path, monkeypatch):
         stand_in = types.ModuleType("stages.neural.trained_field")
         stand_in.load_field = lambda path, device: types.SimpleNamespace(sdf=sdf)
         monkeypatch.setitem(sys.modules, "stages.neural.trained_field", stand_in)
-        artifacts.save_scene(undistort, scene_without_points(ring_of_cameras()))
+        artifacts.save_scene(undistort, scene_without_points(three_rings()))
         seen = []
         context = StageContext(
             inputs={"undistort": undistort, "train": train},
@@ -52,7 +51,7 @@ def test_mesh_and_numbers(stage):
 
 def test_no_finer_than_the_photos(stage):
     numbers, *_ = stage(lambda p: np.linalg.norm(p, axis=1) - 0.5, resolution=512)
-    assert numbers["resolution"] == numbers["supported_resolution"] == supported_resolution(ring_of_cameras())
+    assert numbers["resolution"] == numbers["supported_resolution"] == supported_resolution(three_rings())
     # The unit sphere fills 90 % of the images' 160 pixels; a pixel at its centre is a bit larger than at its front.
     assert 110 < numbers["resolution"] < 160
 

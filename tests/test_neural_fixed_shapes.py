@@ -6,7 +6,7 @@ from collections import Counter
 
 import pytest
 import torch
-from test_train import TINY, assert_finds_the_ball, make_trainer
+from ball_training import TINY, assert_finds_the_ball, make_trainer
 from torch.utils._python_dispatch import TorchDispatchMode
 from train_settings import changed
 

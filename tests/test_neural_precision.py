@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import pytest
 import torch
-from test_train import TINY, assert_finds_the_ball, make_trainer
+from ball_training import TINY, assert_finds_the_ball, make_trainer
 from train_settings import changed
 
 from stages.neural.acceleration import is_mixed, short_products
 from stages.neural.mlp import mlp
 from stages.neural.trained_field import field_state, load_field
 
-EVERYTHING = {"reflection": "stable", "reflection_from": 0.0, "sampler": "proposal"}
+EVERYTHING = {"terms.reflection.form": "stable", "terms.reflection.start": 0.0, "sampling.sampler": "proposal"}
 
 
 def mixed(**settings):

@@ -9,7 +9,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from test_sfm import FOCAL, HEIGHT, WIDTH, ingested, look_at, render
+from printed_box import FOCAL, HEIGHT, WIDTH, ingested, render
+from rigs import look_at
 
 from configs.params import SfmParams
 from stages import artifacts

@@ -18,11 +18,11 @@ MIN_REACH, MAX_REACH, AIR = 1.3, 12.0, 1.08
 COLORS = {"point": "#8a94a3", "inside": "#3c8d5a", "camera": "#2f6fb0", "region": "#d9822b", "ground": "#a0522d"}
 
 
-def overview_svg(scene: PosedScene, box_corners: np.ndarray | None = None) -> str:
+def overview_svg(scene: PosedScene, box_corners: Float[np.ndarray, "8 3"] | None = None) -> str:
     """An SVG with two views of the scene frame side by side: from above (x right, y up), from the side (x, z).
 
     Args:
-        box_corners: [8, 3] scene frame, of the box that the mesh is cropped to; see `GivenRegion.box_corners`.
+        box_corners: scene frame, of the box that the mesh is cropped to; see `GivenRegion.box_corners`.
     """
     centers = scene.cameras.centers
     reach = float(np.clip(AIR * np.abs(centers).max(), MIN_REACH, MAX_REACH))
