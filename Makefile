@@ -43,11 +43,8 @@ format: venv
 
 docs: venv
 	$(BIN)/python docs/make_reference.py
-	$(BIN)/python -m benchmarks.run_sets --table-only
-	$(BIN)/python -m benchmarks.ablate --table-only
-	$(BIN)/python -m benchmarks.hard_variants --table-only
-	$(BIN)/python -m benchmarks.suites --table-only
-	$(BIN)/python -m benchmarks.held_out --table-only
+	$(BIN)/python -m docs.make_architecture
+	$(BIN)/python -m benchmarks.pages
 
 # Bundled in a temporary folder: nothing of npm stays in the tree.
 VENDOR := stages/templates/vendor
