@@ -11,7 +11,7 @@ from stages.neural.acceleration import is_mixed, short_products
 from stages.neural.mlp import mlp
 from stages.neural.trained_field import field_state, load_field
 
-EVERYTHING = {"reflection": "stable", "reflection_from": 0.0, "sampler": "proposal"}
+EVERYTHING = {"terms.reflection.form": "stable", "terms.reflection.start": 0.0, "sampling.sampler": "proposal"}
 
 
 def mixed(**settings):
