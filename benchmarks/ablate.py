@@ -35,20 +35,8 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any
 
-from benchmarks.run_sets import (
-    NOT_MEASURED,
-    OUT,
-    PAGE,
-    RESULTS,
-    ROOT,
-    find_sets,
-    known_cameras,
-    machine,
-    markdown_table,
-    photos_of,
-    run_hineus,
-    with_table,
-)
+from benchmarks.pages import NOT_MEASURED, markdown_table, write_tables
+from benchmarks.run_sets import OUT, RESULTS, ROOT, find_sets, known_cameras, machine, photos_of, run_hineus
 from configs.params import Config
 from configs.renames import RENAMED
 from stages.engine.stage import Stage, StageContext
@@ -163,7 +151,7 @@ class Run:
         machine: CPU, cores, versions, device, how many runs went side by side.
         poses: hash of the undistorted photos and poses it started from.
         code: hash of the sources in `stages/neural`.
-        score: distances of the clean mesh, see `stages.evaluation.known_surface`; None without a known surface.
+        score: distances of the clean mesh, see `protocols.known_object`; None without a known surface.
         psnr: of the training's rays at its end, dB.
         held_out_psnr: of photos left out of the training, dB; None where none were.
         train_wall_s, train_cpu_s: seconds of the training stage.
@@ -271,7 +259,7 @@ def code_hash() -> str:
 def measured_stages(truth: Path) -> list[Stage]:
     """The stages of a run; a mesh that nothing is known of is not made."""
     from stages.cleanup import CLEANUP
-    from stages.evaluation.known_object import has_truth
+    from stages.evaluation.protocols.known_object import has_truth
     from stages.extract import EXTRACT
     from stages.train import TRAIN
 
@@ -344,7 +332,7 @@ def score_clean_mesh(
 ) -> dict[str, float] | None:
     """Distances of the run's clean mesh to the known surface, None where there is none; see `score_mesh`."""
     from stages import artifacts
-    from stages.evaluation.known_object import file_stem, has_truth, score_mesh
+    from stages.evaluation.protocols.known_object import file_stem, has_truth, score_mesh
 
     if not has_truth(truth):
         return None
@@ -525,15 +513,15 @@ def _mean(values: Sequence[float], digits: int) -> str:
     return f"{fmean(values):.{digits}f}" if values else "-"
 
 
-def write_table() -> None:
+def tables() -> dict[str, str]:
+    """The tables, from the result files."""
     runs = load_runs()
-    body = ablation_table(runs) if runs else NOT_MEASURED
-    PAGE.write_text(with_table(PAGE.read_text(encoding="utf-8"), "ablation", body), encoding="utf-8")
+    return {"ablation": ablation_table(runs) if runs else NOT_MEASURED}
 
 
 # ---------------------------------------------------------------- command
 def main(argv: Sequence[str] | None = None) -> int:
-    from stages.evaluation.known_object import has_truth
+    from stages.evaluation.protocols.known_object import has_truth
     from stages.reconstruct import available_cores, default_preset, has_cuda
 
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -584,7 +572,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"{len(plans)} runs to make (others have a result; --again measures them anew)", file=sys.stderr)
         jobs = arguments.jobs or (1 if has_cuda() else available_cores())
         failed += run_plans(plans, data, jobs, arguments.keep)
-    write_table()
+    write_tables(tables())
     return 1 if failed else 0
 
 

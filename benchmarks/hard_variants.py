@@ -4,7 +4,7 @@ python -m benchmarks.hard_variants DATA                        every row that ha
 python -m benchmarks.hard_variants DATA synth_helmet-blurred   these
 python -m benchmarks.hard_variants DATA --mesh                 go on to the clean mesh where its truth is known
 python -m benchmarks.hard_variants DATA --mesh --set train.steps=2000    with a smaller budget
-python -m benchmarks.hard_variants --table-only                only rewrite the table of docs/benchmarks.md
+python -m benchmarks.hard_variants --table-only                only rewrite the table of docs/benchmarks/hard-photos.md
 
 A row is a set of DATA, or SET-VARIANT: see `VARIANTS` for what each does to the photos, and `BASES` for the sets it is
 done to. A row runs in a process of its own; results go to benchmarks/results/poses/ROW.json, photos made and workspaces
@@ -28,19 +28,8 @@ from typing import Any
 import numpy as np
 
 from benchmarks.ablate import score_clean_mesh
-from benchmarks.run_sets import (
-    NOT_MEASURED,
-    OUT,
-    PAGE,
-    RESULTS,
-    ROOT,
-    find_sets,
-    known_cameras,
-    machine,
-    markdown_table,
-    photos_of,
-    with_table,
-)
+from benchmarks.pages import NOT_MEASURED, markdown_table, write_tables
+from benchmarks.run_sets import OUT, RESULTS, ROOT, find_sets, known_cameras, machine, photos_of
 from stages.posing.neus import read_neus
 
 ROWS = RESULTS / "poses"
@@ -80,7 +69,7 @@ class Row:
         attempts: what each rung of the ladder did, see `stages.posing.ladder.Step`.
         cpu_s: CPU seconds of the sfm stage, all attempts.
         failure: message and hint of the error that ended the row, or None.
-        score: distances of the clean mesh to the truth, see `evaluation.known_surface`; None where it was not made.
+        score: distances of the clean mesh to the truth, see `protocols.known_object`; None where it was not made.
         mesh_preset: preset of the training behind that mesh; mesh_settings: what was set over it, SECTION.KEY=VALUE.
     """
 
@@ -266,13 +255,15 @@ def true_centers(folder: Path) -> tuple[list[np.ndarray], float] | None:
 
     The extent of a set in the layout of NeuS is the diameter of its sphere.
     """
-    from stages.evaluation.known_object import has_truth, load_known_surface
+    from stages.evaluation.protocols.known_object import has_truth, load_known_object
 
     source = photos_of(folder)
     if source is not None and has_truth(folder):
-        known, centers = load_known_surface(folder)
-        by_stem = {Path(name).stem: center for name, center in centers.items()}
-        return [by_stem[path.stem] for path in sorted(source.iterdir())], known.extent
+        known = load_known_object(folder)
+        by_stem = {
+            Path(name).stem: center for name, center in zip(known.cameras.names, known.cameras.centers, strict=True)
+        }
+        return [by_stem[path.stem] for path in sorted(source.iterdir())], known.surface.extent
     if (path := known_cameras(folder)) is not None:
         stated = read_neus(path)
         poses = [camera.cam_from_world for camera in stated.cameras]
@@ -309,7 +300,7 @@ def known_stem(source: Path, variant: str) -> Callable[[str], str]:
 
     Frames of a video have their numbers at the end of their names.
     """
-    from stages.evaluation.known_object import file_stem
+    from stages.evaluation.protocols.known_object import file_stem
 
     if variant != "video":
         return file_stem
@@ -322,9 +313,10 @@ def _stems(source: Path) -> list[str]:
 
 
 def _found_centers(model: Path) -> dict[str, np.ndarray]:
-    from stages.evaluation.known_object import load_model_centers
+    from stages.evaluation.reading import read_cameras
 
-    return load_model_centers(model)
+    cameras = read_cameras(model).pinhole
+    return dict(zip(cameras.names, cameras.centers, strict=True))
 
 
 # ---------------------------------------------------------------- one row
@@ -335,7 +327,7 @@ def run_row(row: str, data: Path, mesh: bool, preset: str, settings: Sequence[st
         RuntimeError: `hineus` broke, rather than saying why it cannot.
     """
     from stages import artifacts
-    from stages.evaluation.known_object import has_truth
+    from stages.evaluation.protocols.known_object import has_truth
 
     photos = make_photos(row, data)
     workspace = FOLDERS / row / "workspace"
@@ -465,10 +457,10 @@ def attempts_cell(row: Row) -> str:
     return ", ".join(f"**{cell}**" if i == kept else cell for i, cell in enumerate(cells)) or "-"
 
 
-def write_table() -> None:
+def tables() -> dict[str, str]:
+    """The table, from the result files."""
     rows = load_rows()
-    body = pose_table(rows) if rows else NOT_MEASURED
-    PAGE.write_text(with_table(PAGE.read_text(encoding="utf-8"), "poses", body), encoding="utf-8")
+    return {"poses": pose_table(rows) if rows else NOT_MEASURED}
 
 
 # ---------------------------------------------------------------- command
@@ -505,7 +497,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             except RuntimeError as error:
                 print(f"{row}: {error}", file=sys.stderr)
                 failed.append(row)
-    write_table()
+    write_tables(tables())
     return 1 if failed else 0
 
 

@@ -11,7 +11,7 @@ import sys
 from pathlib import Path
 
 from stages.errors import HineusError
-from stages.evaluation.known_object import score_mesh
+from stages.evaluation.protocols.known_object import score_mesh
 
 
 def main() -> int:

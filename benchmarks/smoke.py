@@ -125,7 +125,7 @@ def measure(folder: Path) -> dict[str, float]:
     Raises:
         RuntimeError: `hineus` failed.
     """
-    from stages.scenes.figurine import PHOTOS, make_demo_photos
+    from stages.scenes.demo_photos import PHOTOS, make_demo_photos
 
     make_demo_photos(folder, NUM_PHOTOS, SIZE)
     workspace = folder / "workspace"
@@ -143,7 +143,7 @@ def figures(workspace: Path, answer: dict[str, Any], truth: Path) -> dict[str, f
         truth: folder with the known surface.
     """
     from stages import artifacts
-    from stages.evaluation.known_object import score_mesh
+    from stages.evaluation.protocols.known_object import score_mesh
 
     numbers = {stage["name"]: stage["numbers"] for stage in answer["stages"]}
     score = score_mesh(artifacts.ply_path(workspace / "export"), artifacts.model_path(workspace / "sfm"), truth)
@@ -187,20 +187,18 @@ def _glb_json(path: Path) -> dict[str, Any]:
 def held_out_drawing(workspace: Path, mesh: AtlasMesh, texture: np.ndarray) -> tuple[float, float]:
     """Mean PSNR in dB and SSIM of the mesh, drawn from where the left-out photos were taken."""
     from stages import artifacts
-    from stages.drawing.view_scores import draw_view, score_views, silhouette
+    from stages.drawing.view_scores import score_views
 
     cameras = artifacts.load_scene(workspace / "undistort").cameras
     names = artifacts.load_held_out(workspace / "train")
-    scores = score_views(
-        lambda index: draw_view(mesh, texture, cameras, index),
-        cameras,
-        lambda index: (artifacts.load_image(workspace / "undistort", cameras.names[index]), None),
-        lambda index: silhouette(mesh.vertices, mesh.faces, cameras, index),
-        [cameras.names.index(name) for name in names],
-    )
+
+    def load(index: int) -> tuple[np.ndarray, None]:
+        return artifacts.load_image(workspace / "undistort", cameras.names[index]), None
+
+    scores = [(view.psnr, view.ssim) for view in score_views(mesh, texture, cameras, load, names)]
     if not scores:
         return float("nan"), float("nan")
-    return float(np.mean([score.psnr for score in scores])), float(np.mean([score.ssim for score in scores]))
+    return float(np.mean([psnr for psnr, _ in scores])), float(np.mean([ssim for _, ssim in scores]))
 
 
 def exported(folder: Path) -> list[Path]:

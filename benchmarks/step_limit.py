@@ -31,7 +31,7 @@ import numpy as np
 import torch
 from numba import njit, prange
 
-from benchmarks.run_sets import markdown_table
+from benchmarks.pages import markdown_table
 from benchmarks.step_speed import (
     CHOSEN,
     POINTS,

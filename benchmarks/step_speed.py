@@ -30,7 +30,7 @@ import torch
 
 from benchmarks import ball_heap
 from benchmarks.ablate import BASE, VARIANTS, settings_of
-from benchmarks.run_sets import markdown_table
+from benchmarks.pages import markdown_table
 from configs.load import load_config
 from configs.training import TrainParams
 from stages.geometry.cameras import PinholeCameras, PosedScene

@@ -130,14 +130,6 @@ def _bars(console: Console) -> Progress:
     )
 
 
-@contextlib.contextmanager
-def progress_of(what: str) -> Iterator[Callable[[int, int], None]]:
-    """A bar for something that is no stage; yields what takes (done, total). Silent in a pipe."""
-    with _bars(people()) as bars:
-        task = bars.add_task(what, total=None, note="")
-        yield lambda done, total: bars.update(task, completed=done, total=total)
-
-
 class ProgressDisplay:
     """A bar with an ETA for each stage; in a pipe, a line at its start, its end and now and then between."""
 
@@ -156,6 +148,17 @@ class ProgressDisplay:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._bars.stop()
+
+    def bar(self, what: str) -> Callable[[int, int], None]:
+        """For something that is no stage: what takes (done, total) and shows it. Silent in a pipe."""
+        task: Any = None
+
+        def show(done: int, total: int) -> None:
+            nonlocal task
+            task = self._bars.add_task(what, note="") if task is None else task
+            self._bars.update(task, completed=done, total=total)
+
+        return show
 
     def stage_started(self, stage: Stage, reason: str) -> None:
         self.running = stage.name
@@ -182,6 +185,17 @@ class ProgressDisplay:
 
 
 # ---------------------------------------------------------------- tables
+def table_of(first: str, *numbers: str) -> Table:
+    """An empty table: a column of names, and columns of numbers."""
+    from rich.table import Table
+
+    table = Table(header_style="bold")
+    table.add_column(first)
+    for heading in numbers:
+        table.add_column(heading, justify="right")
+    return table
+
+
 def outcome_table(outcomes: Sequence[StageOutcome], width: int) -> Table:
     """Stage, what became of it and why, its cost, where there is room its key numbers. The total is of what ran now."""
     from rich.table import Table

@@ -17,7 +17,7 @@ FEW_PHOTOS = 20  # a full turn in steps of less than 20 degrees; sets below it l
 EXPECTED = ("not an image", "the raw file of", "the clip of")  # reasons to leave a file out that are no news
 NAMED = 4  # this many photos are named in a warning
 
-# All measured with `benchmarks/run_sets.py` on two cores, see docs/benchmarks.md.
+# All measured with `benchmarks/run_sets.py` on two cores, see docs/benchmarks/results.md.
 GIB = 1 << 30
 MEMORY_BASE_GIB = 1.5  # baking, the peak of all sets: 1.45 to 1.66 GiB
 MEMORY_OF_PHOTOS = 2.0  # training holds the photos' bytes twice while it puts them in a row

@@ -5,10 +5,10 @@ from __future__ import annotations
 import ctypes
 import logging
 import os
-import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 from configs.load import load_config
 from configs.params import Config
@@ -24,7 +24,7 @@ from stages.preflight import Preflight, in_short, preflight
 
 log = logging.getLogger(__name__)
 
-_TIME = re.compile(r"^(?:(?P<h>[\d.]+)h)?(?:(?P<m>[\d.]+)m(?:in)?)?(?:(?P<s>[\d.]+)s)?$")
+HOLD_OUT = "train.hold_out"  # the setting that keeps every n-th photo back
 
 
 @dataclass(frozen=True)
@@ -40,10 +40,6 @@ class Request:
         from_stage, until, force: see `run_pipeline`.
         device: "auto", "cpu" or "cuda".
         workers: CPU threads; default all that this process may use.
-        time: training budget, for example "5m".
-        hold_out: percent of the photos to keep back from training and texture.
-        no_ground: cut off the ground; "not said" leaves the settings as they are.
-        watertight: a closed mesh; "not said" leaves the settings as they are.
     """
 
     photos: Path | None = None
@@ -60,10 +56,6 @@ class Request:
     force: Sequence[str] = ()
     device: str = "auto"
     workers: int | None = None
-    time: str | None = None
-    hold_out: float | None = None
-    no_ground: bool = False
-    watertight: bool = False
 
 
 @dataclass(frozen=True)
@@ -76,6 +68,18 @@ class Reconstruction:
     device: str
     workers: int
     outcomes: tuple[StageOutcome, ...]
+
+    def as_dict(self) -> dict[str, Any]:
+        """JSON-able."""
+        return {
+            "workspace": str(self.workspace.root),
+            "preset": self.preset,
+            "device": self.device,
+            "workers": self.workers,
+            "stages": [asdict(outcome) for outcome in self.outcomes],
+            "glb": str(self.glb) if self.glb else None,
+            "report": str(self.report) if self.report else None,
+        }
 
     @property
     def glb(self) -> Path | None:
@@ -129,8 +133,7 @@ def check_photos(request: Request) -> Preflight:
     """
     photos = request.photos
     assert photos is not None, "the command line demands it"
-    sets = [*request.sets, *([f"train.minutes={minutes(request.time)}"] if request.time else [])]
-    config = load_config(request.preset or default_preset(), request.config, sets)
+    config = load_config(request.preset or default_preset(), request.config, request.sets)
     workers = request.workers or available_cores()
     return preflight(photos, request.masks, choose_folder(request), config, choose_device(request.device), workers)
 
@@ -212,23 +215,14 @@ def choose_config(request: Request, workspace: Workspace) -> tuple[str | None, C
     Raises:
         ConfigError: see `load_config`.
     """
-    sets = list(request.sets)
-    if request.time is not None:
-        sets.append(f"train.minutes={minutes(request.time)}")
-    if request.hold_out is not None:
-        sets.append(f"train.hold_out={every_nth(request.hold_out)}")
-    if request.no_ground:
-        sets.append("cleanup.remove_ground=true")
-    if request.watertight:
-        sets.append("cleanup.keep_closed=true")
     kept = request.preset is None and request.config is None and workspace.config_path.exists()
     if not kept:
         named = request.preset or default_preset()
-        return named, load_config(named, request.config, sets)
+        return named, load_config(named, request.config, request.sets)
     preset = workspace.record.preset
     log.info("settings: those of the last run (preset %s); name a --preset to start anew", preset or "none")
     try:
-        return preset, load_config(None, workspace.config_path, sets)
+        return preset, load_config(None, workspace.config_path, request.sets)
     except ConfigError as error:
         if str(workspace.config_path) not in error.message:
             raise
@@ -273,43 +267,6 @@ def available_cores() -> int:
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
-
-
-def minutes(text: str) -> float:
-    """ "90s", "5m", "1h30m" or "5" (minutes) as minutes.
-
-    Raises:
-        ConfigError: it is none of these, or not positive.
-    """
-    refusal = ConfigError(f"--time {text} is no length of time.", "Try `--time 5m`, `--time 90s` or `--time 1h30m`.")
-    found = _TIME.match(text.strip())
-    try:
-        if found and any(found.groups()):
-            hours, mins, seconds = (float(found[unit] or 0) for unit in "hms")
-            total = 60 * hours + mins + seconds / 60
-        else:
-            total = float(text)
-    except ValueError:
-        raise refusal from None
-    if not 0 < total < float("inf"):
-        raise refusal
-    return total
-
-
-def every_nth(percent: float) -> int:
-    """Which photos are kept back, for `train.hold_out`: 5 percent is every 20th; 0 is none.
-
-    Raises:
-        ConfigError: it is neither 0 nor from 1 to 50.
-    """
-    if percent == 0:
-        return 0
-    if not 1 <= percent <= 50:
-        raise ConfigError(
-            f"--hold-out {percent:g}: the part of the photos must be from 1 to 50 percent, or 0 for none.",
-            "Try `--hold-out 5`, which is every 20th photo.",
-        )
-    return round(100 / percent)
 
 
 def _existing(path: Path) -> Path | None:

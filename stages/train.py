@@ -157,7 +157,7 @@ def _check_hold_out(num_photos: int, num_held_out: int, every: int) -> None:
     left = num_photos - num_held_out
     if every and (left < MIN_TRAINING or num_held_out == 0):
         found = f"leaves {left} of {num_photos} photos to train on (needed: {MIN_TRAINING} to {num_photos - 1})"
-        raise ConfigError(f"`train.hold_out` = {every} {found}.", "Try `--hold-out 12`, or 0 for none.")
+        raise ConfigError(f"`train.hold_out` = {every} {found}.", "Try `--hold-out 8`, or 0 for none.")
 
 
 def _progress(step: int, seconds: float, params: TrainParams) -> float:

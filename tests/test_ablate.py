@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import itertools
 import json
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from benchmarks import ablate
+from benchmarks import ablate, pages
 from benchmarks.ablate import BASE, VARIANTS, Plan, Run, ablation_table, load_runs, parse_extra, save_run, settings_of
 from configs.load import load_config
 from stages import artifacts
@@ -39,7 +39,7 @@ def here(tmp_path, monkeypatch):
     """Result files, run folders and a page of their own; a set with a known surface and one without."""
     monkeypatch.setattr(ablate, "RUNS", tmp_path / "runs")
     monkeypatch.setattr(ablate, "FOLDERS", tmp_path / "out")
-    monkeypatch.setattr(ablate, "PAGE", tmp_path / "page.md")
+    monkeypatch.setattr(pages, "DOCS", tmp_path)
     (tmp_path / "page.md").write_text("top\n<!-- table ablation -->\n<!-- end ablation -->\nbottom\n")
     for name in ("helmet", "scan"):
         (tmp_path / "data" / name / "images").mkdir(parents=True)
@@ -151,13 +151,6 @@ def test_results_of_other_code_are_marked():
     assert [row[6] for row in _rows(runs)] == ["-", "-50.0 % *", "-50.0 %"]
     assert "Versions: `c` base, eikonal; `d` planar." in ablation_table(runs)
     assert "Versions" not in ablation_table([_run(), _run("planar")])
-
-
-def test_the_table_of_the_page_is_that_of_the_result_files():
-    page = ablate.PAGE.read_text(encoding="utf-8")
-    runs = load_runs()
-    body = ablation_table(runs) if runs else ablate.NOT_MEASURED
-    assert page == ablate.with_table(page, "ablation", body), "run `make docs`"
 
 
 # ---------------------------------------------------------------- running
@@ -325,14 +318,15 @@ def test_the_mesh_is_scored_in_the_world_frame(here, monkeypatch):
         seen["vertices"], seen["model"] = artifacts.load_mesh(mesh.parent)[0], model
         return {"mean": 1.0}
 
-    monkeypatch.setattr("stages.evaluation.known_object.score_mesh", score_mesh)
+    monkeypatch.setattr("stages.evaluation.protocols.known_object.score_mesh", score_mesh)
     assert ablate.score_clean_mesh(folder, here / "shared", truth / "helmet") == {"mean": 1.0}
     assert np.allclose(seen["vertices"], 2 * corners + [1, 0, 0])
     assert seen["model"] == here / "shared" / "sfm" / "model"
 
 
 def test_a_scene_without_sparse_points_trains(tmp_path):
-    from sphere_scene import ring_of_cameras, sphere_scene, write_undistorted
+    from rigs import scene_without_points
+    from sphere_scene import ring_of_cameras, write_undistorted
     from train_settings import small
 
     from stages import train
@@ -340,8 +334,7 @@ def test_a_scene_without_sparse_points_trains(tmp_path):
     cameras = ring_of_cameras()
     folder, out, scratch = (tmp_path / name for name in ("undistort", "out", "scratch"))
     write_undistorted(folder, cameras)
-    nothing = {"points": np.zeros((0, 3)), "point_errors": np.zeros(0), "observations": np.zeros((0, 2), np.int32)}
-    artifacts.save_scene(folder, replace(sphere_scene(cameras), **nothing))
+    artifacts.save_scene(folder, scene_without_points(cameras))
     out.mkdir()
     scratch.mkdir()
     params = small({

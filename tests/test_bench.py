@@ -18,20 +18,20 @@ from suite_layouts import COUNT, LAYOUTS, cameras, write_suite
 from typer.testing import CliRunner, Result
 
 from hineus_cli.app import build_app
-from hineus_cli.bench_tables import score_table, tables_of
 from stages import artifacts, reconstruct
 from stages.engine.stage import Stage, StageContext
 from stages.engine.workspace import Workspace
 from stages.errors import ConfigError, InputError, ReconstructionError
-from stages.evaluation import against_photos
-from stages.evaluation import suite_runs as bench_module
-from stages.evaluation.comparison import read_mesh
-from stages.evaluation.peers import parse_peer, run_peer
-from stages.evaluation.suite_runs import load_results
-from stages.evaluation.suite_scores import posed_mesh, result_mesh
+from stages.evaluation.peers.running import parse_peer, run_peer
+from stages.evaluation.photos import scoring
+from stages.evaluation.photos.test_photos import TestPhotos
+from stages.evaluation.reading import read_mesh
+from stages.evaluation.suites import runs as bench_module
 from stages.evaluation.suites.registry import SUITES, find_scenes
+from stages.evaluation.suites.runs import load_results
 from stages.evaluation.suites.scene import Wanted
-from stages.evaluation.test_photos import TestPhotos
+from stages.evaluation.suites.scores import posed_mesh, result_mesh
+from stages.evaluation.suites.tables import score_table, tables_of
 from stages.geometry.cameras import PinholeCameras
 from stages.geometry.place import Place
 from stages.geometry.similarity import Similarity
@@ -273,9 +273,10 @@ class GreyBall:
         return FieldDrawing(colors, covered.astype(np.float32), covered, background=False)
 
 
+@pytest.mark.slow
 def test_views_of_nerf_synthetic_are_whole_photos_on_white(data: Path, monkeypatch: pytest.MonkeyPatch):
     write_suite("nerf-synthetic", data)
-    monkeypatch.setattr(against_photos, "field_drawer", lambda workspace, device: GreyBall())
+    monkeypatch.setattr(scoring, "field_drawer", lambda workspace, device: GreyBall())
 
     def no_training(context: StageContext) -> dict[str, Any]:
         context.to_write(artifacts.FIELD).write_text("")
@@ -300,6 +301,7 @@ def test_views_of_nerf_synthetic_are_whole_photos_on_white(data: Path, monkeypat
 COPY = "import shutil, sys; shutil.copy(sys.argv[1], sys.argv[2])"
 
 
+@pytest.mark.slow
 def test_a_peer_s_mesh_is_scored_by_the_same_protocol_in_the_same_run(data: Path):
     truth = write_suite("known", data) / "gt_mesh.ply"
     peer = f'{sys.executable} -c "{COPY}" {truth} {{out}}'

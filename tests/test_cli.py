@@ -15,15 +15,16 @@ from toy_pipeline import TOY, failing, with_stage
 from typer.testing import CliRunner, Result
 
 from configs.load import describe_settings
-from hineus_cli import doctor
+from hineus_cli import options
 from hineus_cli.app import build_app
 from hineus_cli.console import key_numbers, outcome_table, status_table
-from hineus_cli.doctor import Finding
+from stages import machine_check as doctor
 from stages import reconstruct
 from stages.engine.runner import StageOutcome
 from stages.engine.status import StageStatus
 from stages.engine.workspace import Workspace
 from stages.errors import ConfigError, InputError, ReconstructionError
+from stages.machine_check import Finding
 
 REPOSITORY = Path(__file__).parents[1]
 
@@ -150,18 +151,34 @@ def test_time_sets_the_training_budget(folder: Path) -> None:
     assert "minutes: 1.5" in (folder / "photos_hineus" / "config.yaml").read_text()
 
 
-def test_hold_out_keeps_back_a_part_of_the_photos_and_is_remembered(folder: Path) -> None:
+def test_hold_out_keeps_every_nth_photo_back_and_is_remembered(folder: Path) -> None:
     config = folder / "photos_hineus" / "config.yaml"
-    hineus("run", "photos", "--hold-out", "5")
-    assert "holdout: 20\n" in config.read_text()
+    hineus("run", "photos", "--hold-out", "8")
+    assert "hold_out: 8\n" in config.read_text()
     hineus("run", "photos")
-    assert "holdout: 20\n" in config.read_text()
+    assert "hold_out: 8\n" in config.read_text()
     hineus("run", "photos", "--hold-out", "0")
-    assert "holdout: 0\n" in config.read_text()
+    assert "hold_out: 0\n" in config.read_text()
 
 
-def test_parts_to_keep_back_become_every_nth_photo() -> None:
-    assert [reconstruct.every_nth(percent) for percent in (0, 1, 5, 12.5, 30, 50)] == [0, 100, 20, 8, 3, 2]
+def test_hold_out_is_a_number_of_photos_in_run_bench_and_help(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert [options.every_nth(text) for text in ("0", "2", "8", "100")] == [0, 2, 8, 100]
+    monkeypatch.setenv("TERMINAL_WIDTH", "200")
+    for command in ("run", "sfm", "bench"):
+        shown = hineus(command, "--help").stdout
+        assert "8: every 8th, 12 %" in " ".join(shown.replace("│", " ").split())
+        refused = hineus(command, "a", "--hold-out", "12.5", "--json")
+        assert json.loads(refused.stdout)["error"]["exit_code"] == refused.exit_code == 2
+
+
+def test_run_and_every_stage_have_the_same_options(folder: Path) -> None:
+    from typer.main import get_command
+
+    commands = get_command(build_app(TOY)).commands
+    names = {name: [parameter.name for parameter in commands[name].params] for name in ("run", "sfm")}
+    only_run = {"from_stage", "until"}
+    assert [name for name in names["run"] if name not in only_run] == names["sfm"]
+    assert all(parameter.help for parameter in commands["sfm"].params)
 
 
 def test_no_ground_sets_the_cut_and_is_remembered(folder: Path) -> None:
@@ -184,13 +201,13 @@ def test_watertight_sets_the_closed_mesh(folder: Path) -> None:
     ("text", "expected"), [("5m", 5), ("90s", 1.5), ("1h30m", 90), ("5", 5), ("0.5h", 30), ("2min", 2)]
 )
 def test_times(text: str, expected: float) -> None:
-    assert reconstruct.minutes(text) == pytest.approx(expected)
+    assert options.minutes(text) == pytest.approx(expected)
 
 
 @pytest.mark.parametrize("text", ["", "0", "-5m", "5x", "m", "nan", "inf", "1.2.3m"])
 def test_wrong_times_are_refused(text: str) -> None:
     with pytest.raises(ConfigError, match="is no length of time"):
-        reconstruct.minutes(text)
+        options.minutes(text)
 
 
 # ---------------------------------------------------------------- errors
@@ -207,9 +224,10 @@ def test_wrong_times_are_refused(text: str) -> None:
         (["run", "photos", "--set", "sfm.seed=-1"], 2, ["`sfm.seed` = -1", "must be >= 0"]),
         (["run", "photos", "--preset", "tinny"], 2, ["no preset 'tinny'", "--preset tiny"]),
         (["run", "photos", "--until", "sfmm"], 2, ["There is no stage 'sfmm'", "Did you mean `--until sfm`?"]),
-        (["run", "photos", "--hold-out", "80"], 2, ["from 1 to 50 percent", "--hold-out 5"]),
-        (["run", "photos", "--hold-out", "-5"], 2, ["from 1 to 50 percent"]),
-        (["run", "photos", "--hold-out", "nan"], 2, ["from 1 to 50 percent"]),
+        (["run", "photos", "--hold-out", "12.5"], 2, ["not a percentage", "`--hold-out 8`: every 8th photo"]),
+        (["run", "photos", "--hold-out", "-5"], 2, ["whole number from 2 on"]),
+        (["run", "photos", "--hold-out", "5%"], 2, ["--hold-out 5%", "not a percentage"]),
+        (["run", "photos", "--hold-out", "1"], 2, ["whole number from 2 on"]),
         (["run", "photos", "--time", "soon"], 2, ["--time soon is no length of time"]),
         (["run", "photos", "--device", "tpu"], 2, ["There is no device 'tpu'"]),
         (["run", "photos", "--device", "cuda"], 6, ["No CUDA device can be used here.", "hineus doctor"]),

@@ -10,7 +10,7 @@ import pytest
 import trimesh
 
 from stages.errors import InputError
-from stages.evaluation.coloring import distance_colors
+from stages.evaluation.distance_map import distance_colors
 
 
 def sphere(radius: float = 1.0, center=(0.0, 0, 0)) -> tuple[np.ndarray, np.ndarray]:
@@ -35,6 +35,7 @@ def hineus(*args: str, monkeypatch, capsys) -> tuple[int, str]:
     return int(ended.value.code or 0), capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_the_command_tells_numbers_and_writes_the_map(tmp_path, monkeypatch, capsys):
     workspace = tmp_path / "run"
     (workspace / "export").mkdir(parents=True)
@@ -44,16 +45,41 @@ def test_the_command_tells_numbers_and_writes_the_map(tmp_path, monkeypatch, cap
     arguments = ("compare", str(tmp_path / "a.stl"), str(workspace), "--map", str(colored))
     code, out = hineus(*arguments, "--json", monkeypatch=monkeypatch, capsys=capsys)
     found = json.loads(out)
-    assert (code, found["ok"], found["alignment"]) == (0, True, "same frame")
-    assert found["a_to_b"]["mean"] == pytest.approx(0.1, abs=2e-3)
+    assert (code, found["ok"]) == (0, True)
+    assert found["accuracy"]["mean"] == pytest.approx(0.1, abs=2e-3)
+    assert found["completeness"]["mean"] == pytest.approx(0.1, abs=2e-3)
+    assert [score["threshold"] for score in found["f_scores"]] == pytest.approx([0.0044, 0.011, 0.022, 0.044], rel=1e-2)
+    assert "alignment: none, taken to be in one frame" in found["done"]
+    assert any(line.startswith(f"map: {colored}") for line in found["done"])
     assert len(trimesh.load(colored, process=False).faces) == len(sphere()[1])
     code, out = hineus(*arguments, "--icp", monkeypatch=monkeypatch, capsys=capsys)
     assert code == 0
-    assert "moved onto B by ICP" in out
+    assert "rigid point-to-plane ICP" in out
+    assert "F-score" in out
+
+
+def test_it_is_evaluate_mesh_by_another_name(tmp_path, monkeypatch, capsys):
+    for name, radius in (("a.ply", 1.0), ("b.ply", 1.1)):
+        trimesh.Trimesh(*sphere(radius), process=False).export(tmp_path / name)
+    files = (str(tmp_path / "a.ply"), str(tmp_path / "b.ply"), "--json")
+    outs = [
+        json.loads(hineus(*command, *files, monkeypatch=monkeypatch, capsys=capsys)[1])
+        for command in (("compare",), ("evaluate", "mesh"))
+    ]
+    assert outs[0] == outs[1]
+
+
+def test_a_cloud_cannot_be_coloured(tmp_path, monkeypatch, capsys):
+    trimesh.PointCloud(sphere()[0]).export(tmp_path / "a.ply")
+    trimesh.Trimesh(*sphere(), process=False).export(tmp_path / "b.ply")
+    arguments = ("evaluate", "mesh", str(tmp_path / "a.ply"), str(tmp_path / "b.ply"), "--map", str(tmp_path / "m.ply"))
+    code, out = hineus(*arguments, "--json", monkeypatch=monkeypatch, capsys=capsys)
+    assert code == 3
+    assert "no surface to colour" in json.loads(out)["error"]["message"]
 
 
 def test_what_is_no_mesh_is_explained(tmp_path):
-    from stages.evaluation.comparison import mesh_path, read_mesh
+    from stages.evaluation.reading import mesh_path, read_mesh
 
     with pytest.raises(InputError, match=r"holds no exported PLY") as caught:
         mesh_path(tmp_path)

@@ -8,9 +8,11 @@ from types import SimpleNamespace
 import pytest
 
 from configs.load import load_config
-from hineus_cli import demo
 from stages import artifacts
 from stages.errors import InputError
+from stages.pipeline import PIPELINE
+from stages.reconstruct import Reconstruction
+from stages.scenes import demo
 
 SCORE = {
     "accuracy": 1.0,
@@ -28,18 +30,16 @@ def stand_ins(monkeypatch):
     """Requests handed to the pipeline; the export holds a PLY unless `made.ply` is turned off."""
     made = SimpleNamespace(requests=[], ply=True)
 
-    def reconstruct(request):
+    def reconstruct(request, pipeline, listener):
         made.requests.append(request)
         export = request.workspace / "export"
         export.mkdir(parents=True, exist_ok=True)
         if made.ply:
             artifacts.ply_path(export).write_text("ply")
         workspace = SimpleNamespace(root=request.workspace, stage_folder=lambda name: request.workspace / name)
-        return SimpleNamespace(
-            workspace=workspace, outcomes=(), glb=None, report=None, preset=request.preset, device="cpu"
-        )
+        return Reconstruction(workspace, load_config(request.preset), request.preset, "cpu", 2, ())
 
-    monkeypatch.setattr(demo, "run_pipeline_with_progress", reconstruct)
+    monkeypatch.setattr(demo, "reconstruct", reconstruct)
     monkeypatch.setattr(demo, "score_mesh", lambda mesh, model, truth: dict(SCORE))
     monkeypatch.setattr(demo, "NUM_PHOTOS", 6)
     monkeypatch.setattr(demo, "PHOTO_SIZE", (32, 24))
@@ -48,7 +48,8 @@ def stand_ins(monkeypatch):
 
 
 def test_demo_runs_on_its_own_photos_and_keeps_the_score(tmp_path, stand_ins):
-    result = demo.run_demo(tmp_path, preset="demo", device="cpu", workers=2)
+    made = demo.run_demo(tmp_path, preset="demo", device="cpu", workers=2, pipeline=PIPELINE)
+    result = made.as_dict()
     photos, request = stand_ins.requests
     assert photos == "photos"
     assert request.photos == tmp_path / "photos"
@@ -61,13 +62,13 @@ def test_demo_runs_on_its_own_photos_and_keeps_the_score(tmp_path, stand_ins):
 
 
 def test_demo_takes_another_preset(tmp_path, stand_ins):
-    assert demo.run_demo(tmp_path, preset="tiny", device="cpu", workers=None)["preset"] == "tiny"
+    assert demo.run_demo(tmp_path, preset="tiny", device="cpu", workers=None, pipeline=PIPELINE).result.preset == "tiny"
 
 
 def test_demo_without_a_ply_says_what_to_do(tmp_path, stand_ins):
     stand_ins.ply = False
     with pytest.raises(InputError, match="writes no PLY"):
-        demo.run_demo(tmp_path, preset="demo", device="cpu", workers=None)
+        demo.run_demo(tmp_path, preset="demo", device="cpu", workers=None, pipeline=PIPELINE)
 
 
 def test_complete_photos_are_not_made_again(tmp_path, stand_ins, monkeypatch):

@@ -8,12 +8,10 @@ import numpy as np
 import pytest
 
 from stages.errors import InputError
-from stages.evaluation.known_surface import (
-    KnownSurface,
-    sample_surface,
-    score_surface,
-    seen_surface,
-)
+from stages.evaluation.protocols.known_object import KnownObject, score_surface, seen_surface
+from stages.evaluation.surfaces import sample_faces
+from stages.geometry.cameras import PinholeCameras
+from stages.geometry.normalisation import into_scene
 from stages.geometry.similarity import Similarity, align_points
 
 trimesh = pytest.importorskip("trimesh")
@@ -32,15 +30,16 @@ def _look_at_origin(center):
 def _known_sphere(centers):
     """A sphere of diameter 1 around the origin."""
     sphere = trimesh.creation.icosphere(subdivisions=5, radius=0.5)
-    return KnownSurface(
-        vertices=np.asarray(sphere.vertices),
-        faces=np.asarray(sphere.faces),
-        intrinsics=np.array([[120.0, 0, 60], [0, 120, 45], [0, 0, 1]]),
-        size=(120, 90),
-        cam_from_world=np.stack([_look_at_origin(center) for center in centers]),
+    cameras = PinholeCameras(
+        names=tuple(f"photos/{i:03d}.jpg" for i in range(len(centers))),
+        sizes=np.array([(120, 90)] * len(centers)),
+        intrinsics=np.array([[[120.0, 0, 60], [0, 120, 45], [0, 0, 1]]] * len(centers)),
+        cam_from_scene=np.stack([_look_at_origin(center)[:3] for center in centers]),
     )
+    return KnownObject(np.asarray(sphere.vertices), np.asarray(sphere.faces), cameras)
 
 
+SHRUNK = Similarity(0.1, np.eye(3), np.zeros(3))
 AROUND = [(2 * np.cos(a), 2 * np.sin(a), z) for a in np.arange(6) for z in (-0.8, 0.9)]
 
 
@@ -65,8 +64,7 @@ def test_a_swollen_sphere_is_off_by_the_swelling(known):
 
 
 def test_the_score_is_relative_to_the_extent(known):
-    large = KnownSurface(10 * known.vertices, known.faces, known.intrinsics, known.size, known.cam_from_world.copy())
-    large.cam_from_world[:, :3, 3] *= 10
+    large = KnownObject(10 * known.vertices, known.faces, into_scene(known.cameras, SHRUNK))
     score = score_surface(10.4 * known.vertices, known.faces, large, samples=60_000)
     assert score.accuracy == pytest.approx(2.0, abs=0.05)
 
@@ -100,7 +98,7 @@ def test_a_mesh_elsewhere_is_refused(known):
 def test_samples_are_uniform_by_area():
     """Two triangles, areas 1 : 3."""
     vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [5, 0, 0], [8, 0, 0], [5, 1, 0.0]])
-    points = sample_surface(vertices, np.array([[0, 1, 2], [3, 4, 5]]), 40_000)
+    points = sample_faces(vertices, np.array([[0, 1, 2], [3, 4, 5]]), 40_000)[0]
     assert np.mean(points[:, 0] > 3) == pytest.approx(0.75, abs=0.01)
     small = points[points[:, 0] < 3]
     np.testing.assert_allclose(small.mean(0), [1 / 3, 1 / 3, 0], atol=0.01)
@@ -109,7 +107,7 @@ def test_samples_are_uniform_by_area():
 
 def test_a_mesh_without_area_is_refused():
     with pytest.raises(ValueError, match="got 1 faces with none"):
-        sample_surface(np.zeros((3, 3)), np.array([[0, 1, 2]]), 10)
+        sample_faces(np.zeros((3, 3)), np.array([[0, 1, 2]]), 10)
 
 
 def test_align_points_finds_a_known_similarity():
@@ -138,27 +136,31 @@ def test_align_points_refuses_what_does_not_fix_a_frame(source, message):
         align_points(source, source)
 
 
+@pytest.mark.slow
 def test_score_mesh_reads_files_and_undoes_the_models_frame(tmp_path, known):
     """The mesh lies in the frame of a COLMAP model that is scaled, turned and moved."""
     pycolmap = pytest.importorskip("pycolmap")
-    from stages.evaluation.known_object import score_mesh
+    from stages.evaluation.protocols.known_object import score_mesh
 
     turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     model_from_world = Similarity(3.0, turn, np.array([1.0, 2, 3]))
     trimesh.Trimesh(known.vertices, known.faces, process=False).export(tmp_path / "gt_mesh.ply")
     moved = model_from_world.apply(1.04 * known.vertices)
     trimesh.Trimesh(moved, known.faces, process=False).export(tmp_path / "model.ply")
+    poses = np.concatenate([known.cameras.cam_from_scene, [[[0, 0, 0, 1.0]]] * len(known.cameras)], 1)
+    opengl = np.diag([1.0, -1, -1, 1])
     frames = [
-        {"file_path": f"photos/{i:03d}.jpg", "w2c_opencv": pose.tolist()} for i, pose in enumerate(known.cam_from_world)
+        {"file_path": name, "transform_matrix": (np.linalg.inv(pose) @ opengl).tolist()}
+        for name, pose in zip(known.cameras.names, poses, strict=True)
     ]
-    K = known.intrinsics
+    K = known.cameras.intrinsics[0]
     truth = {"w": 120, "h": 90, "fl_x": K[0, 0], "fl_y": K[1, 1], "cx": 60, "cy": 45, "frames": frames}
     (tmp_path / "transforms.json").write_text(json.dumps(truth))
 
     model = pycolmap.Reconstruction()
     camera = pycolmap.Camera.create_from_model_name(1, "PINHOLE", 120.0, 120, 90)
     model.add_camera_with_trivial_rig(camera)
-    for i, pose in enumerate(known.cam_from_world):
+    for i, pose in enumerate(poses):
         center = model_from_world.apply(-pose[:3, :3].T @ pose[:3, 3])
         rotation = pose[:3, :3] @ turn.T
         image = pycolmap.Image(name=f"{i:03d}.jpg", camera_id=1, image_id=i + 1)

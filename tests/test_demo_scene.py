@@ -7,19 +7,13 @@ import json
 import numpy as np
 import pytest
 
-from stages.evaluation.known_object import TRUTH_CAMERAS
-from stages.scenes.figurine import (
-    CLOTH_SIDE,
-    FOCAL_35MM,
-    ValueNoise,
-    camera_ring,
-    figurine_distance,
-    light_scene,
-    make_demo_photos,
-    make_figurine,
-    photos_are_complete,
-    render,
-)
+from stages.evaluation.protocols.known_object import TRUTH_CAMERAS
+from stages.scenes.demo_photos import FOCAL_35MM, make_demo_photos, photos_are_complete
+from stages.scenes.figurine import figurine_distance, make_figurine
+from stages.scenes.figurine_pictures import light_scene, render
+from stages.scenes.noise import ValueNoise
+from stages.scenes.room import CLOTH_SIDE
+from stages.scenes.viewpoints import camera_ring
 
 SIZE = (96, 72)
 FOCAL = FOCAL_35MM / 36 * SIZE[0]
@@ -36,7 +30,7 @@ def scene(figurine):
 
 
 def test_figurine_rests_on_the_ground_with_extent_one(figurine):
-    low, high = figurine.bounds
+    low, high = figurine.vertices.min(0), figurine.vertices.max(0)
     assert low[2] == pytest.approx(0.0, abs=1e-12)
     assert (high - low).max() == pytest.approx(1.0)
 

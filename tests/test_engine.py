@@ -477,6 +477,7 @@ def test_manifest_round_trip_and_tampering() -> None:
         Manifest.from_json(manifest.to_json().replace('"a": 1.5', '"a": 1.6'))
 
 
+@pytest.mark.slow
 def test_meter_sees_memory_and_cpu_of_children() -> None:
     program = "b = bytearray(150_000_000); b[::4096] = b'x' * len(b[::4096]); import time; time.sleep(1)"
     with ResourceMeter() as meter:

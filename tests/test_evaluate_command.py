@@ -16,8 +16,10 @@ from typer.testing import CliRunner
 from hineus_cli.app import app
 from stages.drawing.rendering import look_at
 from stages.errors import HineusError, InputError
-from stages.evaluation import truths
-from stages.evaluation.glossy import drawn_depth
+from stages.evaluation import reading
+from stages.evaluation.protocols.dtu import read_dtu
+from stages.evaluation.protocols.glossy import drawn_depth, read_glossy
+from stages.evaluation.protocols.tanks import read_tanks
 from stages.geometry.cameras import PinholeCameras
 
 
@@ -163,7 +165,7 @@ def test_a_workspace_is_judged_in_the_frame_of_its_poses(tmp_path):
     poses = write_transforms(tmp_path / "true.json", cameras)
     found = numbers("mesh", workspace.root, true, "--true-cameras", poses, "--samples", 5000)
     assert found["chamfer"] < 1e-3
-    known = truths.workspace_cameras(workspace.root)
+    known = reading.workspace_cameras(workspace.root)
     np.testing.assert_allclose(
         np.stack(list(known.centers.values())), scene.poses_from_scene.apply(cameras.centers), atol=1e-9
     )
@@ -201,14 +203,14 @@ def test_files_that_are_nothing_are_named(tmp_path):
     skew = tmp_path / "skew.txt"
     np.savetxt(skew, np.diag([1.0, 2, 1, 1]))
     for call, message in (
-        (lambda: truths.read_surface(tmp_path / "absent.ply"), "no file"),
-        (lambda: truths.read_matrix(bad), "4 x 4"),
-        (lambda: truths.read_matrix(skew), "no similarity"),
-        (lambda: truths.read_dtu(tmp_path, 24), "lacks 3 of 3 files of scan 24"),
-        (lambda: truths.read_glossy(tmp_path, None), "-camera.pkl"),
-        (lambda: truths.read_tanks(tmp_path), "lacks"),
-        (lambda: list(truths.read_masks(tmp_path / "masks", cameras_around())), "no folder"),
-        (lambda: list(truths.read_masks(tmp_path, cameras_around())), "None of the 6 photos"),
+        (lambda: reading.read_surface(tmp_path / "absent.ply"), "no file"),
+        (lambda: reading.read_matrix(bad), "4 x 4"),
+        (lambda: reading.read_matrix(skew), "no similarity"),
+        (lambda: read_dtu(tmp_path, 24), "lacks 3 of 3 files of scan 24"),
+        (lambda: read_glossy(tmp_path, None), "-camera.pkl"),
+        (lambda: read_tanks(tmp_path), "lacks"),
+        (lambda: list(reading.read_masks(tmp_path / "masks", cameras_around())), "no folder"),
+        (lambda: list(reading.read_masks(tmp_path, cameras_around())), "None of the 6 photos"),
     ):
         with pytest.raises(HineusError, match=message) as caught:
             call()
@@ -219,17 +221,17 @@ def test_clouds_come_with_their_normals(tmp_path):
     points = ball().vertices
     plain = tmp_path / "plain.ply"
     trimesh.PointCloud(points).export(plain)
-    assert truths.read_surface(plain).faces is None
-    assert truths.read_surface(plain).normals is None
+    assert reading.read_surface(plain).faces is None
+    assert reading.read_surface(plain).normals is None
     turned = tmp_path / "turned.ply"
     rows = "\n".join(" ".join(f"{value:.9f}" for value in (*point, *(3 * point))) for point in points)
     names = "".join(f"property float {name}\n" for name in ("x", "y", "z", "nx", "ny", "nz"))
     turned.write_text(f"ply\nformat ascii 1.0\nelement vertex {len(points)}\n{names}end_header\n{rows}\n")
-    found = truths.read_surface(turned)
+    found = reading.read_surface(turned)
     np.testing.assert_allclose(found.normals, points, atol=1e-6)
     (tmp_path / "empty.xyz").write_text("")
     with pytest.raises(InputError, match="cannot be read as points"):
-        truths.read_surface(tmp_path / "empty.xyz")
+        reading.read_surface(tmp_path / "empty.xyz")
 
 
 # ---------------------------------------------------------------- the protocols

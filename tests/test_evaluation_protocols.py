@@ -7,11 +7,11 @@ import pytest
 import trimesh
 
 from stages.drawing.rendering import look_at
-from stages.evaluation import dtu
-from stages.evaluation.dtu import DtuTruth, dtu_score, lattice
-from stages.evaluation.glossy import VOXEL, drawn_depth, glossy_score, visible_points
+from stages.evaluation.protocols import dtu
+from stages.evaluation.protocols.dtu import DtuTruth, dtu_score, lattice
+from stages.evaluation.protocols.glossy import VOXEL, drawn_depth, glossy_score, visible_points
+from stages.evaluation.protocols.tanks import TAU, CropVolume, refined, tanks_score
 from stages.evaluation.surfaces import Surface
-from stages.evaluation.tanks import TAU, CropVolume, refined, tanks_score
 from stages.geometry.cameras import PinholeCameras
 
 

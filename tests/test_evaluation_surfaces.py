@@ -8,8 +8,8 @@ import trimesh
 
 from stages.drawing.rendering import look_at
 from stages.evaluation import alignment, culling
-from stages.evaluation.scenes import BLENDED_THRESHOLDS, blended_score
-from stages.evaluation.surfaces import OneWay, Sampling, Surface, compare_to_points, draw_points, measure, turning
+from stages.evaluation.protocols.blendedmvs import THRESHOLDS, blended_score
+from stages.evaluation.surfaces import OneWay, Sampling, Surface, draw_points, measure, turning
 from stages.evaluation.thinning import one_a_cube, thin
 from stages.geometry.cameras import PinholeCameras
 
@@ -76,7 +76,7 @@ def test_points_as_truth_give_what_a_slow_loop_gives():
     points, normals = rng.normal(size=(40, 3)), rng.normal(size=(40, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     others = rng.normal(size=(30, 3))
-    found = compare_to_points(Surface(others, None, normals[:30]), points, normals, [0.5])
+    found = measure(Surface(others, None, normals[:30]), Surface(points, None, normals), [0.5])
     nearest = [min(range(40), key=lambda j: np.linalg.norm(points[j] - p)) for p in others]
     distances = np.array([np.linalg.norm(points[j] - p) for p, j in zip(others, nearest, strict=True)])
     assert found.accuracy.mean == pytest.approx(distances.mean())
@@ -86,7 +86,7 @@ def test_points_as_truth_give_what_a_slow_loop_gives():
     assert found.accuracy_normals is not None
     assert found.accuracy_normals.mean_deg == pytest.approx(np.mean(angles))
     assert found.accuracy_normals.median_deg == pytest.approx(np.median(angles))
-    assert compare_to_points(Surface(others), points, normals).accuracy_normals is None
+    assert measure(Surface(others), Surface(points, None, normals)).accuracy_normals is None
 
 
 def test_normals_tell_the_angle_whichever_way_they_point():
@@ -130,7 +130,7 @@ def test_a_selection_is_drawn_more_densely_and_an_empty_one_is_refused():
 
 def test_blended_mvs_has_its_own_thresholds():
     found = blended_score(square(0.03), square(), FEW)
-    assert [each.threshold for each in found.f_scores] == pytest.approx([2 * part for part in BLENDED_THRESHOLDS])
+    assert [each.threshold for each in found.f_scores] == pytest.approx([2 * part for part in THRESHOLDS])
     assert [each.f_score for each in found.f_scores] == pytest.approx([0, 0, 100])
 
 

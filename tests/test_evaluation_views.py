@@ -22,9 +22,9 @@ from stages.artifacts import AtlasMesh
 from stages.engine.fingerprint import Identity, file_sha256
 from stages.engine.manifest import Manifest, OutputFile
 from stages.engine.workspace import Workspace
-from stages.evaluation import images
-from stages.evaluation.images import find_lpips, score_image
-from stages.evaluation.views import judge, laid_on_white
+from stages.evaluation.photos import images
+from stages.evaluation.photos.images import find_lpips, score_image
+from stages.evaluation.photos.regions import judge, laid_on_white
 from stages.neural.drawing import FieldDrawer, FieldDrawing
 from stages.neural.fields import Fields
 from stages.neural.trained_field import field_state
@@ -240,6 +240,6 @@ def test_what_is_missing_or_stale_is_explained(workspace, tmp_path):
     code, refused = evaluate(workspace.root)
     assert code == 3
     assert "holds no photos back" in refused["error"]["message"]
-    assert "train.hold_out=8" in refused["error"]["hint"]
+    assert "--hold-out 8" in refused["error"]["hint"]
     code, refused = evaluate(tmp_path)
     assert code == 5

@@ -109,6 +109,7 @@ def test_large_photos_are_judged_on_a_grid_of_pixels(monkeypatch):
     assert 100 < len(rays) <= 200
 
 
+@pytest.mark.slow
 def test_the_stage_reports_the_photos_left_out_and_trains_on_the_others(tmp_path, monkeypatch):
     drawn = set()
     original = Photos.draw

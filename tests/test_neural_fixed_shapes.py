@@ -6,7 +6,7 @@ from collections import Counter
 
 import pytest
 import torch
-from test_train import TINY, assert_finds_the_ball, make_trainer
+from ball_training import TINY, assert_finds_the_ball, make_trainer
 from torch.utils._python_dispatch import TorchDispatchMode
 from train_settings import changed
 
@@ -58,6 +58,7 @@ def waits_of_steps(trainer) -> Waits:
     return waits
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("masks", "precision"), [(False, "mixed"), (True, "float32")])
 def test_a_step_does_not_wait_for_the_device(like_cuda, masks, precision):
     like_cuda()
@@ -83,6 +84,7 @@ def test_a_step_on_cuda_does_not_wait(masks):
     assert torch.isfinite(numbers["loss"]).item()
 
 
+@pytest.mark.slow
 def test_the_step_of_the_cpu_would_wait(monkeypatch):
     """What the test above looks for is found where it is."""
     monkeypatch.setattr(acceleration, "_has_numba", lambda: False)

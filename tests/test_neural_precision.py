@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from test_train import TINY, assert_finds_the_ball, make_trainer
+from ball_training import TINY, assert_finds_the_ball, make_trainer
 from train_settings import changed
 
 from stages.neural.acceleration import is_mixed, short_products

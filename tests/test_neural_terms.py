@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from ball_training import SMALL, TINY, make_trainer
 from sphere_scene import RADIUS, ring_of_cameras
-from test_train import SMALL, TINY, make_trainer
 from train_settings import changed
 
 from configs.dotted import flatten

@@ -10,7 +10,7 @@ from sphere_scene import RADIUS
 from suite_layouts import COUNT, LAYOUTS, write_mipnerf360, write_neus, write_suite, write_urban_photos
 
 from stages.errors import InputError
-from stages.evaluation.suites.depth_maps import true_points
+from stages.evaluation.protocols.blendedmvs import true_points
 from stages.evaluation.suites.paper import paper_tables
 from stages.evaluation.suites.registry import SUITES, find_scenes, find_suite
 from stages.evaluation.suites.scene import SuiteScene, Wanted

@@ -7,12 +7,15 @@ import json
 import numpy as np
 import pytest
 
-from benchmarks.synthetic import capture, city, implicit, objects, scenes
+from benchmarks.synthetic import capture, city, objects, scenes
 from benchmarks.synthetic.capture import Order, develop, make
 from benchmarks.synthetic.check import check
 from benchmarks.synthetic.model import Ground, Part, Scene, plain
-from stages.evaluation.known_object import has_truth, load_known_surface
-from stages.scenes.figurine import ValueNoise, camera_ring
+from stages.evaluation.protocols.known_object import has_truth, load_known_object
+from stages.scenes import implicit
+from stages.scenes.noise import ValueNoise
+from stages.scenes.photo_files import write_truth
+from stages.scenes.viewpoints import camera_ring
 
 SIZE = (96, 72)
 
@@ -136,7 +139,8 @@ def _write_cast_masks(folder, shift=0.0):
     scene = _small_scene(np.random.default_rng(1), 6)
     (folder / "masks").mkdir(parents=True)
     trimesh.Trimesh(*scene.surface(), process=False).export(folder / "gt_mesh.ply")
-    capture._write_cameras(order, scene, np.ones(6), folder / "transforms.json")
+    names = [f"images/{i:03d}.jpg" for i in range(6)]
+    write_truth(folder, names, scene.cam_from_world, SIZE, order.focal, order.as_dict())
     K = np.array([[order.focal, 0, SIZE[0] / 2 + shift], [0, order.focal, SIZE[1] / 2], [0, 0, 1]])
     caster = raycaster(*scene.surface())
     for i, pose in enumerate(scene.cam_from_world):
@@ -166,9 +170,9 @@ def test_rendered_photos_fit_their_cameras_and_are_not_made_twice(tmp_path, monk
     assert make(order, tmp_path, EVERYWHERE)
     assert has_truth(tmp_path)
     assert check(tmp_path).is_exact
-    known, centers = load_known_surface(tmp_path)
-    assert known.extent == pytest.approx(1.0)
-    assert sorted(centers) == ["000.jpg", "001.jpg", "002.jpg"]
+    known = load_known_object(tmp_path)
+    assert known.surface.extent == pytest.approx(1.0)
+    assert [name.removeprefix("images/") for name in sorted(known.cameras.names)] == ["000.jpg", "001.jpg", "002.jpg"]
 
     photos = [tmp_path / "images" / f"{i:03d}.jpg" for i in range(3)]
     with Image.open(photos[0]) as photo:

@@ -10,8 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from ball_training import TINY, assert_finds_the_ball, make_trainer
 from sphere_scene import RADIUS, render, ring_of_cameras, sphere_scene, write_undistorted
-from train_settings import changed, small
+from train_settings import changed
 
 from configs.training import TrainParams
 from stages import artifacts, train
@@ -25,23 +26,6 @@ from stages.neural.sightings import Sightings
 from stages.neural.trained_field import load_field
 from stages.neural.trainer import Trainer
 from stages.neural.training_photos import Photos
-
-SMALL = {
-    "steps": 60, "sampling.rays": 128, "sampling.samples": 12, "field.levels": 4, "field.log2_rows": 10,
-    "field.coarsest": 8, "field.finest": 32, "field.sdf_width": 16, "field.radiance_width": 16,
-    "schedule.start_levels": 2, "sampling.free_points": 64, "losses.sparse_batch": 32,
-    "sampling.cache_resolution": 24, "sampling.cache_every": 16, "field.background_log2_rows": 9,
-    "sampling.background_samples": 4,
-}  # fmt: skip
-TINY = small(SMALL)
-
-
-def make_trainer(params: TrainParams = TINY, masks: bool = False, device: str = "cpu") -> Trainer:
-    cameras = ring_of_cameras()
-    views = [render(cameras, i) for i in range(len(cameras))]
-    photos = Photos(cameras, [v[0] for v in views], [v[1] for v in views] if masks else None, device)
-    scene = sphere_scene(cameras)
-    return Trainer(photos, Sightings.from_scene(scene, device), params, device)
 
 
 def test_rays_see_the_pixels_they_were_drawn_from():
@@ -142,19 +126,6 @@ def test_training_finds_the_ball():
     assert_finds_the_ball({})
 
 
-def assert_finds_the_ball(settings: dict[str, object]) -> None:
-    params = changed(TINY, {"steps": 300, "sampling.rays": 256, "field.sphere_radius": 0.6, **settings})
-    trainer = make_trainer(params, masks=True)
-    numbers = [trainer.step(i / params.steps) for i in range(params.steps)]
-    first, last = (float(np.mean([float(n["rgb"]) for n in part])) for part in (numbers[:10], numbers[-10:]))
-    assert last < 0.4 * first
-    points = torch.nn.functional.normalize(torch.randn(500, 3, generator=torch.Generator().manual_seed(0)), dim=1)
-    # The sides the cameras see: within 60 degrees of the horizon.
-    points = RADIUS * points[points[:, 2].abs() < 0.8]
-    with torch.no_grad():
-        assert trainer.fields.sdf.sdf(points, params.field.levels).abs().median() < 0.02
-
-
 def context(tmp_path: Path, name: str, params: TrainParams) -> StageContext:
     folder = tmp_path / "undistort"
     if not folder.exists():
@@ -176,6 +147,7 @@ EVERYTHING = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("settings", [{}, EVERYTHING], ids=["default", "everything"])
 def test_a_killed_run_goes_on_with_the_same_loss_curve(tmp_path, monkeypatch, settings):
     monkeypatch.setattr(train, "LOG_EVERY", 5)
@@ -228,6 +200,7 @@ def test_the_published_field_answers_in_numpy(tmp_path):
     assert colors.max() <= 1
 
 
+@pytest.mark.slow
 def test_a_budget_in_minutes_ends_on_time_whatever_the_steps(tmp_path):
     numbers = train.run(context(tmp_path, "out", changed(TINY, {"steps": 10**9, "minutes": 0.02})))
     assert numbers["train_seconds"] < 60  # the first step may have to compile the kernels
@@ -311,6 +284,7 @@ def test_the_hull_of_a_ball_is_a_little_more_than_the_ball():
     assert hull_distances(cameras, [np.zeros((40, 48), np.uint8)] * 16, cells=20) is None
 
 
+@pytest.mark.slow
 def test_training_can_start_from_the_hull():
     trainer = make_trainer(changed(TINY, {"field.sphere_radius": 0.8, "field.init": "hull"}), masks=True)
     cameras = ring_of_cameras()

@@ -64,22 +64,13 @@ def test_a_mesh_meets_photos_of_itself_within_the_mask_or_its_silhouette(board):
     mask = covered[1].copy()
     mask[:, :24] = False
     masks = [None, mask]
-    scores = score_views(
-        lambda i: draw_view(atlas, texture, cameras, i), cameras, lambda i: (photos[i], masks[i]),
-        lambda i: covered[i], [0, 1],
-    )  # fmt: skip
+    scores = list(score_views(atlas, texture, cameras, lambda i: (photos[i], masks[i]), cameras.names))
     assert [score.name for score in scores] == ["one.png", "two.png"]
-    assert [score.pixels for score in scores] == [covered[0].sum(), mask.sum()]
+    assert [score.counted.sum() for score in scores] == [covered[0].sum(), mask.sum()]
     assert all(score.psnr == pytest.approx(100) and score.ssim == pytest.approx(1) for score in scores)
-    turned = score_views(
-        lambda i: draw_view(atlas, texture[::-1], cameras, i), cameras, lambda i: (photos[i], None),
-        lambda i: covered[i], [0],
-    )  # fmt: skip
-    assert turned[0].psnr < 8
-    nothing = score_views(
-        lambda i: photos[i], cameras, lambda i: (photos[i], np.zeros_like(mask)), lambda i: covered[i], [0, 1]
-    )
-    assert nothing == []
+    (turned,) = score_views(atlas, texture[::-1], cameras, lambda i: (photos[i], None), ["one.png"])
+    assert turned.psnr < 8
+    assert list(score_views(atlas, texture, cameras, lambda i: (photos[i], np.zeros_like(mask)), cameras.names)) == []
 
 
 def test_selected_cameras_keep_what_is_theirs(board):

@@ -1,8 +1,8 @@
 """From radiance to files: what a camera does to a picture, and the folder of a scene.
 
 A folder: `images/000.jpg` ..., `masks/000.png` ..., `gt_mesh.ply`, and, last, `transforms.json` as
-`stages.evaluation.known_object` reads it. `made_with.json` says what is being made: photos of another recipe are
-removed, finished ones are kept.
+`stages.evaluation.protocols.known_object` reads it. `made_with.json` says what is being made: photos of another
+recipe are removed, finished ones are kept.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from benchmarks.synthetic import MADE_WITH
 from benchmarks.synthetic.mitsuba_camera import Photographer
 from benchmarks.synthetic.model import Scene
 from benchmarks.synthetic.scenes import RECIPES
-from stages.evaluation.known_object import TRUTH_CAMERAS, TRUTH_MESH
-from stages.scenes.figurine import photo_exif
+from stages.evaluation.protocols.known_object import TRUTH_CAMERAS, TRUTH_MESH
+from stages.scenes.photo_files import is_complete, photo_exif, srgb, write_truth
 
 SUITE_VERSION = 1  # raise it when the same recipe would give other photos
 IMAGES, MASKS = "images", "masks"
@@ -67,7 +67,7 @@ class Order:
 
 def make(order: Order, folder: Path, variant: str, progress: Callable[[int], None] = lambda done: None) -> bool:
     """Make what is not there yet; whether there was anything to do."""
-    if _is_made(order, folder):
+    if is_complete(folder, order.as_dict()):
         return False
     _begin(order, folder)
     rng = np.random.default_rng(order.seed)
@@ -86,7 +86,9 @@ def make(order: Order, folder: Path, variant: str, progress: Callable[[int], Non
             picture = _picture(developed)
             _save(photo, picture, quality=JPEG_QUALITY, exif=photo_exif(picture, i, "Synthetic camera", FOCAL_35MM))
         progress(i + 1)
-    _write_cameras(order, scene, exposures, folder / TRUTH_CAMERAS)
+    names = [f"{IMAGES}/{i:03d}.jpg" for i in range(order.num_photos)]
+    notes = [{"exposure": round(float(exposure), 5)} for exposure in exposures]
+    write_truth(folder, names, scene.cam_from_world, order.size, order.focal, order.as_dict(), notes)
     return True
 
 
@@ -95,8 +97,7 @@ def develop(light: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     clipped = np.clip(light, 0, 1)
     sigma = np.sqrt(READ_NOISE**2 + SHOT_NOISE**2 * clipped)
     linear = np.clip(clipped + sigma * rng.standard_normal(clipped.shape), 0, 1)
-    srgb = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
-    return (srgb * 255 + 0.5).astype(np.uint8)
+    return (srgb(linear) * 255 + 0.5).astype(np.uint8)
 
 
 def _drift(count: int, rng: np.random.Generator) -> np.ndarray:
@@ -117,16 +118,6 @@ def _noise_seed(order: Order, index: int, purpose: int) -> int:
 
 
 # ---------------------------------------------------------------- files
-def _is_made(order: Order, folder: Path) -> bool:
-    try:
-        truth = json.loads((folder / TRUTH_CAMERAS).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return False
-    return truth.get("made_with") == order.as_dict() and all(
-        (folder / frame["file_path"]).is_file() for frame in truth["frames"]
-    )
-
-
 def _begin(order: Order, folder: Path) -> None:
     """Empty folders, or those of the same order."""
     note = folder / MADE_WITH
@@ -156,30 +147,3 @@ def _write_mesh(scene: Scene, path: Path) -> None:
     import trimesh
 
     trimesh.Trimesh(*scene.surface(), process=False).export(path)
-
-
-def _write_cameras(order: Order, scene: Scene, exposures: np.ndarray, path: Path) -> None:
-    opengl = np.diag([1.0, -1, -1, 1])
-    frames = [
-        {
-            "file_path": f"{IMAGES}/{i:03d}.jpg",
-            "exposure": round(float(exposure), 5),
-            "transform_matrix": (np.linalg.inv(cam_from_world) @ opengl).tolist(),
-            "w2c_opencv": cam_from_world.tolist(),
-        }
-        for i, (cam_from_world, exposure) in enumerate(zip(scene.cam_from_world, exposures, strict=True))
-    ]
-    truth = {
-        "camera_model": "PINHOLE",
-        "w": order.size[0],
-        "h": order.size[1],
-        "fl_x": order.focal,
-        "fl_y": order.focal,
-        "cx": order.size[0] / 2,
-        "cy": order.size[1] / 2,
-        "made_with": order.as_dict(),
-        "frames": frames,
-    }
-    partial = path.with_suffix(".partial")
-    partial.write_text(json.dumps(truth, indent=1) + "\n", encoding="utf-8")
-    os.replace(partial, path)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from stages.evaluation.known_object import load_known_surface
+from stages.evaluation.protocols.known_object import KnownObject, load_known_object, pinhole_rays
 from stages.surface.triangle_mesh import raycaster
 
 # A camera that is half a pixel off is far beyond these. An outline that runs along a row of pixels, as the city's does
@@ -43,22 +43,17 @@ class Agreement:
 def check(folder: Path) -> Agreement:
     """Compare all masks of a finished folder with its surface and cameras."""
     import cv2
-    import open3d as o3d
 
-    known, _ = load_known_surface(folder)
+    known = load_known_object(folder)
     scene = raycaster(known.vertices, known.faces)
-    width, height = known.size
     shifts, overlaps, insides = [], [], []
-    for path, cam_from_world in zip(sorted((folder / "masks").iterdir()), known.cam_from_world, strict=True):
+    for i, path in enumerate(sorted((folder / "masks").iterdir())):
         mask = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) > 127
-        rays = o3d.t.geometry.RaycastingScene.create_rays_pinhole(
-            o3d.core.Tensor(known.intrinsics), o3d.core.Tensor(cam_from_world), width, height
-        )
-        cast = np.isfinite(scene.cast_rays(rays)["t_hit"].numpy())
+        cast = np.isfinite(scene.cast_rays(pinhole_rays(known.cameras, i))["t_hit"].numpy())
         shifts.append(_shift(mask, cast))
         sure = _away_from_outlines(cast)
         overlaps.append((mask & cast)[sure].sum() / max((mask | cast)[sure].sum(), 1))
-        insides.append(_share_inside(known.vertices, known.intrinsics, cam_from_world, mask))
+        insides.append(_share_inside(known, i, mask))
     return Agreement(float(max(shifts)), float(min(overlaps)), float(min(insides)))
 
 
@@ -84,13 +79,12 @@ def _away_from_outlines(mask: np.ndarray) -> np.ndarray:
     return np.maximum(inside, outside) > EDGE
 
 
-def _share_inside(vertices: np.ndarray, intrinsics: np.ndarray, cam_from_world: np.ndarray, mask: np.ndarray) -> float:
+def _share_inside(known: KnownObject, index: int, mask: np.ndarray) -> float:
     import cv2
 
-    in_cam = vertices @ cam_from_world[:3, :3].T + cam_from_world[:3, 3]
-    pixels = in_cam @ intrinsics.T
-    pixels = np.floor(pixels[:, :2] / pixels[:, 2:]).astype(int)
-    seen = (in_cam[:, 2] > 0) & np.all((pixels >= 0) & (pixels < np.array(mask.shape)[::-1]), axis=1)
+    pixels, depths = known.cameras.project(index, known.vertices)
+    pixels = np.floor(pixels).astype(int)
+    seen = (depths > 0) & np.all((pixels >= 0) & (pixels < np.array(mask.shape)[::-1]), axis=1)
     grown = cv2.dilate(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     column, row = pixels[seen].T
     return float(grown[row, column].mean())

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from benchmarks.synthetic.model import Paint, Part, plain
-from stages.scenes.figurine import ValueNoise
+from stages.scenes.noise import ValueNoise
 
 STREET = 0.05  # wide
 LOTS = (4, 3)

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from benchmarks.synthetic.implicit import box, cylinder, ellipsoid, mesh_of, profile, tube, union, without
 from benchmarks.synthetic.model import Paint, Part, plain
-from stages.scenes.figurine import ValueNoise, make_figurine
+from stages.scenes.figurine import make_figurine
+from stages.scenes.implicit import box, cylinder, ellipsoid, mesh_of, profile, tube, union, without
+from stages.scenes.noise import ValueNoise
 
 CELL = 1 / 240  # of the grid that shapes are meshed from: about one and a half pixels of the photos
 GRAIN = 0.02  # longest painted edge of rods

@@ -9,9 +9,8 @@ import numpy as np
 
 from benchmarks.synthetic import city, objects
 from benchmarks.synthetic.model import Ground, Part, Scene
-from stages.drawing.rendering import look_at
-from stages.geometry.cameras import PinholeCameras
-from stages.scenes.figurine import CLOTH_SIDE, camera_ring, make_cloth, make_environment
+from stages.scenes.room import CLOTH_SIDE, make_cloth, make_environment, sphere_directions
+from stages.scenes.viewpoints import camera_ring, viewpoint
 
 GROUND_GAP = 1e-4  # under the object: two surfaces in one plane would mix
 SKY_HEIGHT = 512
@@ -75,12 +74,10 @@ def _city(rng: np.random.Generator, num_photos: int) -> Scene:
 
 def sunny_sky(height: int = SKY_HEIGHT) -> np.ndarray:
     """Radiance [height, 2 height, 3]: blue above, bright at the horizon, a soft sun at 50 degrees."""
-    polar = (np.arange(height) + 0.5) / height * np.pi
-    azimuth = (np.arange(2 * height) + 0.5) / height * np.pi
-    up, ring = np.cos(polar)[:, None], np.sin(polar)[:, None]
-    directions = np.stack(np.broadcast_arrays(ring * np.cos(azimuth), ring * np.sin(azimuth), up), -1)
-    haze = np.exp(-np.maximum(up, 0) / 0.25)[..., None]
-    sky = np.where(up[..., None] > 0, (1 - haze) * [0.35, 0.55, 1.0] + haze * [0.9, 0.95, 1.0], 0.0)
+    directions = sphere_directions(height)
+    up = directions[..., 2:]
+    haze = np.exp(-np.maximum(up, 0) / 0.25)
+    sky = np.where(up > 0, (1 - haze) * [0.35, 0.55, 1.0] + haze * [0.9, 0.95, 1.0], 0.0)
     sun = np.array([0.5, 0.4, np.sin(np.radians(50))])
     glow = 350 * np.exp((directions @ (sun / np.linalg.norm(sun)) - 1) / 0.002)
     return (sky + glow[..., None] * [1.0, 0.93, 0.82]).astype(np.float32)
@@ -102,7 +99,7 @@ def flight(num_photos: int, rng: np.random.Generator) -> np.ndarray:
                 ahead = np.tan(np.radians(OBLIQUE_DEG)) * FLIGHT_HEIGHT * np.array([np.cos(angle), np.sin(angle)])
             eye = target + [*(-ahead), FLIGHT_HEIGHT] + jitter[3:]
             up = np.array([0, 0, 1.0]) if heading is not None else np.array([0, 1.0, 0])
-            poses.append(_pose(look_at(eye, target, up, 4, 3)))
+            poses.append(viewpoint(eye, target, up=up))
     return np.array(poses)
 
 
@@ -115,11 +112,6 @@ def _grid(count: int) -> list[tuple[float, float]]:
         line = [(-1 + (2 * j + 1) / len(row), y) for j in range(len(row))]
         places += line if i % 2 == 0 else line[::-1]
     return places
-
-
-def _pose(camera: PinholeCameras) -> np.ndarray:
-    """[4, 4] of the only camera."""
-    return np.concatenate([camera.cam_from_scene[0], [[0, 0, 0, 1.0]]])
 
 
 RECIPES = {

@@ -5,7 +5,7 @@ Shapes: H x W pixels.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,20 +23,23 @@ SSIM_SIGMA = 1.5  # Wang et al. 2004, pixels
 
 
 @dataclass(frozen=True)
-class ViewScore:
+class ScoredView:
     """A drawing against its photo.
 
     Attributes:
         name: of the photo.
+        photo, drawing: [H, W, 3] uint8.
+        counted: [H, W] bool, the pixels that count.
         psnr: dB.
         ssim: mean structural similarity.
-        pixels: how many counted.
     """
 
     name: str
+    photo: np.ndarray
+    drawing: np.ndarray
+    counted: np.ndarray
     psnr: float
     ssim: float
-    pixels: int
 
 
 def psnr(image: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> float:
@@ -87,29 +90,24 @@ def draw_view(atlas: AtlasMesh, texture: np.ndarray, cameras: PinholeCameras, in
 
 
 def score_views(
-    draw: Callable[[int], np.ndarray],
+    atlas: AtlasMesh,
+    texture: np.ndarray,
     cameras: PinholeCameras,
     load_photo: Callable[[int], tuple[np.ndarray, np.ndarray | None]],
-    covered: Callable[[int], np.ndarray],
-    indices: list[int],
-) -> list[ViewScore]:
-    """Scores of drawings against photos, inside the object's mask, or the mesh's silhouette where there is no mask.
+    names: Iterable[str],
+) -> Iterator[ScoredView]:
+    """The textured mesh against photos, inside the object's mask, or the mesh's silhouette where there is no mask.
 
     Args:
-        draw: camera -> [H, W, 3] uint8.
+        texture: [S, S, 3] uint8 sRGB, row 0 at v = 1.
         load_photo: camera -> photo [H, W, 3] uint8 and mask [H, W] bool or None.
-        covered: camera -> the mesh's silhouette [H, W] bool.
-        indices: cameras to score; those with no pixel that counts are left out.
+        names: of the photos to score; those with no pixel that counts are left out.
     """
-    scores = []
-    for index in indices:
+    for name in names:
+        index = cameras.names.index(name)
         photo, mask = load_photo(index)
-        counted = covered(index) if mask is None else mask
+        counted = silhouette(atlas.vertices, atlas.faces, cameras, index) if mask is None else mask
         if counted.any():
-            image = draw(index)
-            scores.append(
-                ViewScore(
-                    cameras.names[index], psnr(image, photo, counted), ssim(image, photo, counted), int(counted.sum())
-                )
-            )
-    return scores
+            drawing = draw_view(atlas, texture, cameras, index)
+            scores = psnr(drawing, photo, counted), ssim(drawing, photo, counted)
+            yield ScoredView(name, photo, drawing, counted, *scores)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import os
 import platform
 from importlib.metadata import version
 from pathlib import Path
+
+from stages.reconstruct import available_cores
 
 LIBRARIES = ("hineus", "torch", "pycolmap", "open3d")
 
@@ -18,10 +19,9 @@ def machine() -> dict[str, str]:
         cpu = next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
     except (OSError, StopIteration):
         pass
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     return {
         "cpu": cpu,
-        "cores": str(cores),
+        "cores": str(available_cores()),
         "python": platform.python_version(),
         **{name: version(name) for name in LIBRARIES},
     }

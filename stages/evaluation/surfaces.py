@@ -17,7 +17,6 @@ from typing import Any
 
 import numpy as np
 
-from stages.evaluation.known_surface import f_score, sample_faces
 from stages.surface.triangle_mesh import face_normals, raycaster
 
 SAMPLES = 200_000
@@ -239,10 +238,17 @@ def measure(
         ValueError: a mesh has no area, or no point of a side counts.
     """
     sampling = sampling or Sampling()
+    ours, true = draw_points(predicted, sampling, keep_predicted), draw_points(truth, sampling, keep_true)
+    return measure_points(ours, true, predicted, truth, thresholds)
+
+
+def measure_points(
+    ours: Surface, true: Surface, predicted: Surface, truth: Surface, thresholds: Sequence[float] | None = None
+) -> SurfaceScores:
+    """The definition: from points `ours` to the surface `truth` (accuracy), from points `true` to `predicted`."""
     extent = truth.extent
     if thresholds is None:
         thresholds = [part * extent for part in DEFAULT_THRESHOLDS]
-    ours, true = draw_points(predicted, sampling, keep_predicted), draw_points(truth, sampling, keep_true)
     to_truth, to_predicted = Target(truth).nearest(ours.points), Target(predicted).nearest(true.points)
     accuracy, completeness = OneWay.of(to_truth.distances), OneWay.of(to_predicted.distances)
     return SurfaceScores(
@@ -257,21 +263,10 @@ def measure(
     )
 
 
-def compare_to_points(
-    predicted: Surface,
-    points: np.ndarray,
-    normals: np.ndarray | None = None,
-    thresholds: Sequence[float] | None = None,
-    sampling: Sampling | None = None,
-) -> SurfaceScores:
-    """`measure` against true points [P, 3], with unit normals [P, 3] where they are known."""
-    return measure(predicted, Surface(points, None, normals), thresholds, sampling)
-
-
 def score_at(to_truth: np.ndarray, to_predicted: np.ndarray, threshold: float) -> FScore:
     """Precision, recall and F-score of distances [P] and [Q] at a threshold."""
     precision, recall = (100 * float((distances < threshold).mean()) for distances in (to_truth, to_predicted))
-    return FScore(threshold, precision, recall, f_score(to_truth, to_predicted, threshold))
+    return FScore(threshold, precision, recall, 2 * precision * recall / max(precision + recall, 1e-9))
 
 
 def turning(normals: np.ndarray | None, others: np.ndarray | None) -> Turning | None:
@@ -281,6 +276,27 @@ def turning(normals: np.ndarray | None, others: np.ndarray | None) -> Turning | 
     cosines = np.abs((normals * others).sum(1)).clip(0, 1)
     angles = np.degrees(np.arccos(cosines))
     return Turning(float(angles.mean()), float(np.median(angles)), float(cosines.mean()))
+
+
+def sample_faces(
+    vertices: np.ndarray, faces: np.ndarray, count: int, seed: int = 0
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """Points [count, 3], uniform by area, on a triangle mesh, and the face [count] of each.
+
+    Raises:
+        ValueError: the mesh has no area.
+    """
+    corners = vertices[faces].astype(np.float64)
+    edge_b, edge_c = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    area = np.linalg.norm(np.cross(edge_b, edge_c), axis=1)
+    if not area.sum() > 0:
+        raise ValueError(f"a mesh with area is expected, got {len(faces)} faces with none")
+    rng = np.random.default_rng(seed)
+    chosen = rng.choice(len(faces), size=count, p=area / area.sum())
+    u, v = rng.random((2, count, 1))
+    flip = u + v > 1
+    u, v = np.where(flip, 1 - u, u), np.where(flip, 1 - v, v)
+    return corners[chosen, 0] + u * edge_b[chosen] + v * edge_c[chosen], chosen
 
 
 def _draw(surface: Surface, sampling: Sampling, times: float) -> Surface:

@@ -7,9 +7,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float32, Int64
 
 # A table starts as small noise: features begin near zero, so the geometric initialisation is what is rendered.
 INITIAL_AMPLITUDE = 1e-4
@@ -37,21 +41,21 @@ class HashGrid:
         return self.levels * self.features
 
     @cached_property
-    def resolutions(self) -> np.ndarray:
-        """[L] int64 cells along a side per level."""
+    def resolutions(self) -> Int64[np.ndarray, " levels"]:
+        """Cells along a side per level."""
         if self.levels == 1:
             return np.array([self.coarsest], dtype=np.int64)
         growth = np.exp(np.log(self.finest / self.coarsest) / (self.levels - 1))
         return np.round(self.coarsest * growth ** np.arange(self.levels)).astype(np.int64)
 
     @cached_property
-    def dense(self) -> np.ndarray:
-        """[L] bool: whether the level's (res + 1)^3 lattice fits its rows without hashing."""
+    def dense(self) -> Bool[np.ndarray, " levels"]:
+        """Whether the level's (res + 1)^3 lattice fits its rows without hashing."""
         return (self.resolutions + 1) ** 3 <= 2**self.log2_rows
 
     @cached_property
-    def offsets(self) -> np.ndarray:
-        """[L + 1] int64 first row of each level; the last entry is the number of rows."""
+    def offsets(self) -> Int64[np.ndarray, " offsets"]:
+        """First row of each level; the last entry is the number of rows."""
         rows = np.where(self.dense, (self.resolutions + 1) ** 3, 2**self.log2_rows)
         return np.concatenate([[0], np.cumsum(rows)]).astype(np.int64)
 
@@ -63,8 +67,8 @@ class HashGrid:
         """Side of a cell of the finest active level, in scene units."""
         return 2.0 / float(self.resolutions[(active_levels or self.levels) - 1])
 
-    def initial_table(self, generator: torch.Generator) -> torch.Tensor:
-        """[rows, features] float32 uniform noise of amplitude `INITIAL_AMPLITUDE`."""
+    def initial_table(self, generator: torch.Generator) -> Float32[torch.Tensor, "{self.num_rows} {self.features}"]:
+        """Uniform noise of amplitude `INITIAL_AMPLITUDE`."""
         noise = torch.rand(self.num_rows, self.features, generator=generator)
         return (noise * 2 - 1) * INITIAL_AMPLITUDE
 

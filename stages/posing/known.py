@@ -6,7 +6,7 @@ Cameras are COLMAP's: OpenCV axes (x right, y down, z forward), pixel centres at
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 
@@ -172,9 +172,3 @@ def image_size(file: Path, origin: Path) -> tuple[int, int]:
             f"{origin} does not say how large its images are, and {file} cannot be read.",
             "Keep the file of poses beside its images.",
         ) from error
-
-
-def first_of(names: Sequence[str], count: int = 3) -> str:
-    """The first names, and how many more there are."""
-    more = len(names) - count
-    return ", ".join(names[:count]) + (f" and {more} more" if more > 0 else "")

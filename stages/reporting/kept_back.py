@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from stages.artifacts import AtlasMesh
-from stages.drawing.view_scores import draw_view, score_views, silhouette
+from stages.drawing.view_scores import score_views
 from stages.geometry.cameras import PinholeCameras
 from stages.reporting.pictures import jpeg_uri, shrink
 
@@ -30,42 +30,25 @@ def compare_held_out(
     Args:
         load_photo: camera -> photo [H, W, 3] uint8 and mask [H, W] bool or None.
     """
-    indices = [number for number, name in enumerate(cameras.names) if name in names]
-    drawings: dict[str, np.ndarray] = {}
-
-    def draw(index: int) -> np.ndarray:
-        drawings[cameras.names[index]] = draw_view(atlas, texture, cameras, index)
-        return drawings[cameras.names[index]]
-
-    def covered(index: int) -> np.ndarray:
-        return silhouette(atlas.vertices, atlas.faces, cameras, index)
-
     pairs: list[dict[str, str]] = []
     scores = []
-    for index in indices:
-        for score in score_views(draw, cameras, load_photo, covered, [index]):
-            scores.append(score)
-            drawing = drawings.pop(score.name)
-            if len(pairs) < MAX_PAIRS:
-                photo, mask = load_photo(index)
-                window = _window(covered(index) if mask is None else mask)
-                pairs.append(
-                    {
-                        "name": score.name,
-                        "psnr": f"{score.psnr:.1f}",
-                        "ssim": f"{score.ssim:.3f}",
-                        "photo": jpeg_uri(shrink(photo[window], PAIR_SIDE)),
-                        "drawing": jpeg_uri(shrink(drawing[window], PAIR_SIDE)),
-                    }
-                )
+    for view in score_views(atlas, texture, cameras, load_photo, [name for name in cameras.names if name in names]):
+        scores.append((view.psnr, view.ssim))
+        if len(pairs) < MAX_PAIRS:
+            window = _window(view.counted)
+            pairs.append(
+                {
+                    "name": view.name,
+                    "psnr": f"{view.psnr:.1f}",
+                    "ssim": f"{view.ssim:.3f}",
+                    "photo": jpeg_uri(shrink(view.photo[window], PAIR_SIDE)),
+                    "drawing": jpeg_uri(shrink(view.drawing[window], PAIR_SIDE)),
+                }
+            )
     if not scores:
         return None
-    return {
-        "pairs": pairs,
-        "count": len(scores),
-        "psnr": float(np.mean([score.psnr for score in scores])),
-        "ssim": float(np.mean([score.ssim for score in scores])),
-    }
+    mean_psnr, mean_ssim = np.mean(scores, axis=0).tolist()
+    return {"pairs": pairs, "count": len(scores), "psnr": mean_psnr, "ssim": mean_ssim}
 
 
 def _window(mask: np.ndarray) -> tuple[slice, slice]:

@@ -1,1 +1,1 @@
-"""Made-up scenes with known truth: what the demo and the synthetic suite photograph."""
+"""Made-up scenes whose surface and cameras are known: the demo's, and what the synthetic suite shares with it."""

@@ -8,10 +8,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from stages.evaluation.protocols.blendedmvs import DEPTHS
 from stages.evaluation.suites.scene import SuiteScene, Truth, Wanted, every_nth, folders_with, photo_names
 from stages.posing import mvsnet, neus
 
-DEPTHS = "rendered_depth_maps"
 MASKED = "_masked"  # pictures with black where the model has a hole
 
 

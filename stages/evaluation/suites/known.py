@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from stages.evaluation.known_object import TRUTH_CAMERAS, TRUTH_MESH
+from stages.evaluation.protocols.known_object import TRUTH_CAMERAS, TRUTH_MESH
 from stages.evaluation.suites.scene import SuiteScene, Truth, Wanted, every_nth, folders_with, photo_names
 
 IMAGES, MASKS = "images", "masks"

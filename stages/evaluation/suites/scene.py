@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Literal
 
 from stages.capture.photo_reading import PHOTO_SUFFIXES
+from stages.evaluation.photos.test_photos import TestViews
 
 
 @dataclass(frozen=True)
@@ -26,29 +27,11 @@ class Wanted:
 
 
 @dataclass(frozen=True)
-class TestViews:
-    """Photos to judge by, which no stage sees.
-
-    Attributes:
-        folder: of the photos. names: relative to it, posix.
-        poses: what `stages.posing.reading.read_poses` takes.
-        background: how the suite's PSNR counts what is not the object: "white", or as "photo" shows it.
-    """
-
-    __test__ = False  # pytest takes the name for a test
-
-    folder: Path
-    names: tuple[str, ...]
-    poses: Path
-    background: Literal["white", "photo"] = "photo"
-
-
-@dataclass(frozen=True)
 class Truth:
     """What the mesh is held against.
 
     Attributes:
-        protocol: by which a suite's papers score, see `stages.evaluation.suite_scores`.
+        protocol: by which a suite's papers score, see `stages.evaluation.suites.scores`.
         folder: that the protocol reads.
         scan: the number DTU gives the scene.
         split: NeRO's file that names the test views; None: all are.

@@ -1,0 +1,69 @@
+"""`hineus run`, and the command of each stage."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Annotated
+
+import typer
+
+from hineus_cli.options import Json, Until, Verbose, with_options_of_a_run
+from hineus_cli.session import Session, print_json
+from stages.engine.stage import Stage
+from stages.reconstruct import Reconstruction, Request, choose_folder, reconstruct
+
+
+@with_options_of_a_run
+def run(
+    context: typer.Context,
+    request: Request,
+    from_stage: Annotated[
+        str | None, typer.Option("--from", help="Run this stage and all after it, even if fresh.", show_default=False)
+    ] = None,
+    until: Until = None,
+    force: Annotated[
+        list[str] | None, typer.Option(help="Run this stage even if fresh. Repeatable.", show_default=False)
+    ] = None,
+    as_json: Json = False,
+    verbose: Verbose = False,
+) -> None:
+    """Photos to a textured asset: run every stage that is not up to date."""
+    _run(context.obj, replace(request, from_stage=from_stage, until=until, force=tuple(force or ())), verbose)
+
+
+def stage_command(stage: Stage) -> Callable[..., None]:
+    """The subcommand of one stage: bring what it needs up to date, then run it, then stop."""
+
+    @with_options_of_a_run
+    def command(
+        context: typer.Context,
+        request: Request,
+        force: Annotated[bool, typer.Option("--force", help="Run it even if it is fresh.")] = False,
+        as_json: Json = False,
+        verbose: Verbose = False,
+    ) -> None:
+        _run(context.obj, replace(request, until=stage.name, force=(stage.name,) if force else ()), verbose)
+
+    command.__doc__ = f"Stage: {stage.summary or stage.name}."
+    return command
+
+
+def _run(session: Session, request: Request, verbose: bool) -> None:
+    session.log_path = choose_folder(request).absolute() / "hineus.log"
+    with session.running(verbose) as progress:
+        result = reconstruct(request, session.pipeline, progress)
+    _show(result)
+    if session.json:
+        print_json(result.as_dict())
+
+
+def _show(result: Reconstruction) -> None:
+    from hineus_cli.console import outcome_table, people
+
+    console = people()
+    console.print(outcome_table(result.outcomes, console.width))
+    results = {"textured model": result.glb, "report": result.report, "workspace": result.workspace.root}
+    for what, path in results.items():
+        if path is not None:
+            console.print(f"{what}: {path}", markup=False, soft_wrap=True)

@@ -1,0 +1,33 @@
+"""`hineus view`."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from hineus_cli.options import OfWorkspace
+
+
+def view(
+    context: typer.Context,
+    workspace: OfWorkspace = Path("."),
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port of the local server; 0: a free one.")] = 0,
+    no_browser: Annotated[bool, typer.Option("--no-browser", help="Print the address only.")] = False,
+) -> None:
+    """Show the report of a workspace in the browser, or a run as it goes and the report once it is there."""
+    import threading
+    import webbrowser
+
+    from hineus_cli.console import people
+    from hineus_cli.viewing import serving, watch
+
+    watched = watch(workspace, context.obj.pipeline)
+    with suppress(KeyboardInterrupt), serving(watched, port) as url:
+        typer.echo(url)
+        people().print("Ctrl-C ends it.")
+        if not no_browser:
+            webbrowser.open(url)
+        threading.Event().wait()

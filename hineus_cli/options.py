@@ -1,0 +1,192 @@
+"""Options that several commands have, and the one way from those of a run to its request."""
+
+from __future__ import annotations
+
+import inspect
+import json
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from stages.errors import ConfigError
+from stages.reconstruct import HOLD_OUT, Request
+
+_TIME = re.compile(r"^(?:(?P<h>[\d.]+)h)?(?:(?P<m>[\d.]+)m(?:in)?)?(?:(?P<s>[\d.]+)s)?$")
+
+
+def minutes(text: str) -> float:
+    """ "90s", "5m", "1h30m" or "5" (minutes) as minutes.
+
+    Raises:
+        ConfigError: it is none of these, or not positive.
+    """
+    refusal = ConfigError(f"--time {text} is no length of time.", "Try `--time 5m`, `--time 90s` or `--time 1h30m`.")
+    found = _TIME.match(text.strip())
+    try:
+        if found and any(found.groups()):
+            hours, mins, seconds = (float(found[unit] or 0) for unit in "hms")
+            total = 60 * hours + mins + seconds / 60
+        else:
+            total = float(text)
+    except ValueError:
+        raise refusal from None
+    if not 0 < total < float("inf"):
+        raise refusal
+    return total
+
+
+def every_nth(text: str) -> int:
+    """ "8", for every 8th photo, or "0" for none.
+
+    Raises:
+        ConfigError: it is neither 0 nor a whole number from 2 on.
+    """
+    if not re.fullmatch(r"0|[1-9]\d*", text.strip()) or int(text) == 1:
+        raise ConfigError(
+            f"--hold-out {text}: N must be a whole number from 2 on, for every N-th photo, or 0 for none; "
+            "it is not a percentage.",
+            "Try `--hold-out 8`: every 8th photo, 12 % of them.",
+        )
+    return int(text)
+
+
+Photos = Annotated[
+    Path | None,
+    typer.Argument(
+        help="Folder of photos, or a video; may be left out for a workspace that knows its own.", show_default=False
+    ),
+]
+OfWorkspace = Annotated[Path, typer.Argument(help="The workspace's folder.")]
+WorkspaceOption = Annotated[
+    Path | None,
+    typer.Option("--workspace", "-w", help="Folder for all results; default: PHOTOS_hineus here.", show_default=False),
+]
+Masks = Annotated[
+    Path | None, typer.Option(help="Folder of masks, named like the photos, white on the object.", show_default=False)
+]
+Poses = Annotated[
+    Path | None,
+    typer.Option(
+        help="Known poses: a COLMAP model, transforms.json, cameras_sphere.npz, or a folder of *-camera.pkl.",
+        show_default=False,
+    ),
+]
+NoPoses = Annotated[bool, typer.Option("--no-poses", help="Forget the poses of the last run and find them.")]
+NoMasks = Annotated[bool, typer.Option("--no-masks", help="Forget the masks of the last run.")]
+Preset = Annotated[
+    str | None,
+    typer.Option(help="See `hineus presets`; default: gpu with a CUDA device, else cpu.", show_default=False),
+]
+ConfigFile = Annotated[
+    Path | None, typer.Option("--config", help="YAML file of settings, over the preset.", show_default=False)
+]
+Sets = Annotated[
+    list[str] | None,
+    typer.Option("--set", help="One setting, over all else: section.key=value. Repeatable.", show_default=False),
+]
+Until = Annotated[str | None, typer.Option(help="Stop after this stage.", show_default=False)]
+Device = Annotated[str, typer.Option(help="auto, cpu or cuda.")]
+Workers = Annotated[int | None, typer.Option(min=1, help="CPU threads; default: all.", show_default=False)]
+Time = Annotated[
+    float | None,
+    typer.Option(
+        parser=minutes,
+        metavar="TIME",
+        help="Training budget, like 5m or 90s: sets train.minutes.",
+        show_default=False,
+    ),
+]
+
+
+def hold_out_option(what_for: str) -> Any:
+    """`--hold-out N`, which means the same in every command."""
+    text = f"Keep every N-th photo back {what_for}. 8: every 8th, 12 %; 0: none."
+    return typer.Option("--hold-out", parser=every_nth, metavar="N", help=text, show_default=False)
+
+
+HoldOut = Annotated[
+    int | None, hold_out_option(f"from training and texture, and compare the result with it: sets {HOLD_OUT}")
+]
+NoGround = Annotated[bool, typer.Option("--no-ground", help="Cut off the ground or table: sets cleanup.remove_ground.")]
+Watertight = Annotated[
+    bool, typer.Option("--watertight", help="A closed mesh, as for printing: sets cleanup.keep_closed.")
+]
+Deterministic = Annotated[
+    bool,
+    typer.Option("--deterministic", help="The same poses every time, bit for bit, but slower: sfm.deterministic=true."),
+]
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout.")]
+Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Say more.")]
+
+
+def settings(
+    sets: list[str] | None,
+    time: float | None = None,
+    hold_out: int | None = None,
+    no_ground: bool = False,
+    watertight: bool = False,
+    deterministic: bool = False,
+) -> tuple[str, ...]:
+    """Those of --set, then what other options stand for; an option that was not given says nothing."""
+    stood_for = {
+        "train.minutes": time,
+        HOLD_OUT: hold_out,
+        "cleanup.remove_ground": no_ground or None,
+        "cleanup.keep_closed": watertight or None,
+        "sfm.deterministic": deterministic or None,
+    }
+    given = (f"{key}={json.dumps(value)}" for key, value in stood_for.items() if value is not None)
+    return (*(sets or ()), *given)
+
+
+def of_a_run(
+    photos: Photos = None,
+    workspace: WorkspaceOption = None,
+    masks: Masks = None,
+    no_masks: NoMasks = False,
+    poses: Poses = None,
+    no_poses: NoPoses = False,
+    preset: Preset = None,
+    config: ConfigFile = None,
+    sets: Sets = None,
+    device: Device = "auto",
+    workers: Workers = None,
+    time: Time = None,
+    hold_out: HoldOut = None,
+    no_ground: NoGround = False,
+    watertight: Watertight = False,
+    deterministic: Deterministic = False,
+) -> Request:
+    """What `hineus run` and every stage's command ask for; which stages they run is their own."""
+    return Request(
+        photos=photos,
+        workspace=workspace,
+        masks=masks,
+        no_masks=no_masks,
+        poses=poses,
+        no_poses=no_poses,
+        preset=preset,
+        config=config,
+        sets=settings(sets, time, hold_out, no_ground, watertight, deterministic),
+        device=device,
+        workers=workers,
+    )
+
+
+def with_options_of_a_run(command: Callable[..., None]) -> Callable[..., None]:
+    """A command whose parameter `request` is, on the command line, the options of `of_a_run`."""
+    shared = inspect.signature(of_a_run, eval_str=True).parameters
+    own = inspect.signature(command, eval_str=True).parameters
+
+    def asked(**given: Any) -> None:
+        request = of_a_run(**{name: given.pop(name) for name in shared})
+        command(request=request, **given)
+
+    parameters = [each for name in own for each in (shared.values() if name == "request" else [own[name]])]
+    asked.__name__, asked.__doc__ = command.__name__, command.__doc__
+    asked.__annotations__ = {each.name: each.annotation for each in parameters}
+    asked.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]  # what typer reads
+    return asked

@@ -1,0 +1,53 @@
+"""One invocation of the command line, and how a command answers it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import typer
+
+from stages.engine.stage import Stage
+
+if TYPE_CHECKING:
+    from hineus_cli.console import ProgressDisplay
+
+
+@dataclass
+class Session:
+    """The pipeline that is served, and what is needed to tell of a failure; a command finds it as `context.obj`.
+
+    Attributes:
+        json: whether stdout gets one JSON object.
+    """
+
+    pipeline: Sequence[Stage]
+    json: bool = False
+    log_path: Path | None = None
+    progress: ProgressDisplay | None = None
+
+    @contextmanager
+    def working(self, verbose: bool = False) -> Iterator[None]:
+        """For what a command calls: it is logged, and stdout is kept clean for the JSON."""
+        from hineus_cli.console import set_up_logging, stdout_kept_clean
+
+        set_up_logging(verbose)
+        with stdout_kept_clean() if self.json else nullcontext():
+            yield
+
+    @contextmanager
+    def running(self, verbose: bool = False) -> Iterator[ProgressDisplay]:
+        """As `working`, with a progress bar for each stage."""
+        from hineus_cli.console import ProgressDisplay
+
+        with self.working(verbose), ProgressDisplay() as self.progress:
+            yield self.progress
+
+
+def print_json(answer: Mapping[str, Any], ok: bool = True) -> None:
+    """One object on stdout."""
+    typer.echo(json.dumps({"ok": ok, **answer}))

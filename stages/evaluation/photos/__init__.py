@@ -1,0 +1,1 @@
+"""Photos that nothing was learned from, against drawings of the result."""

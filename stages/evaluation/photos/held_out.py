@@ -1,0 +1,86 @@
+"""`hineus evaluate views`: photos that a workspace held back, against drawings of its field and of its final mesh."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from stages import artifacts
+from stages.atlas import ATLAS_STAGE
+from stages.bake import BAKE
+from stages.engine.status import replaced_inputs
+from stages.engine.workspace import Workspace
+from stages.errors import InputError, WorkspaceError
+from stages.evaluation.photos.images import find_lpips
+from stages.evaluation.photos.scoring import score_photos
+from stages.reconstruct import choose_device
+from stages.train import TRAIN
+from stages.undistort import UNDISTORT
+
+# The stages that drawings are made from, in order.
+DRAWN_FROM = (UNDISTORT, TRAIN, ATLAS_STAGE, BAKE)
+
+
+def evaluate_views(workspace: Path, renders: Path | None = None, device: str = "auto") -> dict[str, Any]:
+    """The photos that a workspace held back, against drawings of its field and of its final mesh.
+
+    Args:
+        renders: folder for the pictures, `photo/`, `field/` and `mesh/`; None: none are written.
+        device: auto, cpu or cuda.
+
+    Returns:
+        Photos and means as of `score_photos`, and under "done" how they were scored.
+
+    Raises:
+        InputError: the workspace holds no photos back.
+        WorkspaceError: a stage is missing, or is of another run than those after it.
+    """
+    opened = _whole(workspace)
+    undistort = opened.stage_folder("undistort")
+    held_out = artifacts.load_held_out(opened.stage_folder("train"))
+    if not held_out:
+        raise InputError(
+            f"{workspace} holds no photos back: all were trained on.",
+            f"Train without every 8th: `hineus run --workspace {workspace} --hold-out 8`.",
+        )
+    cameras = artifacts.load_scene(undistort).cameras
+    masked = 0
+
+    def load(index: int) -> tuple[np.ndarray, np.ndarray | None]:
+        nonlocal masked
+        name = cameras.names[index]
+        mask = artifacts.load_mask(undistort, name)
+        masked += mask is not None
+        return artifacts.load_image(undistort, name), None if mask is None else mask > 127
+
+    lpips, about_lpips = find_lpips()
+    indices = [cameras.names.index(name) for name in held_out]
+    found = score_photos(opened, cameras, indices, load, choose_device(device), lpips=lpips, renders=renders)
+    return {
+        "workspace": str(workspace),
+        **found,
+        "renders": None if renders is None else str(renders),
+        "done": [
+            f"photos: {len(held_out)} of {len(cameras)}, held back from training and texture by `--hold-out`",
+            f"object: the photo's mask in {masked} photos, the mesh's silhouette in {len(held_out) - masked}",
+            "whole: the photo as it is for a field with a background; else masked photo and drawing on white",
+            f"lpips: {about_lpips}",
+        ],
+    }
+
+
+def _whole(workspace: Path) -> Workspace:
+    """A workspace whose stages that drawings are made from are all there, and of one run."""
+    opened = Workspace.open(workspace)
+    hint = f"Make it: `hineus run --workspace {workspace}`."
+    for stage in DRAWN_FROM:
+        if opened.published(stage.name) is None:
+            raise WorkspaceError(f"{workspace} has no result of the stage {stage.name}.", hint)
+        made_from = {artifact.partition("/")[0] for artifact in replaced_inputs(stage, opened)}
+        if before := next((each.name for each in DRAWN_FROM if each.name in made_from), None):
+            raise WorkspaceError(
+                f"The stage {stage.name} of {workspace} is of another {before} than the one there.", hint
+            )
+    return opened

@@ -1,0 +1,84 @@
+"""Photos that nothing was learned from, against drawings of the trained field and of the textured mesh.
+
+H x W pixels. Two regions are scored:
+
+- object: the photo's mask, or the mesh's silhouette where there is none, as far as the field says something;
+- whole: the whole photo. A field that has learned a background is held against the photo as it is. Any other field, and
+  the mesh, are laid on white, as is what the mask leaves out of the photo; without a mask they have no such score.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from stages.evaluation.photos.images import ImageScore, Lpips, score_image
+from stages.neural.drawing import FieldDrawing
+
+WHITE = 255
+
+
+@dataclass(frozen=True)
+class RegionScores:
+    """Scores of one drawing; None where a region cannot be scored.
+
+    Attributes:
+        object, whole: see the module.
+    """
+
+    object: ImageScore | None
+    whole: ImageScore | None
+
+
+@dataclass(frozen=True)
+class Judged:
+    """One photo against its drawings.
+
+    Attributes:
+        field, mesh: their scores.
+        pictures: "photo", "field" and "mesh", [H, W, 3] uint8, as they are compared as a whole.
+    """
+
+    field: RegionScores
+    mesh: RegionScores
+    pictures: dict[str, np.ndarray]
+
+
+def judge(
+    photo: np.ndarray,
+    mask: np.ndarray | None,
+    field: FieldDrawing,
+    mesh: np.ndarray,
+    silhouette: np.ndarray,
+    lpips: Lpips | None = None,
+) -> Judged:
+    """Scores of a photo's drawings.
+
+    Args:
+        photo: [H, W, 3] uint8.
+        mask: [H, W] bool, true on the object; None: there is none.
+        field: of the trained field.
+        mesh: [H, W, 3] uint8 of the textured mesh, white around it.
+        silhouette: [H, W] bool, where the mesh is.
+    """
+    counted = (silhouette if mask is None else mask) & field.drawn
+    on_white = photo if mask is None else np.where(mask[..., None], photo, np.uint8(WHITE))
+    seen = field.colors if field.background else laid_on_white(field)
+    field_truth = photo if field.background else None if mask is None else on_white
+
+    def scores(image: np.ndarray, colors: np.ndarray, whole: np.ndarray | None) -> RegionScores:
+        inside = score_image(colors, photo, counted, lpips) if counted.any() else None
+        return RegionScores(inside, None if whole is None else score_image(image, whole, None, lpips))
+
+    return Judged(
+        scores(seen, field.colors, field_truth),
+        scores(mesh, mesh, None if mask is None else on_white),
+        {"photo": photo if field.background else on_white, "field": seen, "mesh": mesh},
+    )
+
+
+def laid_on_white(field: FieldDrawing) -> np.ndarray:
+    """[H, W, 3] uint8: the field's colours, and white as far as it is not opaque."""
+    open_part = 1 - field.opacity[..., None]
+    return np.clip(field.colors + WHITE * open_part + 0.5, 0, WHITE).astype(np.uint8)

@@ -1,0 +1,115 @@
+"""Test photos, which no stage has seen, as pinhole images in the frame of a finished workspace."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from stages import artifacts
+from stages.engine.workspace import Workspace
+from stages.evaluation.photos.images import find_lpips
+from stages.evaluation.photos.regions import WHITE
+from stages.evaluation.photos.scoring import score_photos
+from stages.geometry.cameras import PinholeCameras
+from stages.geometry.normalisation import into_scene
+from stages.ingest import find_masks, read_mask_file
+from stages.posing.known import image_size, match_photos
+from stages.posing.reading import read_poses
+from stages.posing.triangulation import fitted_camera
+from stages.posing.undistortion import pinhole_camera, pinhole_photo
+
+OPAQUE = 127  # alpha above this is the object, as ingest has it
+
+
+@dataclass(frozen=True)
+class TestViews:
+    """Photos to judge by, which no stage sees.
+
+    Attributes:
+        folder: of the photos. names: relative to it, posix.
+        poses: what `stages.posing.reading.read_poses` takes.
+        background: how the suite's PSNR counts what is not the object: "white", or as "photo" shows it.
+    """
+
+    __test__ = False  # pytest takes the name for a test
+
+    folder: Path
+    names: tuple[str, ...]
+    poses: Path
+    background: Literal["white", "photo"] = "photo"
+
+
+class TestPhotos:
+    """Test photos and their cameras.
+
+    Attributes:
+        cameras: in the scene frame, in the order of the views' names; photos without a pose are left out.
+    """
+
+    __test__ = False  # pytest takes the name for a test
+
+    def __init__(self, views: TestViews, workspace: Workspace, masks: Path | None = None) -> None:
+        """With the folder of the masks that the scene is run with, if it is.
+
+        Raises:
+            InputError: no photo has a pose, or one has another shape than its pose is for.
+        """
+        scene = artifacts.load_scene(workspace.stage_folder("undistort"))
+        poses = read_poses(views.poses)
+        matched = match_photos(poses, views.names)
+        self._views = views
+        self._masks = find_masks(list(matched), masks, poses) if masks is not None else {}
+        # as large as training saw photos of this scene
+        self._max_side = int(scene.cameras.sizes.max())
+        self._lenses = {
+            name: fitted_camera(known, name, image_size(views.folder / name, views.poses))
+            for name, known in matched.items()
+        }
+        intrinsics, sizes = zip(*(pinhole_camera(lens, self._max_side) for lens in self._lenses.values()), strict=True)
+        in_poses = PinholeCameras(
+            names=tuple(matched),
+            sizes=np.array(sizes, dtype=np.int64),
+            intrinsics=np.stack(intrinsics),
+            cam_from_scene=np.stack([known.cam_from_world for known in matched.values()]),
+        )
+        self.cameras = into_scene(in_poses, scene.poses_from_scene)
+
+    def load(self, index: int) -> tuple[np.ndarray, np.ndarray | None]:
+        """Photo [H, W, 3] uint8 (on white, where that is the suite's background) and mask [H, W] bool or None."""
+        name = self.cameras.names[index]
+        pixels, mask = _read(self._views.folder / name, self._views.background == "white")
+        if name in self._masks:
+            size = pixels.shape[1], pixels.shape[0]
+            mask = np.where(read_mask_file(self._masks[name], name, size, size, 1), WHITE, 0).astype(np.uint8)
+        pixels, mask = pinhole_photo(self._lenses[name], pixels, mask, self._max_side)
+        return pixels, None if mask is None else mask > OPAQUE
+
+
+def _read(file: Path, on_white: bool) -> tuple[np.ndarray, np.ndarray | None]:
+    """Pixels [H, W, 3] and, of a photo with an alpha channel, its mask [H, W], both uint8."""
+    from PIL import Image
+
+    with Image.open(file) as stored:
+        image: Any = stored.convert("RGBA" if "A" in stored.getbands() else "RGB")
+    values = np.asarray(image)
+    if values.shape[2] == 3:
+        return values, None
+    alpha = values[..., 3:] / WHITE
+    pixels = values[..., :3] * alpha + WHITE * (1 - alpha) if on_white else values[..., :3]
+    return np.rint(pixels).astype(np.uint8), np.where(values[..., 3] > OPAQUE, 255, 0).astype(np.uint8)
+
+
+def score_test_views(photos: TestPhotos, workspace: Workspace, fresh: set[str], device: str) -> dict[str, Any]:
+    """Every test photo against drawings of the trained field and, where it is up to date, of the textured mesh.
+
+    Returns:
+        How many were "counted", and photos and means as of `score_photos`.
+    """
+    indices = range(len(photos.cameras))
+    found = score_photos(
+        workspace, photos.cameras, indices, photos.load, device, textured="bake" in fresh, lpips=find_lpips()[0]
+    )
+    return {"counted": len(indices), **found}

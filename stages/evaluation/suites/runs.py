@@ -1,0 +1,266 @@
+"""`hineus bench`: run a suite's scenes, each in a workspace of its own, score them, and keep one JSON a run.
+
+OUT/SUITE/SCENE/PRESET-seed0/         the workspace; the engine resumes it
+OUT/SUITE/SCENE/PRESET-seed0.json     settings, seed, machine, time, memory, scores
+OUT/SUITE/SCENE/PRESET-seed0.ply      the mesh that was scored, in the frame of the poses
+OUT/SUITE/SCENE/peers/                what peers started from, and a folder each
+OUT/SUITE/SCENE/PRESET-peer-NAME.json
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import shutil
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from glob import escape
+from pathlib import Path
+from typing import Any
+
+from configs.dotted import flatten
+from configs.params import Config
+from stages import artifacts
+from stages.engine.runner import Listener
+from stages.engine.stage import Stage
+from stages.engine.workspace import Workspace, storage_errors
+from stages.errors import HineusError, InputError
+from stages.evaluation.machine import machine
+from stages.evaluation.peers.running import MESH, Peer, run_peer
+from stages.evaluation.suites.registry import Suite, find_scenes
+from stages.evaluation.suites.scene import SuiteScene, Wanted
+from stages.evaluation.suites.scores import posed_mesh, result_mesh, score_result
+from stages.export_poses import export_poses
+from stages.posing.exporting import write_colmap
+from stages.reconstruct import Reconstruction, Request, default_preset, reconstruct
+
+log = logging.getLogger(__name__)
+
+# Raised whenever the same results would get other scores: what was scored before is scored anew.
+SCORING = 1
+POSED = ("ingest", "sfm", "place", "undistort")  # stages that no seed changes
+OURS = "hineus"
+
+
+@dataclass(frozen=True)
+class BenchRequest:
+    """What the user asked for.
+
+    Attributes:
+        suite, data: which scenes, and where they lie. out: where results go.
+        scenes: names; none: all.
+        seeds: how many runs a scene, with seeds 0, 1, ...
+        wanted: how scenes are read. peers: run on the same photos and poses.
+        preset, sets, until, device, workers: see `Request`.
+    """
+
+    suite: Suite
+    data: Path
+    out: Path
+    scenes: Sequence[str] = ()
+    seeds: int = 1
+    wanted: Wanted = field(default_factory=Wanted)
+    peers: Sequence[Peer] = ()
+    preset: str | None = None
+    sets: Sequence[str] = ()
+    until: str | None = None
+    device: str = "auto"
+    workers: int | None = None
+
+
+def run_bench(
+    request: BenchRequest, pipeline: Sequence[Stage], listener: Listener | None = None
+) -> Iterator[dict[str, Any]]:
+    """Run scene after scene; what is fresh is not run again. A scene that fails does not stop the others.
+
+    Yields:
+        A result for each run and peer, JSON-able, as it is kept; where something failed, with its "error".
+
+    Raises:
+        HineusError: the scenes cannot be found, or the settings are wrong.
+    """
+    scenes = find_scenes(request.suite, request.data, request.wanted, request.scenes)
+    if request.out.resolve() == request.data.resolve():
+        raise InputError("Results would lie among the data.", "Name another folder with `--out`.")
+    preset = request.preset or default_preset()
+    for scene in scenes:
+        folder = request.out / request.suite.name / scene.name
+        for sentence in scene.lacking:
+            log.warning("%s: %s", scene.name, sentence)
+        for seed in range(request.seeds):
+            log.info("%s %s, seed %d", request.suite.title, scene.name, seed)
+            yield _run(request, pipeline, listener, scene, preset, folder, seed)
+        yield from _run_peers(request, scene, preset, folder)
+
+
+# ---------------------------------------------------------------- ours
+def _run(
+    request: BenchRequest,
+    pipeline: Sequence[Stage],
+    listener: Listener | None,
+    scene: SuiteScene,
+    preset: str,
+    folder: Path,
+    seed: int,
+) -> dict[str, Any]:
+    place = folder / f"{preset}-seed{seed}"
+    file = place.with_name(f"{place.name}.json")
+    result = {**_heading(request, scene, OURS, preset), "seed": seed}
+    try:
+        if seed:
+            _share_poses(folder / f"{preset}-seed0", place)
+        done = reconstruct(_ask(request, scene, preset, place, seed), pipeline, listener)
+        fresh = {outcome.name for outcome in done.outcomes}
+        made_from = {"scoring": SCORING, **_fingerprints(done.workspace, fresh)}
+        known = _load(file)
+        if known and _is_current(known, made_from, result):
+            return known
+        result |= _costs(done)
+        result["settings"] = _differing(done.config.model_dump(mode="json"))
+        mesh = result_mesh(done.workspace, fresh, place.with_name(f"{place.name}.ply"))
+        result["scores"] = score_result(scene, done.workspace, mesh, fresh, done.device)
+        result["made_from"] = made_from
+    except HineusError as error:
+        return _failed(result, error)
+    _save(file, result)
+    return result
+
+
+def _ask(request: BenchRequest, scene: SuiteScene, preset: str, place: Path, seed: int) -> Request:
+    """The run of one scene; test photos are kept from every stage."""
+    left_out = json.dumps([escape(name) for name in scene.left_out])
+    return Request(
+        photos=scene.photos,
+        workspace=place,
+        masks=scene.masks,
+        no_masks=scene.masks is None,
+        poses=scene.poses,
+        no_poses=scene.poses is None,
+        preset=preset,
+        sets=[*request.sets, f"train.seed={seed}", *([f"ingest.leave_out={left_out}"] if scene.left_out else [])],
+        until=request.until,
+        device=request.device,
+        workers=request.workers,
+    )
+
+
+def _share_poses(first: Path, place: Path) -> None:
+    """Start another seed from the poses of the first: only the training is to differ."""
+    if place.exists() or not (first / "workspace.json").exists():
+        return
+    partial = place.with_name(f"{place.name}.partial")
+    with storage_errors(place, "copying the poses"):
+        shutil.rmtree(partial, ignore_errors=True)
+        for name in POSED:
+            if (first / name).is_dir():
+                shutil.copytree(first / name, partial / name)
+        for name in ("workspace.json", "config.yaml"):
+            shutil.copyfile(first / name, partial / name)
+        partial.rename(place)
+
+
+def _costs(done: Reconstruction) -> dict[str, Any]:
+    stages = [
+        {
+            "name": outcome.name,
+            "wall_s": round(outcome.wall_s, 2),
+            "cpu_s": round(outcome.cpu_s, 2),
+            "peak_rss": outcome.peak_rss,
+        }
+        for outcome in done.outcomes
+    ]
+    return {
+        "device": done.device,
+        "machine": machine(),
+        "wall_s": round(sum(outcome.wall_s for outcome in done.outcomes), 2),
+        "cpu_s": round(sum(outcome.cpu_s for outcome in done.outcomes), 2),
+        # what peers are to be compared with: they start from photos that have poses
+        "wall_after_poses_s": round(sum(o.wall_s for o in done.outcomes if o.name not in POSED), 2),
+        "peak_rss": max(outcome.peak_rss for outcome in done.outcomes),
+        "photos": next((int(o.numbers["images"]) for o in done.outcomes if o.name == "undistort"), None),
+        "stages": stages,
+    }
+
+
+def _differing(settings: dict[str, Any]) -> dict[str, Any]:
+    """The settings that are not the defaults; they are all that a run is made again from."""
+    defaults = flatten(Config().model_dump(mode="json"))
+    return {key: value for key, value in flatten(settings).items() if value != defaults[key]}
+
+
+def _fingerprints(workspace: Workspace, stages: Iterable[str]) -> dict[str, str]:
+    manifests = {name: workspace.published(name) for name in sorted(stages)}
+    return {name: manifest.identity.fingerprint for name, manifest in manifests.items() if manifest}
+
+
+# ---------------------------------------------------------------- peers
+def _run_peers(request: BenchRequest, scene: SuiteScene, preset: str, folder: Path) -> Iterator[dict[str, Any]]:
+    """The peers on the photos and poses of the first seed, which are written out once."""
+    given = folder / "peers" / f"{preset}-photos"
+    shutil.rmtree(given, ignore_errors=True)  # those of an earlier call may be of other poses
+    for peer in request.peers:
+        log.info("%s %s, peer %s", request.suite.title, scene.name, peer.name)
+        result = _heading(request, scene, peer.name, preset)
+        file = folder / f"{preset}-peer-{peer.name}.json"
+        try:
+            workspace = Workspace.open(folder / f"{preset}-seed0")
+            made_from = {"scoring": SCORING, "command": list(peer.given), **_fingerprints(workspace, POSED)}
+            known = _load(file)
+            if known and _is_current(known, made_from, result):
+                yield known
+                continue
+            if not given.exists():
+                export_poses(workspace.root, given, write_colmap)
+            result |= run_peer(peer, given, folder / "peers" / f"{preset}-{peer.name}")
+            mesh = posed_mesh(workspace, folder / "peers" / f"{preset}-{peer.name}" / MESH, file.with_suffix(".ply"))
+            result["scores"] = score_result(scene, workspace, mesh, set(), "cpu")
+            result["made_from"] = made_from
+        except HineusError as error:
+            yield _failed(result, error)
+            continue
+        _save(file, result)
+        yield result
+
+
+# ---------------------------------------------------------------- results
+def _heading(request: BenchRequest, scene: SuiteScene, method: str, preset: str) -> dict[str, Any]:
+    return {
+        "suite": request.suite.name,
+        "scene": scene.name,
+        "method": method,
+        "preset": preset,
+        "asked": dict(text.partition("=")[::2] for text in request.sets) if method == OURS else {},
+        "masks": scene.masks is not None,
+        "known_poses": scene.poses is not None,
+        "lacking": list(scene.lacking),
+    }
+
+
+def _is_current(known: dict[str, Any], made_from: dict[str, Any], heading: dict[str, Any]) -> bool:
+    """Whether a result that was kept is of the same run, and all that can be scored now was scored then."""
+    return known.get("made_from") == made_from and known.get("lacking") == heading["lacking"]
+
+
+def _failed(result: dict[str, Any], error: HineusError) -> dict[str, Any]:
+    log.error("%s, %s: %s %s", result["scene"], result["method"], error.message, error.hint)
+    told = {"type": type(error).__name__, "message": error.message, "hint": error.hint, "exit_code": error.exit_code}
+    return {**result, "error": told}
+
+
+def _save(file: Path, result: dict[str, Any]) -> None:
+    with storage_errors(file.parent, "keeping the result"):
+        artifacts.write_json(file, result)
+
+
+def _load(file: Path) -> dict[str, Any] | None:
+    """A result that was kept; one that cannot be read is made again."""
+    try:
+        return dict(artifacts.read_json(file))
+    except (OSError, ValueError):
+        return None
+
+
+def load_results(out: Path) -> list[dict[str, Any]]:
+    """All results kept under `out`, by suite, scene and file name."""
+    found = (_load(path) for path in sorted(out.glob("*/*/*.json")))
+    return [result for result in found if result and "suite" in result]

@@ -1,0 +1,173 @@
+"""Is this machine fit? Versions, missing libraries, GPU, memory, disk; and what to install."""
+
+from __future__ import annotations
+
+import os
+import platform
+import shutil
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import Literal
+
+from stages.engine.system import SYSTEM_LIBRARIES, apt_line, missing_libraries
+from stages.reconstruct import available_cores
+
+State = Literal["ok", "note", "missing"]
+
+IMPORT_TIME_LIMIT_S = 120
+ENOUGH_MEMORY_GB = 6.0
+ENOUGH_DISK_GB = 5.0
+
+# module -> distribution on PyPI
+REQUIRED = {
+    "numpy": "numpy",
+    "scipy": "scipy",
+    "PIL": "pillow",
+    "pillow_heif": "pillow-heif",
+    "cv2": "opencv-python-headless",
+    "torch": "torch",
+    "numba": "numba",
+    "pycolmap": "pycolmap",
+    "open3d": "open3d",
+    "pymeshlab": "pymeshlab",
+    "trimesh": "trimesh",
+    "manifold3d": "manifold3d",
+    "xatlas": "xatlas",
+    "jinja2": "jinja2",
+    "pxr": "usd-core",
+}
+OPTIONAL = {
+    "rawpy": ("rawpy", "camera raw files are left out"),
+    "coacd": ("coacd", "no convex pieces (export.collision)"),
+}
+
+# PyMeshLab imports even where the libraries of its plug-ins are missing; then its filters are not there.
+_PROBES = {
+    "pymeshlab": "import pymeshlab; assert 'meshing_decimation_quadric_edge_collapse' in pymeshlab.filter_list(), "
+    "'its decimation plug-in did not load'",
+}
+_GPU_PROBE = (
+    "import torch; print(torch.cuda.get_device_name(0), f'{torch.cuda.mem_get_info(0)[1] / 1e9:.0f} GB')"
+    " if torch.cuda.is_available() else print('none: '"
+    " + ('this torch was built without CUDA' if torch.version.cuda is None else 'no usable device'))"
+)
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line of the doctor's: what was looked at, what was found, and what to do where something lacks."""
+
+    what: str
+    state: State
+    found: str
+    advice: str = ""
+
+
+def examine(folder: Path) -> list[Finding]:
+    """Look at everything; `folder` is where workspaces would lie."""
+    # Each library is imported in a process of its own: one that crashes must not take the doctor along.
+    with ThreadPoolExecutor(max_workers=2) as pool:
+        gpu = pool.submit(_gpu)
+        packages = list(pool.map(lambda item: _package(*item), REQUIRED.items()))
+    optional = [_optional(module, *rest) for module, rest in OPTIONAL.items()]
+    broken = any(finding.state == "missing" for finding in packages)
+    return [
+        Finding("hineus", "ok", f"{_version('hineus') or 'not installed'} in {Path(__file__).parents[1]}"),
+        Finding("Python", "ok", f"{platform.python_version()} ({sys.executable})"),
+        Finding("platform", "ok", platform.platform()),
+        *packages,
+        *optional,
+        _system_libraries(broken),
+        gpu.result(),
+        _cores(),
+        _memory(),
+        _disk(folder),
+    ]
+
+
+def _package(module: str, distribution: str) -> Finding:
+    version = _version(distribution)
+    problem = _probe(_PROBES.get(module, f"import {module}"))
+    if problem is None:
+        return Finding(module, "ok", version or "version unknown")
+    advice = f"pip install {distribution}" if version is None else "see the system libraries below"
+    return Finding(module, "missing", problem, advice)
+
+
+def _optional(module: str, distribution: str, without: str) -> Finding:
+    version = _version(distribution)
+    if version is not None:
+        return Finding(module, "ok", version)
+    return Finding(module, "note", f"not installed: {without}", f"pip install {distribution}")
+
+
+def _system_libraries(broken: bool) -> Finding:
+    missing = missing_libraries()
+    if not missing:
+        return Finding("system libraries", "ok", f"all {len(SYSTEM_LIBRARIES)} found")
+    state: State = "missing" if broken else "note"
+    return Finding("system libraries", state, f"not found: {', '.join(missing)}", apt_line(missing))
+
+
+def _gpu() -> Finding:
+    try:
+        found = _python(_GPU_PROBE)
+    except (OSError, subprocess.TimeoutExpired) as error:
+        return Finding("GPU", "note", f"unknown: {error}")
+    name = found.stdout.strip() or "unknown: torch does not import"
+    if name.startswith(("none", "unknown")):
+        return Finding("GPU", "note", name, "everything runs on the CPU, with smaller settings")
+    return Finding("GPU", "ok", name)
+
+
+def _cores() -> Finding:
+    usable, present = available_cores(), os.cpu_count() or 1
+    return Finding("CPU cores", "ok", f"{usable} usable of {present}")
+
+
+def _memory() -> Finding:
+    import psutil
+
+    memory = psutil.virtual_memory()
+    total, free = memory.total / 1e9, memory.available / 1e9
+    found = f"{free:.1f} GB available of {total:.1f} GB"
+    if free < ENOUGH_MEMORY_GB:
+        return Finding("memory", "note", found, f"{ENOUGH_MEMORY_GB:.0f} GB is comfortable; try `--preset tiny`")
+    return Finding("memory", "ok", found)
+
+
+def _disk(folder: Path) -> Finding:
+    free = shutil.disk_usage(folder).free / 1e9
+    found = f"{free:.1f} GB free at {folder}"
+    if free < ENOUGH_DISK_GB:
+        return Finding("disk", "note", found, f"a workspace may take up to {ENOUGH_DISK_GB:.0f} GB")
+    return Finding("disk", "ok", found)
+
+
+def _version(distribution: str) -> str | None:
+    try:
+        return metadata.version(distribution)
+    except metadata.PackageNotFoundError:
+        return None
+
+
+def _probe(program: str) -> str | None:
+    """The last line of what went wrong in running `program`, None where nothing did."""
+    try:
+        result = _python(program)
+    except subprocess.TimeoutExpired:
+        return f"did not load within {IMPORT_TIME_LIMIT_S} s"
+    if result.returncode == 0:
+        return None
+    lines = result.stderr.strip().splitlines()
+    return lines[-1] if lines else f"loading it ended with exit code {result.returncode}"
+
+
+def _python(program: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=IMPORT_TIME_LIMIT_S, check=False
+    )

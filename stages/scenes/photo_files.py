@@ -1,0 +1,92 @@
+"""The files of a made-up set: photos as a camera writes them, and, last, the truth that says how they were made."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping, Sequence
+from datetime import datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from stages.evaluation.protocols.known_object import TRUTH_CAMERAS
+
+OPENGL_FROM_OPENCV = np.diag([1.0, -1, -1, 1])
+
+
+def srgb(linear: np.ndarray) -> np.ndarray:
+    """The tone curve of sRGB for linear values in [0, 1]."""
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+
+
+def photo_exif(picture: Any, index: int, model: str, focal_35mm: int) -> Any:
+    """What a camera would note: maker, model, time, and the focal length SfM starts from (35 mm equivalent)."""
+    from PIL import ExifTags
+
+    exif = picture.getexif()
+    taken = datetime(2025, 6, 1, 12, 0, 0) + timedelta(seconds=5 * index)
+    exif[ExifTags.Base.Make] = "HiNeuS"
+    exif[ExifTags.Base.Model] = model
+    exif[ExifTags.Base.DateTime] = taken.strftime("%Y:%m:%d %H:%M:%S")
+    details = exif.get_ifd(ExifTags.IFD.Exif)
+    details[ExifTags.Base.FocalLength] = float(focal_35mm)
+    details[ExifTags.Base.FocalLengthIn35mmFilm] = focal_35mm
+    return exif
+
+
+def write_truth(
+    folder: Path,
+    names: Sequence[str],
+    cam_from_world: np.ndarray,
+    size: tuple[int, int],
+    focal: float,
+    made_with: Mapping[str, Any],
+    notes: Sequence[Mapping[str, Any]] | None = None,
+) -> None:
+    """Write `transforms.json`, which says that the set is complete.
+
+    Args:
+        names: of the photos, relative to the folder.
+        cam_from_world: [N, 4, 4]; each is written as `transform_matrix` (camera to world, OpenGL axes), and as
+            `w2c_opencv` as it is.
+        focal: pixels; the principal point is the middle.
+        made_with: the recipe.
+        notes: more to say of each photo.
+    """
+    frames = [
+        {
+            "file_path": name,
+            **note,
+            "transform_matrix": (np.linalg.inv(pose) @ OPENGL_FROM_OPENCV).tolist(),
+            "w2c_opencv": pose.tolist(),
+        }
+        for name, pose, note in zip(names, cam_from_world, notes or [{}] * len(names), strict=True)
+    ]
+    width, height = size
+    truth = {
+        "camera_model": "PINHOLE",
+        "w": width,
+        "h": height,
+        "fl_x": focal,
+        "fl_y": focal,
+        "cx": width / 2,
+        "cy": height / 2,
+        "made_with": made_with,
+        "frames": frames,
+    }
+    partial = (folder / TRUTH_CAMERAS).with_suffix(".partial")
+    partial.write_text(json.dumps(truth, indent=1) + "\n", encoding="utf-8")
+    os.replace(partial, folder / TRUTH_CAMERAS)
+
+
+def is_complete(folder: Path, made_with: Mapping[str, Any]) -> bool:
+    """Whether a set made with this recipe is there, to the last photo."""
+    try:
+        truth = json.loads((folder / TRUTH_CAMERAS).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return False
+    return truth.get("made_with") == made_with and all(
+        (folder / frame["file_path"]).is_file() for frame in truth["frames"]
+    )
