@@ -85,7 +85,7 @@ def test_sphere_tracing_meets_the_same_minimum_as_dense_samples():
 
 
 def paths(start: tuple[float, float, float], end: tuple[float, float, float], count: int = 1):
-    return torch.tensor([start]).expand(count, 3).contiguous(), torch.tensor([end]).expand(count, 3).contiguous()
+    return tuple(torch.tensor([place], dtype=torch.float32).expand(count, 3).contiguous() for place in (start, end))
 
 
 @pytest.mark.parametrize(("num_samples", "mean"), [(16, 0.957), (64, 0.837), (256, 0.491), (1024, 0.058)])

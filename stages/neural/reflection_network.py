@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from stages.neural.mlp import mlp, spherical_harmonics
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
 
 # Reflectivity before training: compensation has to earn its place.
 _INITIAL_REFLECTIVITY = 0.02
@@ -23,13 +28,15 @@ class ReflectionNetwork(nn.Module):
         head.weight.data *= 0.1
         head.bias.data.fill_(torch.logit(torch.tensor(_INITIAL_REFLECTIVITY)).item())
 
-    def forward(self, points: torch.Tensor, normals: torch.Tensor, directions: torch.Tensor) -> torch.Tensor:
-        """sRGB colour g [Q, 3] in [0, 1] of x_r [Q, 3] with unit n_r, seen along the reflected directions v_r."""
+    def forward(
+        self, points: Float[Tensor, "q 3"], normals: Float[Tensor, "q 3"], directions: Float[Tensor, "q 3"]
+    ) -> Float[Tensor, "q 3"]:
+        """sRGB colour g in [0, 1] of x_r with unit n_r, seen along the reflected directions v_r."""
         inputs = [points, normals, spherical_harmonics(directions)]
         return torch.sigmoid(self.color_layers(torch.cat(inputs, 1)))
 
-    def reflectivity(self, features: torch.Tensor, facing: torch.Tensor) -> torch.Tensor:
-        """rho [Q] in (0, 1) at x_0, from its geometry features [Q, G] and facing ratio n.v [Q]; 0.02 before training.
+    def reflectivity(self, features: Float[Tensor, "q g"], facing: Float[Tensor, " q"]) -> Float[Tensor, " q"]:
+        """rho in (0, 1) at x_0, from its geometry features and facing ratio n.v; 0.02 before training.
 
         Not in the paper, where whatever faces another part of the object is a perfect mirror.
         """

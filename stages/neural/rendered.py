@@ -1,17 +1,22 @@
 """What a batch of rays shows: what the renderer gives and the terms look at.
 
-Shapes: R rays, K samples a ray, N = R K points, P bins of the proposal network.
+Shapes: r rays, k samples a ray, p edges of the proposal network's bins, e extra points.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import torch
+from torch import Tensor
 
 from stages.neural.rendering import composite
 from stages.neural.training_photos import RayBatch
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
 
 # Rays more opaque than this count as having met a surface.
 OPAQUE = 0.5
@@ -23,38 +28,38 @@ class Rendered:
 
     Attributes:
         batch: the rays.
-        colors: [R, 3] sRGB with reflections and the background behind, before exposure.
-        opacity: [R] of the surface alone.
-        weights, distances: [R, K] rendering weights of the samples and where they lie on the ray.
-        points: [N, 3] the samples.
-        gradients: [N, 3] of the SDF at the samples.
-        features: [N, G] geometry features at the samples.
-        reflected: [R] part of the colour that came from reflections of the object itself.
-        proposal: edges [R, P + 1] and weights [R, P] of the proposal network, or None where a grid guides the samples.
-        extra_sdf, extra_gradients: f [E] and its gradients [E, 3] at the extra points that were asked for.
+        colors: sRGB with reflections and the background behind, before exposure.
+        opacity: of the surface alone.
+        weights, distances: rendering weights of the samples and where they lie on the ray.
+        points: the samples.
+        gradients: of the SDF at the samples.
+        features: geometry features at the samples.
+        reflected: part of the colour that came from reflections of the object itself.
+        proposal: edges and weights of the proposal network, or None where a grid guides the samples.
+        extra_sdf, extra_gradients: f and its gradients at the extra points that were asked for.
     """
 
     batch: RayBatch
-    colors: torch.Tensor
-    opacity: torch.Tensor
-    weights: torch.Tensor
-    distances: torch.Tensor
-    points: torch.Tensor
-    gradients: torch.Tensor
-    features: torch.Tensor
-    reflected: torch.Tensor
-    proposal: tuple[torch.Tensor, torch.Tensor] | None
-    extra_sdf: torch.Tensor
-    extra_gradients: torch.Tensor
+    colors: Float[Tensor, "r 3"]
+    opacity: Float[Tensor, " r"]
+    weights: Float[Tensor, "r k"]
+    distances: Float[Tensor, "r k"]
+    points: Float[Tensor, "r*k 3"]
+    gradients: Float[Tensor, "r*k 3"]
+    features: Float[Tensor, "r*k g"]
+    reflected: Float[Tensor, " r"]
+    proposal: tuple[Float[Tensor, "r p"], Float[Tensor, "r p-1"]] | None
+    extra_sdf: Float[Tensor, " e"]
+    extra_gradients: Float[Tensor, "e 3"]
 
-    def mean(self, values: torch.Tensor) -> torch.Tensor:
-        """Mean [R, D] of values [N, D] over each ray's surface; means something only where the ray is opaque."""
+    def mean(self, values: Float[Tensor, "n d"]) -> Float[Tensor, "r d"]:
+        """Mean of values of the samples over each ray's surface; means something only where the ray is opaque."""
         summed = composite(self.weights, values.view(*self.weights.shape, values.shape[-1]))
         return summed / self.opacity.clamp(min=1e-3)[:, None]
 
     @cached_property
-    def surface(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Mean surface point x_0 and unit normal n_0 of each ray [R, 3], without gradient.
+    def surface(self) -> tuple[Float[Tensor, "r 3"], Float[Tensor, "r 3"]]:
+        """Mean surface point x_0 and unit normal n_0 of each ray, without gradient.
 
         They mean something only where the ray is opaque.
         """

@@ -5,7 +5,10 @@ Shapes: R rays, K samples a ray, N = R K points, Q rays that hit something, P bi
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import torch
+from torch import Tensor
 
 from configs.training import TrainParams
 from stages.neural import schedules
@@ -18,6 +21,9 @@ from stages.neural.sampling import SdfCache, importance_distances, stratified
 from stages.neural.schedules import Moment
 from stages.neural.terms import Terms
 from stages.neural.training_photos import RayBatch
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
 
 # Samples that weigh less than this get no colour: together they change a pixel by less than one grey level.
 _COLOR_THRESHOLD = 2e-4
@@ -41,7 +47,7 @@ class Renderer:
         """
         density, schedule, grid = self.params.density, self.params.schedule, self.fields.shape.sdf_grid
         levels = schedules.active_levels(progress, grid.levels, schedule.start_levels, schedule.coarse_until)
-        scale: torch.Tensor | float
+        scale: Tensor | float
         if self.fields.log_scale is not None:
             scale = torch.exp(self.fields.log_scale) + 0.1 * grid.voxel_size()
         else:
@@ -50,9 +56,9 @@ class Renderer:
         return Moment(progress, scale, levels, grid.voxel_size(levels))
 
     def render(
-        self, batch: RayBatch, moment: Moment, extra: torch.Tensor, generator: torch.Generator | None
+        self, batch: RayBatch, moment: Moment, extra: Float[Tensor, "e 3"], generator: torch.Generator | None
     ) -> Rendered:
-        """Render rays and evaluate the SDF at extra points [E, 3] in the same pass.
+        """Render rays and evaluate the SDF at extra points in the same pass.
 
         Without a generator samples lie at the centres of their strata: the same rays give the same colours.
         """
@@ -76,8 +82,8 @@ class Renderer:
 
     def _sample(
         self, batch: RayBatch, moment: Moment, generator: torch.Generator | None
-    ) -> tuple[torch.Tensor, tuple[torch.Tensor, torch.Tensor] | None]:
-        """Distances [R, K] of the samples, and the proposal network's histogram where it made them."""
+    ) -> tuple[Float[Tensor, "r k"], tuple[Float[Tensor, "r p"], Float[Tensor, "r p-1"]] | None]:
+        """Distances of the samples, and the proposal network's histogram where it made them."""
         params = self.params.sampling
         if self.fields.proposal is None:
             return importance_distances(
@@ -93,14 +99,14 @@ class Renderer:
     def _colors(
         self,
         batch: RayBatch,
-        weights: torch.Tensor,
-        points: torch.Tensor,
-        gradients: torch.Tensor,
-        features: torch.Tensor,
-    ) -> torch.Tensor:
-        """Colour [R, 3] of the samples that weigh enough, weighted and summed over each ray.
+        weights: Float[Tensor, "r k"],
+        points: Float[Tensor, "r*k 3"],
+        gradients: Float[Tensor, "more 3"],
+        features: Float[Tensor, "more g"],
+    ) -> Float[Tensor, "r 3"]:
+        """Colour of the samples that weigh enough, weighted and summed over each ray.
 
-        The first N of the gradients [N + E, 3] and features [N + E, G] belong to the samples.
+        The first of the gradients and features belong to the samples, the others to the extra points.
         """
         num_rays, num_samples = weights.shape
         heavy = weights.detach().view(-1) > _COLOR_THRESHOLD
@@ -120,10 +126,10 @@ class Renderer:
         self,
         background: BackgroundNetwork,
         batch: RayBatch,
-        transmittance: torch.Tensor,
+        transmittance: Float[Tensor, " r"],
         generator: torch.Generator | None,
-    ) -> torch.Tensor:
-        """Background colour [R, 3] weighted by the transmittance [R] that the surface leaves."""
+    ) -> Float[Tensor, "r 3"]:
+        """Background colour weighted by the transmittance that the surface leaves."""
         shining = transmittance.detach() > _BACKGROUND_THRESHOLD
         if fixed_shapes(transmittance.device):
             color = self.background_color(background, batch.origins, batch.directions, generator)
@@ -136,11 +142,11 @@ class Renderer:
     def background_color(
         self,
         background: BackgroundNetwork,
-        origins: torch.Tensor,
-        directions: torch.Tensor,
+        origins: Float[Tensor, "q 3"],
+        directions: Float[Tensor, "q 3"],
         generator: torch.Generator | None,
-    ) -> torch.Tensor:
-        """What rays [Q] see of the background, colours [Q, 3].
+    ) -> Float[Tensor, "q 3"]:
+        """What rays see of the background, sRGB.
 
         Samples are even in the inverse of their distance from the scene's centre, from the unit sphere outwards
         (NeRF++), so that half of them look at what lies within twice the region's radius.

@@ -6,14 +6,19 @@ Shapes: M lines of sight, S of them drawn for a step.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from configs.training import LossParams
 from stages.geometry.cameras import PosedScene
 from stages.neural import losses
 from stages.neural.sampling import intersect_unit_sphere
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float
 
 
 @dataclass(frozen=True)
@@ -21,22 +26,24 @@ class Sightings:
     """Which photo saw which SfM point: M lines of sight that are free up to the surface at their end.
 
     Attributes:
-        points: [M, 3] the SfM point at the end of each line, inside the region of interest.
-        directions: [M, 3] unit, from the camera to the point.
-        free: [M] length of the line inside the unit sphere before the point.
-        weights: [M] in [0, 1].
+        points: the SfM point at the end of each line, inside the region of interest.
+        directions: unit, from the camera to the point.
+        free: length of the line inside the unit sphere before the point.
+        weights: in [0, 1].
     """
 
-    points: torch.Tensor
-    directions: torch.Tensor
-    free: torch.Tensor
-    weights: torch.Tensor
+    points: Float[Tensor, "m 3"]
+    directions: Float[Tensor, "m 3"]
+    free: Float[Tensor, " m"]
+    weights: Float[Tensor, " m"]
 
     @staticmethod
-    def from_scene(scene: PosedScene, device: torch.device | str, training: np.ndarray | None = None) -> Sightings:
+    def from_scene(
+        scene: PosedScene, device: torch.device | str, training: Bool[np.ndarray, " i"] | None = None
+    ) -> Sightings:
         """Sightings of points inside the unit sphere; weight 1 / (1 + e^2), e the reprojection error in pixels.
 
-        Of the photos where `training` [I] bool is true only, if it is given.
+        Of the photos where `training` is true only, if it is given.
         """
         inside = np.linalg.norm(scene.points, axis=1) < 0.98
         kept = inside[scene.observations[:, 1]]
@@ -52,8 +59,10 @@ class Sightings:
         lines = (points, directions, (distances - entry).clamp(min=0), weights)
         return Sightings(*(tensor.to(device) for tensor in lines))
 
-    def draw(self, count: int, step: float, generator: torch.Generator) -> tuple[torch.Tensor, torch.Tensor]:
-        """Places [4 S, 3] along S random sightings, and the sightings' weights [S]; S is at most `count`.
+    def draw(
+        self, count: int, step: float, generator: torch.Generator
+    ) -> tuple[Float[Tensor, "places 3"], Float[Tensor, " s"]]:
+        """Four places along each of S random sightings, and the sightings' weights; S is at most `count`.
 
         First the points, then places a `step` (scene units) behind them, a step before them, and somewhere on the free
         line of sight.
@@ -68,8 +77,8 @@ class Sightings:
         return torch.cat([points, points + offset, points - offset, points - free]), self.weights[chosen]
 
 
-def sighting_loss(sdf: torch.Tensor, weights: torch.Tensor, params: LossParams) -> torch.Tensor:
-    """Mean error of f [4 S] at the places of `Sightings.draw`: 0 at the points, solid behind them, free before."""
+def sighting_loss(sdf: Float[Tensor, " places"], weights: Float[Tensor, " s"], params: LossParams) -> Float[Tensor, ""]:
+    """Mean error of f at the places of `Sightings.draw`: 0 at the points, solid behind them, free before."""
     on_point, behind, front, free = sdf.view(4, len(weights))
     margin = 0.25 * params.sparse_step
     error = (

@@ -9,21 +9,25 @@ the rendering (512 rays, 48 photos, 64 samples). Space outside the unit sphere i
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from stages.neural.acceleration import takes_kernel
 from stages.neural.sampling import SdfCache, free_outside
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
 
 # Paper: sharpness of the sigmoid in eq. sdf_visibility, per scene unit, and the visibility from which a view counts.
 SHARPNESS = 100.0
 VISIBLE = 0.9
 
 
-def sdf_visibility_literal(path_sdf: torch.Tensor, sharpness: float = SHARPNESS) -> torch.Tensor:
-    """V = prod_k sigmoid(beta f(x_k)) [...] over samples [..., K] on the path from a camera to a surface point.
+def sdf_visibility_literal(path_sdf: Float[Tensor, "*any k"], sharpness: float = SHARPNESS) -> Float[Tensor, "*any"]:
+    """V = prod_k sigmoid(beta f(x_k)) over samples on the path from a camera to a surface point.
 
     The paper's eq. sdf_visibility and Alg. 1 as written. The samples near the surface have f ~ 0 and count 1/2 each,
     so V shrinks as K grows, also for points in plain view.
@@ -33,14 +37,14 @@ def sdf_visibility_literal(path_sdf: torch.Tensor, sharpness: float = SHARPNESS)
 
 @torch.no_grad()
 def visibility_literal(
-    sdf: Callable[[torch.Tensor], torch.Tensor],
-    points: torch.Tensor,
-    centers: torch.Tensor,
+    sdf: Callable[[Tensor], Tensor],
+    points: Float[Tensor, "p 3"],
+    centers: Float[Tensor, "p 3"],
     num_samples: int,
     generator: torch.Generator | None,
     sharpness: float = SHARPNESS,
-) -> torch.Tensor:
-    """V [P] of surface points [P, 3] from camera centres [P, 3]: the paper's Alg. 1 as written.
+) -> Float[Tensor, " p"]:
+    """V of surface points from camera centres: the paper's Alg. 1 as written.
 
     `sdf` gives f [...] at points [..., 3]: the network, as in the paper, or the cached grid for a fraction of the time.
 
@@ -53,8 +57,8 @@ def visibility_literal(
     return sdf_visibility_literal(path_sdf, sharpness)
 
 
-def sdf_visibility(min_sdf: torch.Tensor, sharpness: float = SHARPNESS) -> torch.Tensor:
-    """V = sigmoid(beta (min_k f(x_k) + 3 / beta)) [...] from the smallest f on a path that ends short of the surface.
+def sdf_visibility(min_sdf: Float[Tensor, "*any"], sharpness: float = SHARPNESS) -> Float[Tensor, "*any"]:
+    """V = sigmoid(beta (min_k f(x_k) + 3 / beta)) from the smallest f on a path that ends short of the surface.
 
     About 0.95 where the path just touches a surface and more in free space, whatever K; above 0.9 from
     min f = -0.8 / beta on, and 0.05 at -6 / beta.
@@ -62,8 +66,8 @@ def sdf_visibility(min_sdf: torch.Tensor, sharpness: float = SHARPNESS) -> torch
     return torch.sigmoid(sharpness * min_sdf + 3)
 
 
-def path_margin(facing: torch.Tensor, scale: float, voxel: float) -> torch.Tensor:
-    """How far from the surface a path starts [...], so that the surface itself does not hide the point.
+def path_margin(facing: Float[Tensor, "*any"], scale: float, voxel: float) -> Float[Tensor, "*any"]:
+    """How far from the surface a path starts, so that the surface itself does not hide the point.
 
     delta = max(4 b, 2 h) / max(n.d, 0.2), scene units: a path that leaves at a grazing angle needs more length to gain
     the same height over the surface. b Laplace scale, h voxel size, n.d cosine between normal and path.
@@ -73,13 +77,13 @@ def path_margin(facing: torch.Tensor, scale: float, voxel: float) -> torch.Tenso
 
 def smallest_sdf_on_paths(
     cache: SdfCache,
-    points: torch.Tensor,
-    targets: torch.Tensor,
-    start: torch.Tensor,
+    points: Float[Tensor, "p 3"],
+    targets: Float[Tensor, "p 3"],
+    start: Float[Tensor, " p"],
     num_samples: int = 32,
     sharpness: float = SHARPNESS,
-) -> torch.Tensor:
-    """Smallest cached f [P] between distance `start` [P] from points [P, 3] and targets [P, 3] or the unit sphere.
+) -> Float[Tensor, " p"]:
+    """Smallest cached f between distance `start` from points and targets or the unit sphere.
 
     On the CPU a kernel walks the paths by sphere tracing and stops at -10 / sharpness, where V is 1e-3 and the rest of
     the path cannot matter; elsewhere they are sampled evenly.
@@ -120,10 +124,12 @@ class MeshVisibility:
         self.scene: Any = None
 
     @torch.no_grad()
-    def __call__(self, points: torch.Tensor, centers: torch.Tensor, start: torch.Tensor) -> torch.Tensor:
-        """V [P] of points [P, 3] from camera centres [P, 3]: 0 where a face crosses the path between them, else 1.
+    def __call__(
+        self, points: Float[Tensor, "p 3"], centers: Float[Tensor, "p 3"], start: Float[Tensor, " p"]
+    ) -> Float[Tensor, " p"]:
+        """V of points from camera centres: 0 where a face crosses the path between them, else 1.
 
-        The path leaves out the distance `start` [P] (`path_margin`) at the point, or its own faces would hide it.
+        The path leaves out the distance `start` (`path_margin`) at the point, or its own faces would hide it.
         """
         o3d = self.open3d
         if self.version != self.cache.values._version:  # torch counts the writes to a tensor

@@ -8,7 +8,10 @@ Shapes: R rays, K samples a ray, N = R K points.
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import torch
+from torch import Tensor
 
 from configs.training import TrainParams
 from stages.neural.fields import Fields
@@ -21,6 +24,9 @@ from stages.neural.terms.planar import Planar
 from stages.neural.terms.reflection import Reflection
 from stages.neural.terms.term import Term
 from stages.neural.training_photos import Photos
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
 
 KINDS: tuple[type[Term], ...] = (Ambiguity, Reflection, Planar, Eikonal)
 
@@ -44,8 +50,8 @@ class Terms:
             rendered = term.recolored(rendered, moment, generator)
         return rendered
 
-    def color_weight(self, rendered: Rendered, exposed: torch.Tensor, moment: Moment) -> torch.Tensor:
-        """Weight [R] of each ray's colour error."""
+    def color_weight(self, rendered: Rendered, exposed: Float[Tensor, "r 3"], moment: Moment) -> Float[Tensor, " r"]:
+        """Weight of each ray's colour error."""
         weight = torch.ones_like(rendered.batch.leave)
         for term in self.all:
             if (factor := term.color_weight(rendered, exposed, moment)) is not None:
@@ -53,16 +59,16 @@ class Terms:
         return weight
 
     def eikonal_weight(
-        self, rendered: Rendered, ray_error: torch.Tensor, trust: torch.Tensor, moment: Moment
-    ) -> torch.Tensor:
-        """Weight [N] of the Eikonal error at the samples."""
+        self, rendered: Rendered, ray_error: Float[Tensor, " r"], trust: Float[Tensor, " r"], moment: Moment
+    ) -> Float[Tensor, " n"]:
+        """Weight of the Eikonal error at the samples."""
         weight = torch.ones_like(rendered.weights).view(-1)
         for term in self.all:
             if (factor := term.eikonal_weight(rendered, ray_error, trust, moment)) is not None:
                 weight = weight * factor
         return weight
 
-    def losses(self, rendered: Rendered, moment: Moment) -> dict[str, tuple[float, torch.Tensor]]:
+    def losses(self, rendered: Rendered, moment: Moment) -> dict[str, tuple[float, Float[Tensor, ""]]]:
         """Weight and loss of each term that has one, by name."""
         found = ((term, term.loss(rendered, moment)) for term in self.all)
         return {term.name: (term.weight, loss) for term, loss in found if loss is not None}

@@ -8,8 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import torch
+from torch import Tensor
 
 from stages.errors import ReconstructionError, SystemRequirementError
 from stages.neural.fields import points_at_a_time
@@ -26,6 +28,9 @@ from stages.neural.visibility import (
     visibility_literal,
 )
 
+if TYPE_CHECKING:
+    from jaxtyping import Float, Int
+
 # Keeps the colour covariance invertible where photos are nearly grey: one 8-bit level, squared.
 COLOR_VARIANCE_FLOOR = (1 / 255) ** 2
 # A covariance whose smallest eigenvalue is this small a part of the largest has no inverse worth the name.
@@ -36,8 +41,8 @@ _SQUARED_DISTANCE_FLOOR = 1e-12
 
 def color_precision(
     photos: Photos, generator: torch.Generator, num_pixels: int = 100_000, floor: float = COLOR_VARIANCE_FLOOR
-) -> torch.Tensor:
-    """Inverse [3, 3] of the empirical colour covariance over the training photos (paper: Sigma^-1).
+) -> Float[Tensor, "3 3"]:
+    """Inverse of the empirical colour covariance over the training photos (paper: Sigma^-1).
 
     `floor` is added to each channel's variance. The paper adds none (0): photos in shades of one colour then have no
     inverse.
@@ -57,8 +62,10 @@ def color_precision(
     return torch.linalg.inv(covariance).float()
 
 
-def mahalanobis(colors: torch.Tensor, others: torch.Tensor, precision: torch.Tensor) -> torch.Tensor:
-    """D_M = sqrt((C_i - C_j)^T Sigma^-1 (C_i - C_j)) [...] for colours [..., 3] (paper eq. ambiguity_factor).
+def mahalanobis(
+    colors: Float[Tensor, "*#any 3"], others: Float[Tensor, "*any 3"], precision: Float[Tensor, "3 3"]
+) -> Float[Tensor, "*any"]:
+    """D_M = sqrt((C_i - C_j)^T Sigma^-1 (C_i - C_j)) for colours (paper eq. ambiguity_factor).
 
     At least 1e-6, without a gradient there. The paper's C_i is the rendered colour, and D_M pulls at it.
     """
@@ -67,8 +74,8 @@ def mahalanobis(colors: torch.Tensor, others: torch.Tensor, precision: torch.Ten
     return squared.clamp(min=_SQUARED_DISTANCE_FLOOR).sqrt()
 
 
-def ambiguity(visibility: torch.Tensor, distance: torch.Tensor) -> torch.Tensor:
-    """lambda [R] = mean over the visible views of V_j D_M(C_i, C_j), V and D_M [R, I] (paper eq. ambiguity_factor).
+def ambiguity(visibility: Float[Tensor, "r i"], distance: Float[Tensor, "r i"]) -> Float[Tensor, " r"]:
+    """lambda = mean over the visible views of V_j D_M(C_i, C_j) (paper eq. ambiguity_factor).
 
     A view is visible when V_j > 0.9. Zero where no view is.
     """
@@ -76,16 +83,16 @@ def ambiguity(visibility: torch.Tensor, distance: torch.Tensor) -> torch.Tensor:
     return (seen * visibility * distance).sum(1) / seen.sum(1).clamp(min=1)
 
 
-def trust_literal(lambda_ambiguity: torch.Tensor) -> torch.Tensor:
-    """Weight of each ray's colour error [R]: 1 / (1 + lambda) (paper eq. loss_without_ambiguity as written).
+def trust_literal(lambda_ambiguity: Float[Tensor, " r"]) -> Float[Tensor, " r"]:
+    """Weight of each ray's colour error: 1 / (1 + lambda) (paper eq. loss_without_ambiguity as written).
 
     Differentiable: where lambda comes from rendered colours, the loss can also be lowered by raising lambda.
     """
     return 1 / (1 + lambda_ambiguity)
 
 
-def trust(lambda_ambiguity: torch.Tensor) -> torch.Tensor:
-    """Weight of each ray's colour error [R]: sg[1 / (1 + lambda)], scaled to mean 1 (paper eq. loss_without_ambiguity).
+def trust(lambda_ambiguity: Float[Tensor, " r"]) -> Float[Tensor, " r"]:
+    """Weight of each ray's colour error: sg[1 / (1 + lambda)], scaled to mean 1 (paper eq. loss_without_ambiguity).
 
     The mean is held, so that doubt in some rays does not shift the balance against the other terms. Detached: else the
     error could be lowered by raising the doubt.
@@ -98,12 +105,14 @@ def trust(lambda_ambiguity: torch.Tensor) -> torch.Tensor:
 class Ambiguity(Term):
     """The weight of each ray's colour error."""
 
-    def color_weight(self, rendered: Rendered, exposed: torch.Tensor, moment: Moment) -> torch.Tensor | None:
-        """Weight [R] of each ray's colour error, 1 / (1 + lambda_ambiguity) (paper eq. loss_without_ambiguity).
+    def color_weight(
+        self, rendered: Rendered, exposed: Float[Tensor, "r 3"], moment: Moment
+    ) -> Float[Tensor, " r"] | None:
+        """Weight of each ray's colour error, 1 / (1 + lambda_ambiguity) (paper eq. loss_without_ambiguity).
 
         The stable form compares photos with photos, carries no gradient, has mean 1 over the surface, and is 1 before
         `start`: early on, a pattern seen at a wrong depth would pass for a reflection. The paper's form
-        compares the rendered colours `exposed` [R, 3] with the photos, from the first step.
+        compares the rendered colours `exposed` with the photos, from the first step.
         """
         params, batch = self.params.terms.ambiguity, rendered.batch
         if params.form == "off" or (params.form == "stable" and moment.progress < params.start):
@@ -121,8 +130,8 @@ class Ambiguity(Term):
         return weights.index_copy(0, hit, trust(ambiguity(seen, distance)))
 
     @cached_property
-    def color_precision(self) -> torch.Tensor:
-        """The photos' inverse colour covariance [3, 3], from a draw of its own."""
+    def color_precision(self) -> Float[Tensor, "3 3"]:
+        """The photos' inverse colour covariance, from a draw of its own."""
         assert self.photos is not None
         generator = torch.Generator(device=self.device).manual_seed(self.params.seed)
         floor = 0.0 if self.params.terms.ambiguity.form == "paper" else COLOR_VARIANCE_FLOOR
@@ -146,8 +155,10 @@ class Ambiguity(Term):
             ) from error
 
     @torch.no_grad()
-    def _views(self, hit: torch.Tensor, rendered: Rendered, moment: Moment) -> tuple[torch.Tensor, torch.Tensor]:
-        """What every photo shows at the surface points of rays `hit` [M]: colours [M, I, 3], visibility factor [M, I].
+    def _views(
+        self, hit: Int[Tensor, " m"], rendered: Rendered, moment: Moment
+    ) -> tuple[Float[Tensor, "m i 3"], Float[Tensor, "m i"]]:
+        """What every photo shows at the surface points of rays `hit`: colours, visibility factor.
 
         The factor is 0 in the ray's own photo, in those not trained on, and where the point is out of frame.
         """
@@ -178,14 +189,14 @@ class Ambiguity(Term):
         seen[ray, view] = factor
         return colors, seen
 
-    def _path_margin(self, facing: torch.Tensor, moment: Moment) -> torch.Tensor:
-        """How far from the surface the paths [...] start that leave it at the cosines `facing` [...]."""
+    def _path_margin(self, facing: Float[Tensor, "*any"], moment: Moment) -> Float[Tensor, "*any"]:
+        """How far from the surface the paths start that leave it at the cosines `facing`."""
         return path_margin(facing, moment.width, max(moment.voxel, self.cache.cell / 2))
 
-    def _network_sdf(self, moment: Moment) -> Callable[[torch.Tensor], torch.Tensor]:
+    def _network_sdf(self, moment: Moment) -> Callable[[Tensor], Tensor]:
         """f [...] of the network at points [..., 3], in parts: they are many."""
 
-        def sdf(points: torch.Tensor) -> torch.Tensor:
+        def sdf(points: Tensor) -> Tensor:
             parts = points.reshape(-1, 3).split(points_at_a_time(self.device))
             return torch.cat([self.fields.sdf.sdf(part, moment.levels) for part in parts]).view(points.shape[:-1])
 

@@ -5,12 +5,18 @@ Shapes: R rays, K samples a ray, N = R K points.
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import torch
+from torch import Tensor
 
 from stages.neural.rendered import OPAQUE, Rendered
 from stages.neural.schedules import Moment
 from stages.neural.terms.planar import planarity, planarity_literal, planarity_scale
 from stages.neural.terms.term import Term
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
 
 # Samples that weigh more than this count as near the surface for the relaxed Eikonal term.
 _NEAR_SURFACE_WEIGHT = 0.01
@@ -19,9 +25,9 @@ _RELAXATION_FLOOR = 0.2
 
 
 def eikonal_relaxation_literal(
-    photo_error: torch.Tensor, planarity: torch.Tensor, gamma: float = 5.0, clip: float = 0.2
-) -> torch.Tensor:
-    """omega [...] = planarity exp(-gamma min(err, clip)) (paper eq. adaptive_weight as written).
+    photo_error: Float[Tensor, "*any"], planarity: Float[Tensor, "*any"], gamma: float = 5.0, clip: float = 0.2
+) -> Float[Tensor, "*any"]:
+    """omega = planarity exp(-gamma min(err, clip)) (paper eq. adaptive_weight as written).
 
     Differentiable in both, since the paper stops neither: a higher colour error, below the clip, then lowers the
     Eikonal loss. Never above the planarity, which in its literal form is about 1e-3: so is the whole term.
@@ -30,9 +36,12 @@ def eikonal_relaxation_literal(
 
 
 def eikonal_relaxation(
-    photo_error: torch.Tensor, planarity: torch.Tensor | float = 1.0, gamma: float = 5.0, clip: float = 0.2
-) -> torch.Tensor:
-    """omega [...] = sg[w + (1 - w) exp(-gamma min(err, clip)) (1 + planarity) / 2], w = 0.2.
+    photo_error: Float[Tensor, "*any"],
+    planarity: Float[Tensor, "*any"] | float = 1.0,
+    gamma: float = 5.0,
+    clip: float = 0.2,
+) -> Float[Tensor, "*any"]:
+    """omega = sg[w + (1 - w) exp(-gamma min(err, clip)) (1 + planarity) / 2], w = 0.2.
 
     The paper's eq. adaptive_weight. 1 where the photo is met, falling where the colour error err is large, so that
     detail may bend f there. The paper's omega = lambda_pla exp(-gamma err) vanishes with its lambda_pla ~ 1e-3; this
@@ -48,13 +57,13 @@ class Eikonal(Term):
     """The weight of the Eikonal term at the rays' samples."""
 
     def eikonal_weight(
-        self, rendered: Rendered, ray_error: torch.Tensor, trust: torch.Tensor, moment: Moment
-    ) -> torch.Tensor:
-        """Weight omega [N] of the Eikonal term at the rays' samples, from the colour error [R] (paper
+        self, rendered: Rendered, ray_error: Float[Tensor, " r"], trust: Float[Tensor, " r"], moment: Moment
+    ) -> Float[Tensor, " n"]:
+        """Weight omega of the Eikonal term at the rays' samples, from the colour error (paper
         eq. adaptive_weight).
 
         The paper's form weighs every sample of a ray that meets a surface and carries gradients. The stable form weighs
-        only samples near the surface, and takes the error times the `trust` [R] in the photo: what a mirror shows is
+        only samples near the surface, and takes the error times the `trust` in the photo: what a mirror shows is
         no reason to bend f. 1 elsewhere: there is no x_0 to compare with.
         """
         params = self.params.terms.eikonal

@@ -5,7 +5,10 @@ Shapes: Q rays with a surface point each, J neighbours of each, F appearance fea
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import torch
+from torch import Tensor
 
 from configs.training import PlanarParams, TermParams
 from stages.neural import losses, schedules
@@ -14,16 +17,21 @@ from stages.neural.rendered import OPAQUE, Rendered
 from stages.neural.schedules import Moment
 from stages.neural.terms.term import Term
 
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
 # Slope error from which the planar term pulls linearly: about 6 degrees, so that a sharp edge is not rounded away.
 _PLANAR_DELTA = 0.1
 # The literal planar term divides by a length, which may be 0.
 _LENGTH_FLOOR = 1e-9
 
 
-def planar_error_literal(sdf: torch.Tensor, normals: torch.Tensor, offsets: torch.Tensor) -> torch.Tensor:
-    """|f(x_k) / |x_k - x_0| - n_0.(x_k - x_0) / |x_k - x_0|| per neighbour [Q, K] (paper L_planar as written).
+def planar_error_literal(
+    sdf: Float[Tensor, "q j"], normals: Float[Tensor, "q 3"], offsets: Float[Tensor, "q j 3"]
+) -> Float[Tensor, "q j"]:
+    """|f(x_k) / |x_k - x_0| - n_0.(x_k - x_0) / |x_k - x_0|| per neighbour (paper L_planar as written).
 
-    sdf [Q, K] at x_0 + offsets [Q, K, 3], unit normals [Q, 3] at x_0. The paper takes x_k on the viewing ray before
+    sdf at x_0 + offsets, unit normals at x_0. The paper takes x_k on the viewing ray before
     x_0. Zero for a plane only where f(x_0) = 0; f(x_0) / |x_k - x_0| otherwise, without bound near x_0.
     """
     length = torch.linalg.vector_norm(offsets, dim=2).clamp(min=_LENGTH_FLOOR)
@@ -31,32 +39,38 @@ def planar_error_literal(sdf: torch.Tensor, normals: torch.Tensor, offsets: torc
 
 
 def planar_error(
-    sdf: torch.Tensor, sdf_center: torch.Tensor, normals: torch.Tensor, offsets: torch.Tensor, radius: float
-) -> torch.Tensor:
-    """Huber of (f(x_k) - f(x_0) - n_0.(x_k - x_0)) / max(|x_k - x_0|, eta/4) per neighbour [Q, K] (paper L_planar).
+    sdf: Float[Tensor, "q j"],
+    sdf_center: Float[Tensor, " q"],
+    normals: Float[Tensor, "q 3"],
+    offsets: Float[Tensor, "q j 3"],
+    radius: float,
+) -> Float[Tensor, "q j"]:
+    """Huber of (f(x_k) - f(x_0) - n_0.(x_k - x_0)) / max(|x_k - x_0|, eta/4) per neighbour (paper L_planar).
 
-    How far f is from linear around surface points: sdf [Q, K] at x_0 + offsets [Q, K, 3], sdf_center [Q] and unit
-    normals [Q, 3] at x_0, eta = radius. Zero for a plane at any distance. The paper leaves f(x_0) out, divides by
-    |x_k - x_0| alone and takes the absolute value: an x_0 that is off by 1e-3 then outweighs the shape.
+    How far f is from linear around surface points: sdf at x_0 + offsets, sdf_center and unit normals at x_0, eta =
+    radius. Zero for a plane at any distance. The paper leaves f(x_0) out, divides by |x_k - x_0| alone and takes the
+    absolute value: an x_0 that is off by 1e-3 then outweighs the shape.
     """
     linear = sdf_center[:, None] + torch.einsum("qc,qkc->qk", normals, offsets)
     length = torch.linalg.vector_norm(offsets, dim=2).clamp(min=0.25 * radius)
     return torch.nn.functional.huber_loss(sdf / length, linear / length, reduction="none", delta=_PLANAR_DELTA)
 
 
-def planarity_literal(features: torch.Tensor, center_features: torch.Tensor, epsilon: float = 1e-3) -> torch.Tensor:
-    """lambda_pla [Q, K] = epsilon / (|c(x_k) - c(x_0)| + epsilon) (paper lambda_pla^k as written).
+def planarity_literal(
+    features: Float[Tensor, "q j f"], center_features: Float[Tensor, "q f"], epsilon: float = 1e-3
+) -> Float[Tensor, "q j"]:
+    """lambda_pla = epsilon / (|c(x_k) - c(x_0)| + epsilon) (paper lambda_pla^k as written).
 
-    1 for equal features [Q, K, F] and [Q, F], about 1e-3 for features that differ by 1. Differentiable, since the
+    1 for equal features, about 1e-3 for features that differ by 1. Differentiable, since the
     paper does not stop it: pulling features apart lowers the loss.
     """
     return epsilon / (torch.linalg.vector_norm(features - center_features[:, None], dim=2) + epsilon)
 
 
-def planarity(features: torch.Tensor, center_features: torch.Tensor) -> torch.Tensor:
-    """lambda_pla [Q, K] = sg[tau / (|c(x_k) - c(x_0)| + tau)], tau the batch's median difference (paper lambda_pla^k).
+def planarity(features: Float[Tensor, "q j f"], center_features: Float[Tensor, "q f"]) -> Float[Tensor, "q j"]:
+    """lambda_pla = sg[tau / (|c(x_k) - c(x_0)| + tau)], tau the batch's median difference (paper lambda_pla^k).
 
-    Near 1 where the appearance features [Q, K, F] equal those at the centre [Q, F], 1/2 at the median. The paper's
+    Near 1 where the appearance features equal those at the centre, 1/2 at the median. The paper's
     tau = 1e-3 drives it to ~1e-3 everywhere. Detached: else features would be pulled apart to be rid of the term.
     """
     difference = torch.linalg.vector_norm(features - center_features[:, None], dim=2).detach()
@@ -79,7 +93,7 @@ class Planar(Term):
     def weight(self) -> float:
         return self.params.terms.planar.weight
 
-    def loss(self, rendered: Rendered, moment: Moment) -> torch.Tensor:
+    def loss(self, rendered: Rendered, moment: Moment) -> Float[Tensor, ""]:
         """Mean planar error around the surface points of some of the rays, adaptively weighted (paper L_planar).
 
         The paper's neighbours lie on the ray before the surface; in the stable form half of them do, the others lie on
@@ -118,8 +132,10 @@ class Planar(Term):
             error = planar_error(sdf_around, sdf_center, unit_normals, offsets, radius)
         return planarity_scale(moment, params) * (weight * error).mean()
 
-    def _neighbors(self, normals: torch.Tensor, dirs: torch.Tensor, radius: float) -> torch.Tensor:
-        """Offsets [Q, J, 3] of neighbours from surface points with normals [Q, 3], seen along dirs [Q, 3]."""
+    def _neighbors(
+        self, normals: Float[Tensor, "q 3"], dirs: Float[Tensor, "q 3"], radius: float
+    ) -> Float[Tensor, "q j 3"]:
+        """Offsets of neighbours from surface points with these normals, seen along dirs."""
         params = self.params.terms.planar
         shape = (len(normals), params.neighbors)
         reach = radius * torch.rand(*shape, 1, generator=self.generator, device=self.device)
@@ -139,7 +155,7 @@ def has_feature_mlp(params: TermParams) -> bool:
     return params.planar.features == "mlp" and (params.planar.form != "off" or params.eikonal.form != "plain")
 
 
-def feature_mlp_error(fields: Fields, rendered: Rendered, params: TermParams) -> torch.Tensor:
+def feature_mlp_error(fields: Fields, rendered: Rendered, params: TermParams) -> Float[Tensor, ""]:
     """Colour error of the feature MLP at the surface points: what trains it in the stable form.
 
     Zero without the MLP, and in the paper's form.

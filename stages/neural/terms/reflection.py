@@ -10,8 +10,10 @@ begins off the surface, and asks whether the reflected ray runs INTO something.
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import torch
+from torch import Tensor
 
 from stages.neural.density import laplace_density, section_optical_depth
 from stages.neural.rendered import OPAQUE, Rendered
@@ -19,6 +21,9 @@ from stages.neural.rendering import weights_from_optical_depth
 from stages.neural.sampling import SdfCache, free_outside, stratified
 from stages.neural.schedules import Moment
 from stages.neural.terms.term import Term
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
 
 # A ray on which f falls slower than this per unit of length runs along a surface, not into it: within 3 degrees. Else
 # rounding and the grid's facets alone would make a flat mirror reflect itself at grazing angles.
@@ -29,16 +34,20 @@ _MISS = 1e-3
 _REFLECTION_THRESHOLD = 2e-3
 
 
-def reflect(directions: torch.Tensor, normals: torch.Tensor) -> torch.Tensor:
-    """Unit reflected directions v - 2 (v.n) n [..., 3] of unit directions, about unit normals (paper r_refl)."""
+def reflect(directions: Float[Tensor, "*any 3"], normals: Float[Tensor, "*any 3"]) -> Float[Tensor, "*any 3"]:
+    """Unit reflected directions v - 2 (v.n) n of unit directions, about unit normals (paper r_refl)."""
     return directions - 2 * (directions * normals).sum(-1, keepdim=True) * normals
 
 
 # ---------------------------------------------------------------------- the paper's form
 def uniform_points(
-    points: torch.Tensor, directions: torch.Tensor, reach: float, num_samples: int, generator: torch.Generator | None
-) -> torch.Tensor:
-    """Samples x_0 + t_k v_refl [Q, K, 3] on reflected rays, t_k ~ U(0, t_max = reach) (paper Alg. 2).
+    points: Float[Tensor, "q 3"],
+    directions: Float[Tensor, "q 3"],
+    reach: float,
+    num_samples: int,
+    generator: torch.Generator | None,
+) -> Float[Tensor, "q {num_samples} 3"]:
+    """Samples x_0 + t_k v_refl on reflected rays, t_k ~ U(0, t_max = reach) (paper Alg. 2).
 
     Evenly spaced without a generator.
     """
@@ -49,8 +58,8 @@ def uniform_points(
     return points[:, None] + reach * share[..., None] * directions[:, None]
 
 
-def reflection_probability_literal(sdf: torch.Tensor, temperature: float = 10.0) -> torch.Tensor:
-    """S = max_k Psi(-f(r_refl(t_k))) [Q] from f [Q, K] on the reflected ray (paper eq. indirect_reflect).
+def reflection_probability_literal(sdf: Float[Tensor, "q k"], temperature: float = 10.0) -> Float[Tensor, " q"]:
+    """S = max_k Psi(-f(r_refl(t_k))) from f on the reflected ray (paper eq. indirect_reflect).
 
     Psi is the Laplace CDF of scale 1 / temperature, 0.1 scene units by default. The other reading, a scale of 10, makes
     Psi 1/2 to within 5 % everywhere in the region of interest. At least 1/2 as soon as one sample is on the surface,
@@ -60,8 +69,8 @@ def reflection_probability_literal(sdf: torch.Tensor, temperature: float = 10.0)
     return (scale * laplace_density(sdf, scale)).max(1).values
 
 
-def nearest_to_surface(sdf: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
-    """The row [Q, D] of values [Q, K, D] whose |f| [Q, K] is smallest on its ray (paper Alg. 2: x_r, and grad f there).
+def nearest_to_surface(sdf: Float[Tensor, "q k"], values: Float[Tensor, "q k d"]) -> Float[Tensor, "q d"]:
+    """The row of values whose |f| is smallest on its ray (paper Alg. 2: x_r, and grad f there).
 
     The choice itself has no gradient; the values chosen keep theirs.
     """
@@ -75,11 +84,11 @@ def reflection_start(scale: float, voxel: float) -> float:
 
 
 def reflection_probability(
-    sdf: torch.Tensor, distances: torch.Tensor, scale: torch.Tensor | float
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """S = 1 - prod_k (1 - alpha_k) [Q] over the sections where f falls, and the mean hit distance [Q].
+    sdf: Float[Tensor, "q k"], distances: Float[Tensor, "q k"], scale: Float[Tensor, ""] | float
+) -> tuple[Float[Tensor, " q"], Float[Tensor, " q"]]:
+    """S = 1 - prod_k (1 - alpha_k) over the sections where f falls, and the mean hit distance.
 
-    f [Q, K] is piecewise linear between sorted distances [Q, K], alpha_k = 1 - exp(-tau_k) with the exact optical depth
+    f is piecewise linear between sorted distances, alpha_k = 1 - exp(-tau_k) with the exact optical depth
     tau_k. Where f rises the ray leaves a surface, most often its own, and meets none: those sections are transparent.
     The hit is averaged with the rendering weights, each section at its middle; without a hit it is the ray's end.
     """
@@ -96,14 +105,14 @@ def reflection_probability(
 @torch.no_grad()
 def trace_reflections(
     cache: SdfCache,
-    points: torch.Tensor,
-    directions: torch.Tensor,
+    points: Float[Tensor, "q 3"],
+    directions: Float[Tensor, "q 3"],
     scale: float,
     voxel: float,
     reach: float,
     num_samples: int,
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """S [Q] and x_r [Q, 3] of rays reflected at points [Q, 3] into unit directions [Q, 3], from cached f. No gradient.
+) -> tuple[Float[Tensor, " q"], Float[Tensor, "q 3"]]:
+    """S and x_r of rays reflected at points into unit directions, from cached f. No gradient.
 
     A ray begins `reflection_start` off the surface and is `reach` long; h is the coarser of the encoding's voxel and
     the cache's cell, as facets of the grid bend f at that size.
@@ -118,9 +127,12 @@ def trace_reflections(
 
 # ---------------------------------------------------------------------- both forms
 def compose(
-    color: torch.Tensor, reflected_color: torch.Tensor, probability: torch.Tensor, reflectivity: torch.Tensor | float
-) -> torch.Tensor:
-    """C' = (1 - rho S) C + rho S g [Q, 3] for colours C and g [Q, 3], S and rho [Q] (paper C').
+    color: Float[Tensor, "q 3"],
+    reflected_color: Float[Tensor, "q 3"],
+    probability: Float[Tensor, " q"],
+    reflectivity: Float[Tensor, " q"] | float,
+) -> Float[Tensor, "q 3"]:
+    """C' = (1 - rho S) C + rho S g for colours C and g (paper C').
 
     The paper has no reflectivity: rho = 1. C itself where S or rho is 0.
     """

@@ -5,7 +5,10 @@ Shapes: R rays, K samples a ray, N = R K points.
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import torch
+from torch import Tensor
 
 from configs.training import TrainParams
 from stages.neural.fields import Fields
@@ -13,6 +16,9 @@ from stages.neural.rendered import Rendered
 from stages.neural.sampling import SdfCache
 from stages.neural.schedules import Moment
 from stages.neural.training_photos import Photos
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
 
 
 class Term:
@@ -41,14 +47,16 @@ class Term:
         """The rays with the colours that they have by this term."""
         return rendered
 
-    def color_weight(self, rendered: Rendered, exposed: torch.Tensor, moment: Moment) -> torch.Tensor | None:
-        """Weight [R] of each ray's colour error; `exposed` [R, 3] is what is compared with the photos. None: 1."""
+    def color_weight(
+        self, rendered: Rendered, exposed: Float[Tensor, "r 3"], moment: Moment
+    ) -> Float[Tensor, " r"] | None:
+        """Weight of each ray's colour error; `exposed` is what is compared with the photos. None: 1."""
         return None
 
     def eikonal_weight(
-        self, rendered: Rendered, ray_error: torch.Tensor, trust: torch.Tensor, moment: Moment
-    ) -> torch.Tensor | None:
-        """Weight [N] of the Eikonal error at the samples, given each ray's colour error [R] and its weight [R].
+        self, rendered: Rendered, ray_error: Float[Tensor, " r"], trust: Float[Tensor, " r"], moment: Moment
+    ) -> Float[Tensor, " n"] | None:
+        """Weight of the Eikonal error at the samples, given each ray's colour error and its weight.
 
         None: 1.
         """
@@ -59,6 +67,6 @@ class Term:
         """Of `loss` in the sum."""
         return 0.0
 
-    def loss(self, rendered: Rendered, moment: Moment) -> torch.Tensor | None:
+    def loss(self, rendered: Rendered, moment: Moment) -> Float[Tensor, ""] | None:
         """What is to be lowered, a number, not yet weighted. None: nothing, ever."""
         return None
