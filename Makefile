@@ -1,5 +1,6 @@
 # make demo   photos -> textured model of a made-up object, with its score; result in demo/
-# make test   all tests
+# make check  lint, types, who-may-import-whom, the quick tests: under a minute on two cores
+# make test   all tests, shapes checked
 # make bench-smoke   a small scene through the whole pipeline, its figures against committed ones
 # make lint   formatting, lint, types, who-may-import-whom
 # make vendor the report's copy of three.js, from npm
@@ -9,7 +10,7 @@ PYTHON ?=
 export PYTHON
 BIN := .venv/bin
 
-.PHONY: help venv demo test bench-smoke lint format docs vendor clean
+.PHONY: help venv demo check test bench-smoke lint format docs vendor clean
 
 help:
 	@sed -n 's/^# //p' Makefile
@@ -20,8 +21,12 @@ venv:
 demo: venv
 	$(BIN)/hineus demo
 
+# One thread a process: two of them fill two cores.
+check: lint
+	OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(BIN)/python -m pytest -m "not slow" -n auto --maxprocesses 4
+
 test: venv
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest --check-shapes
 
 bench-smoke: venv
 	$(BIN)/python -m benchmarks.smoke
@@ -38,11 +43,8 @@ format: venv
 
 docs: venv
 	$(BIN)/python docs/make_reference.py
-	$(BIN)/python -m benchmarks.run_sets --table-only
-	$(BIN)/python -m benchmarks.ablate --table-only
-	$(BIN)/python -m benchmarks.hard_variants --table-only
-	$(BIN)/python -m benchmarks.suites --table-only
-	$(BIN)/python -m benchmarks.held_out --table-only
+	$(BIN)/python -m docs.make_architecture
+	$(BIN)/python -m benchmarks.pages
 
 # Bundled in a temporary folder: nothing of npm stays in the tree.
 VENDOR := stages/templates/vendor

@@ -6,7 +6,7 @@ set -euo pipefail
 cd "$(dirname "$0")/.."
 
 VENV=${VENV:-.venv}
-TORCH=torch==2.13.0 # the version the figures in docs/benchmarks.md were measured with
+TORCH=torch==2.13.0 # the version the figures in docs/benchmarks were measured with
 TORCH_CPU_INDEX=https://download.pytorch.org/whl/cpu
 STAMP=$VENV/.ready
 

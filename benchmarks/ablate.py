@@ -2,7 +2,7 @@
 
 python -m benchmarks.ablate DATA                                            every variant on every set that has a truth
 python -m benchmarks.ablate DATA synth_helmet --variants base,ambiguity     these
-python -m benchmarks.ablate DATA --extra far:all,reflection_reach=0.3       and one more: `all` with that setting
+python -m benchmarks.ablate DATA --extra far:all,terms.reflection.reach=0.3 and one more: `all` with that setting
 python -m benchmarks.ablate --table-only                                    only rewrite the table
 
 A truth is a known surface (`gt_mesh.ply`, `transforms.json`), and the score is the distance of the clean mesh to it; or
@@ -35,20 +35,10 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any
 
-from benchmarks.run_sets import (
-    NOT_MEASURED,
-    OUT,
-    PAGE,
-    RESULTS,
-    ROOT,
-    find_sets,
-    known_cameras,
-    machine,
-    markdown_table,
-    photos_of,
-    run_hineus,
-    with_table,
-)
+from benchmarks.pages import NOT_MEASURED, markdown_table, write_tables
+from benchmarks.run_sets import OUT, RESULTS, ROOT, find_sets, known_cameras, machine, photos_of, run_hineus
+from configs.params import Config
+from configs.renames import RENAMED
 from stages.engine.stage import Stage, StageContext
 from stages.errors import HineusError
 from stages.posing import neus
@@ -57,55 +47,52 @@ BASE = "base"
 # What every variant starts from: colours and the plain Eikonal term. Written out, so that it stays the base whatever
 # the presets and defaults become.
 BASE_SETTINGS = {
-    "train.ambiguity": "off",
-    "train.visibility": "stable",
-    "train.reflection": "off",
-    "train.planar": "off",
-    "train.planar_features": "radiance",
-    "train.eikonal": "plain",
-    "train.density": "laplace",
-    "train.scale": "scheduled",
-    "train.gradients": "analytic",
+    "train.terms.ambiguity.form": "off",
+    "train.terms.ambiguity.visibility": "stable",
+    "train.terms.reflection.form": "off",
+    "train.terms.planar.form": "off",
+    "train.terms.planar.features": "radiance",
+    "train.terms.eikonal.form": "plain",
+    "train.density.form": "laplace",
+    "train.density.scale": "scheduled",
+    "train.field.gradients": "analytic",
 }
 BACKBONES = ("neus2", "hfneus", "neuralangelo")
-TERMS = {f"train.{term}": "stable" for term in ("ambiguity", "reflection", "planar", "eikonal")}
+TERMS = {f"train.terms.{term}.form": "stable" for term in ("ambiguity", "reflection", "planar", "eikonal")}
 
 
 def _all_but(term: str) -> dict[str, str]:
-    return {key: value for key, value in TERMS.items() if key != f"train.{term}"}
+    return {key: value for key, value in TERMS.items() if key != f"train.terms.{term}.form"}
 
 
 # What each variant sets otherwise, the most telling first: they run in this order.
 VARIANTS: dict[str, dict[str, str]] = {
     BASE: {},
-    "ambiguity": {"train.ambiguity": "stable"},
-    "reflection": {"train.reflection": "stable"},
-    "planar": {"train.planar": "stable"},
-    "eikonal": {"train.eikonal": "stable"},
+    "ambiguity": {"train.terms.ambiguity.form": "stable"},
+    "reflection": {"train.terms.reflection.form": "stable"},
+    "planar": {"train.terms.planar.form": "stable"},
+    "eikonal": {"train.terms.eikonal.form": "stable"},
     "all": TERMS,
     "all-ambiguity": _all_but("ambiguity"),
     "all-reflection": _all_but("reflection"),
     "all-planar": _all_but("planar"),
     "all-eikonal": _all_but("eikonal"),
-    "ambiguity-paper": {"train.ambiguity": "paper", "train.visibility": "paper"},
-    "visibility-paper": {"train.ambiguity": "stable", "train.visibility": "paper"},
-    "visibility-mesh": {"train.ambiguity": "stable", "train.visibility": "mesh"},
-    "reflection-paper": {"train.reflection": "paper"},
-    "planar-paper": {"train.planar": "paper"},
+    "ambiguity-paper": {"train.terms.ambiguity.form": "paper", "train.terms.ambiguity.visibility": "paper"},
+    "visibility-paper": {"train.terms.ambiguity.form": "stable", "train.terms.ambiguity.visibility": "paper"},
+    "visibility-mesh": {"train.terms.ambiguity.form": "stable", "train.terms.ambiguity.visibility": "mesh"},
+    "reflection-paper": {"train.terms.reflection.form": "paper"},
+    "planar-paper": {"train.terms.planar.form": "paper"},
     # its weight is made of the planar term's
-    "eikonal-paper": {"train.planar": "paper", "train.eikonal": "paper"},
-    "all-paper": {**dict.fromkeys(TERMS, "paper"), "train.visibility": "paper"},
-    # forms of our own: see docs/math.md
-    "eikonal-annealed": {"train.eikonal_start": "0.3", "train.eikonal_end": "3"},
-    "consistency": {"train.weight_consistency": "0.1"},
+    "eikonal-paper": {"train.terms.planar.form": "paper", "train.terms.eikonal.form": "paper"},
+    "all-paper": {**dict.fromkeys(TERMS, "paper"), "train.terms.ambiguity.visibility": "paper"},
     # the colours and the Eikonal term alone, as in NeuS: no SfM points, no reflected direction
-    "rgb+eikonal": {"train.weight_sparse": "0", "train.radiance_inputs": "view"},
-    "density-neus": {"train.density": "neus"},
-    "scale-learned": {"train.scale": "learned"},
-    "gradients-numerical": {"train.gradients": "numerical"},
-    "planar-mlp": {"train.planar": "stable", "train.planar_features": "mlp"},
-    "view-only": {"train.radiance_inputs": "view"},
-    "proposal": {"train.sampler": "proposal"},
+    "rgb+eikonal": {"train.losses.sparse": "0", "train.field.radiance_inputs": "view"},
+    "density-neus": {"train.density.form": "neus"},
+    "scale-learned": {"train.density.scale": "learned"},
+    "gradients-numerical": {"train.field.gradients": "numerical"},
+    "planar-mlp": {"train.terms.planar.form": "stable", "train.terms.planar.features": "mlp"},
+    "view-only": {"train.field.radiance_inputs": "view"},
+    "proposal": {"train.sampling.sampler": "proposal"},
     # the paper's "integrated into" rows: each backbone without and with the terms
     **{
         f"{name}{tail}": {"train.backbone": name, **terms}
@@ -113,10 +100,10 @@ VARIANTS: dict[str, dict[str, str]] = {
         for tail, terms in (("", {}), ("+all", TERMS))
     },
     # the supplement's knobs, around the defaults of t_max 0.1, gamma 5, clip 0.2, hash resolution 512
-    **{f"all-tmax-{value}": {**TERMS, "train.reflection_reach": value} for value in ("0.05", "0.2")},
-    **{f"all-gamma-{value}": {**TERMS, "train.relaxation_gamma": value} for value in ("3", "10")},
-    **{f"all-clip-{value}": {**TERMS, "train.relaxation_clip": value} for value in ("0.1", "0.3")},
-    **{f"all-hash-{value}": {**TERMS, "train.finest": value} for value in ("1024", "2048")},
+    **{f"all-tmax-{value}": {**TERMS, "train.terms.reflection.reach": value} for value in ("0.05", "0.2")},
+    **{f"all-gamma-{value}": {**TERMS, "train.terms.eikonal.gamma": value} for value in ("3", "10")},
+    **{f"all-clip-{value}": {**TERMS, "train.terms.eikonal.clip": value} for value in ("0.1", "0.3")},
+    **{f"all-hash-{value}": {**TERMS, "train.field.finest": value} for value in ("1024", "2048")},
 }
 
 RUNS = RESULTS / "ablation"
@@ -151,7 +138,7 @@ class Plan:
         """All that is set on top of the preset."""
         # A budget of minutes would overrule that of steps; a preview at the end is enough.
         budget = ["train.minutes=null", f"train.steps={self.steps}", "train.preview_every=1"]
-        return [*self.settings, *budget, f"train.seed={self.seed}", f"train.holdout={self.holdout}"]
+        return [*self.settings, *budget, f"train.seed={self.seed}", f"train.hold_out={self.holdout}"]
 
 
 @dataclass(frozen=True)
@@ -192,7 +179,7 @@ def settings_of(changes: dict[str, str]) -> tuple[str, ...]:
     """A variant's settings, those of the base that it does not change included."""
     base = dict(BASE_SETTINGS)
     if "train.backbone" in changes:  # sets these itself
-        for key in ("train.density", "train.scale", "train.gradients"):
+        for key in ("train.density.form", "train.density.scale", "train.field.gradients"):
             del base[key]
     return tuple(f"{key}={value}" for key, value in {**base, **changes}.items())
 
@@ -210,7 +197,8 @@ def parse_extra(text: str) -> tuple[str, dict[str, str]]:
     for item in listed.split(","):
         key, equals, value = item.partition("=")
         if equals:
-            changes[key if "." in key else f"train.{key}"] = value
+            key = key if key.partition(".")[0] in Config.model_fields else f"train.{key}"
+            changes[RENAMED.get(key, key)] = value
         elif item in VARIANTS:
             changes |= VARIANTS[item]
         else:
@@ -263,7 +251,7 @@ def poses_hash(folder: Path) -> str:
 
 def code_hash() -> str:
     """Hash of the sources that decide what a training comes to."""
-    sources = sorted((ROOT / "stages" / "neural").glob("*.py"))
+    sources = sorted((ROOT / "stages" / "neural").rglob("*.py"))
     return hashlib.sha256(b"".join(source.read_bytes() for source in sources)).hexdigest()[:8]
 
 
@@ -428,7 +416,9 @@ def load_runs() -> list[Run]:
 
 
 def _plan(data: dict[str, Any]) -> Plan:
-    return Plan(**{**data, "settings": tuple(data["settings"])})
+    """A plan as it was saved, also by code that had other names for the settings."""
+    settings = (text.partition("=") for text in data["settings"])
+    return Plan(**{**data, "settings": tuple(f"{RENAMED.get(key, key)}={value}" for key, _, value in settings)})
 
 
 # ---------------------------------------------------------------- table
@@ -523,10 +513,10 @@ def _mean(values: Sequence[float], digits: int) -> str:
     return f"{fmean(values):.{digits}f}" if values else "-"
 
 
-def write_table() -> None:
+def tables() -> dict[str, str]:
+    """The tables, from the result files."""
     runs = load_runs()
-    body = ablation_table(runs) if runs else NOT_MEASURED
-    PAGE.write_text(with_table(PAGE.read_text(encoding="utf-8"), "ablation", body), encoding="utf-8")
+    return {"ablation": ablation_table(runs) if runs else NOT_MEASURED}
 
 
 # ---------------------------------------------------------------- command
@@ -582,7 +572,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"{len(plans)} runs to make (others have a result; --again measures them anew)", file=sys.stderr)
         jobs = arguments.jobs or (1 if has_cuda() else available_cores())
         failed += run_plans(plans, data, jobs, arguments.keep)
-    write_table()
+    write_tables(tables())
     return 1 if failed else 0
 
 

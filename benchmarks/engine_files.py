@@ -23,7 +23,7 @@ from stages.engine.stage import StageContext
 from stages.evaluation.surfaces import Surface, Target
 from stages.export import EXPORT
 from stages.reporting.pictures import read_rgb
-from stages.texture.levels import levels_of_detail
+from stages.surface.levels_of_detail import levels_of_detail
 
 VIEWS = 6  # photos, evenly spread, from where levels are drawn
 

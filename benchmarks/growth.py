@@ -2,7 +2,7 @@
 
 python -m benchmarks.growth DATA                     from the photos of DATA/synth_plaster
 python -m benchmarks.growth DATA synth_helmet        of another set
-python -m benchmarks.growth --table-only             only rewrite the table of docs/benchmarks.md
+python -m benchmarks.growth --table-only             only rewrite the table of docs/benchmarks/growth.md
 
 Photos are left out evenly; larger ones are the same photos enlarged, so that they hold more pixels and no more detail.
 Training is cut to a few hundred steps: a step costs the same whatever the photos, and the table shows what steps cost.
@@ -22,8 +22,8 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from benchmarks.run_sets import GIB, OUT, PAGE, RESULTS, ROOT, find_sets, machine, markdown_table, photos_of, run_hineus
-from benchmarks.run_sets import with_table as _with_table
+from benchmarks.pages import NOT_MEASURED, markdown_table, write_tables
+from benchmarks.run_sets import GIB, OUT, RESULTS, ROOT, find_sets, machine, photos_of, run_hineus
 
 STEPS = 400
 ROWS = RESULTS / "growth"
@@ -127,7 +127,7 @@ def big_training() -> tuple[float, int]:
     import numpy as np
 
     from benchmarks import ball_heap
-    from configs.params import TrainParams
+    from configs.training import TrainParams
     from stages.geometry.cameras import PinholeCameras
     from stages.neural.trainer import Sightings, Trainer
     from stages.neural.training_photos import Photos
@@ -183,9 +183,10 @@ def growth_table(rows: Sequence[Row]) -> str:
     return markdown_table(header, body)
 
 
-def with_table(page: str, rows: Sequence[Row]) -> str:
-    """The page with the table made anew."""
-    return _with_table(page, "growth", growth_table(rows) if rows else "Not measured yet.")
+def tables() -> dict[str, str]:
+    """The table, from the result files."""
+    rows = load_rows()
+    return {"growth": growth_table(rows) if rows else NOT_MEASURED}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -210,7 +211,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             row = measure_big() if name == BIG else measure(name, arguments.data, arguments.set)
             row_path(name).write_text(json.dumps(asdict(row), indent=1) + "\n", encoding="utf-8")
             print(f"{name}: done", file=sys.stderr, flush=True)
-    PAGE.write_text(with_table(PAGE.read_text(encoding="utf-8"), load_rows()), encoding="utf-8")
+    write_tables(tables())
     return 0
 
 

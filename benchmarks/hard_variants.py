@@ -4,7 +4,7 @@ python -m benchmarks.hard_variants DATA                        every row that ha
 python -m benchmarks.hard_variants DATA synth_helmet-blurred   these
 python -m benchmarks.hard_variants DATA --mesh                 go on to the clean mesh where its truth is known
 python -m benchmarks.hard_variants DATA --mesh --set train.steps=2000    with a smaller budget
-python -m benchmarks.hard_variants --table-only                only rewrite the table of docs/benchmarks.md
+python -m benchmarks.hard_variants --table-only                only rewrite the table of docs/benchmarks/hard-photos.md
 
 A row is a set of DATA, or SET-VARIANT: see `VARIANTS` for what each does to the photos, and `BASES` for the sets it is
 done to. A row runs in a process of its own; results go to benchmarks/results/poses/ROW.json, photos made and workspaces
@@ -28,19 +28,8 @@ from typing import Any
 import numpy as np
 
 from benchmarks.ablate import score_clean_mesh
-from benchmarks.run_sets import (
-    NOT_MEASURED,
-    OUT,
-    PAGE,
-    RESULTS,
-    ROOT,
-    find_sets,
-    known_cameras,
-    machine,
-    markdown_table,
-    photos_of,
-    with_table,
-)
+from benchmarks.pages import NOT_MEASURED, markdown_table, write_tables
+from benchmarks.run_sets import OUT, RESULTS, ROOT, find_sets, known_cameras, machine, photos_of
 from stages.posing.neus import read_neus
 
 ROWS = RESULTS / "poses"
@@ -468,10 +457,10 @@ def attempts_cell(row: Row) -> str:
     return ", ".join(f"**{cell}**" if i == kept else cell for i, cell in enumerate(cells)) or "-"
 
 
-def write_table() -> None:
+def tables() -> dict[str, str]:
+    """The table, from the result files."""
     rows = load_rows()
-    body = pose_table(rows) if rows else NOT_MEASURED
-    PAGE.write_text(with_table(PAGE.read_text(encoding="utf-8"), "poses", body), encoding="utf-8")
+    return {"poses": pose_table(rows) if rows else NOT_MEASURED}
 
 
 # ---------------------------------------------------------------- command
@@ -508,7 +497,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             except RuntimeError as error:
                 print(f"{row}: {error}", file=sys.stderr)
                 failed.append(row)
-    write_table()
+    write_tables(tables())
     return 1 if failed else 0
 
 

@@ -1,7 +1,7 @@
 """Photos that training and texture did without, against drawings of the trained field and of the final mesh.
 
 python -m benchmarks.held_out WORKSPACE ...      these, each made with `--hold-out 8`
-python -m benchmarks.held_out --table-only       only rewrite the table of docs/benchmarks.md
+python -m benchmarks.held_out --table-only       only rewrite the table of docs/benchmarks/held-out.md
 
 Results go to benchmarks/results/held_out/NAME.json, where NAME is the workspace's.
 """
@@ -15,8 +15,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from benchmarks.run_sets import NOT_MEASURED, PAGE, machine, markdown_table, with_table
+from benchmarks.pages import NOT_MEASURED, markdown_table, write_tables
 from benchmarks.run_sets import RESULTS as ALL_RESULTS
+from benchmarks.run_sets import machine
 
 RESULTS = ALL_RESULTS / "held_out"
 # What is shown: drawing, region, number, its heading.
@@ -58,10 +59,10 @@ def table(results: Sequence[dict[str, Any]]) -> str:
     return markdown_table(["set", "photos", *(heading for *_, heading in COLUMNS)], rows)
 
 
-def with_held_out(page: str) -> str:
-    """The page with the table made anew."""
+def tables() -> dict[str, str]:
+    """The table, from the result files."""
     results = load_results()
-    return with_table(page, "held-out", table(results) if results else NOT_MEASURED)
+    return {"held-out": table(results) if results else NOT_MEASURED}
 
 
 def main() -> int:
@@ -76,7 +77,7 @@ def main() -> int:
         print(f"{workspace}: drawing", file=sys.stderr, flush=True)
         result = measure(workspace)
         (RESULTS / f"{result['name']}.json").write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
-    PAGE.write_text(with_held_out(PAGE.read_text(encoding="utf-8")), encoding="utf-8")
+    write_tables(tables())
     return 0
 
 

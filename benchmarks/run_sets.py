@@ -4,7 +4,7 @@ python -m benchmarks.run_sets DATA                  every set in DATA that has n
 python -m benchmarks.run_sets DATA banana viking    these
 python -m benchmarks.run_sets DATA --seeds 2        each with seeds 0 and 1, poses made anew, too
 python -m benchmarks.run_sets --demo                `hineus demo`
-python -m benchmarks.run_sets --table-only          only rewrite the tables of docs/benchmarks.md
+python -m benchmarks.run_sets --table-only          only rewrite the tables of the docs
 
 A set is a folder with `images/` (or `image/`) and, where the truth is known, `gt_mesh.ply` and `transforms.json`.
 Results go to benchmarks/results/SET.json (SET-seed1.json and so on), those of the scenes that `benchmarks.synthetic`
@@ -25,6 +25,7 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any
 
+from benchmarks.pages import NOT_MEASURED, markdown_table, write_tables
 from benchmarks.synthetic import MADE_WITH
 from stages.evaluation.machine import machine
 from stages.posing import neus
@@ -32,10 +33,8 @@ from stages.posing import neus
 ROOT = Path(__file__).parent.parent
 RESULTS = ROOT / "benchmarks" / "results"
 OUT = ROOT / "benchmarks" / "out"
-PAGE = ROOT / "docs" / "benchmarks.md"
 VALIDATOR = ROOT / "benchmarks" / "validate_glb.mjs"
 DEMO = "demo"
-NOT_MEASURED = "Not measured yet."
 SYNTHETIC = "synthetic"  # folder of results, and table
 GIB = 1 << 30
 
@@ -317,48 +316,17 @@ def texture_table(results: Sequence[Result]) -> str:
 TABLES = {"summary": summary_table, "stages": stage_table, "memory": memory_table, "texture": texture_table}
 
 
-def with_tables(page: str, results: Sequence[Result]) -> str:
-    """The page with every table between its markers `<!-- table NAME -->` and `<!-- end NAME -->` made anew.
-
-    Raises:
-        ValueError: a marker is missing.
-    """
+def tables_of(results: Sequence[Result]) -> dict[str, str]:
+    """The tables of sets; all but the summary show the first seed alone."""
     first = [result for result in results if result.seed == 0]
-    for name, table in TABLES.items():
-        shown = results if table is summary_table else first
-        page = with_table(page, name, table(shown) if shown else NOT_MEASURED)
-    return page
+    shown = {name: results if table is summary_table else first for name, table in TABLES.items()}
+    return {name: table(shown[name]) if shown[name] else NOT_MEASURED for name, table in TABLES.items()}
 
 
-def updated_page(page: str) -> str:
-    """The page with all its tables made anew from the result files.
-
-    Raises:
-        ValueError: a marker is missing.
-    """
-    synthetic = load_results(RESULTS / SYNTHETIC)
-    page = with_tables(page, load_results(RESULTS))
-    return with_table(page, SYNTHETIC, summary_table(synthetic) if synthetic else NOT_MEASURED)
-
-
-def with_table(page: str, name: str, body: str) -> str:
-    """The page with `body` between the markers of table `name`.
-
-    Raises:
-        ValueError: a marker is missing.
-    """
-    begin, end = f"<!-- table {name} -->", f"<!-- end {name} -->"
-    if page.count(begin) != 1 or page.count(end) != 1:
-        raise ValueError(f"the markers {begin} and {end} are expected once each")
-    before, rest = page.split(begin)
-    after = rest.split(end)[1]
-    return f"{before}{begin}\n{body}\n{end}{after}"
-
-
-def markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Markdown: the first column to the left, the others to the right."""
-    lines = [header, ["---"] + ["---:"] * (len(header) - 1), *rows]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+def tables() -> dict[str, str]:
+    """All tables, from the result files."""
+    ours = load_results(RESULTS / SYNTHETIC)
+    return tables_of(load_results(RESULTS)) | {SYNTHETIC: summary_table(ours) if ours else NOT_MEASURED}
 
 
 def _score_cell(seeds: Sequence[Result], name: str) -> str:
@@ -406,7 +374,7 @@ def main() -> int:
         except RuntimeError as error:
             print(f"{path.stem}: {error}", file=sys.stderr)
             failed.append(path.stem)
-    PAGE.write_text(updated_page(PAGE.read_text(encoding="utf-8")), encoding="utf-8")
+    write_tables(tables())
     return 1 if failed else 0
 
 

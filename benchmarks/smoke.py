@@ -28,7 +28,7 @@ EXPECTED = Path(__file__).with_suffix(".json")
 NUM_PHOTOS = 20
 SIZE = (400, 300)
 HOLDOUT = 5
-SETTINGS = (f"train.holdout={HOLDOUT}", "sfm.deterministic=true")
+SETTINGS = (f"train.hold_out={HOLDOUT}", "sfm.deterministic=true")
 
 
 @dataclass(frozen=True)

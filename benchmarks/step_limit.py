@@ -31,7 +31,7 @@ import numpy as np
 import torch
 from numba import njit, prange
 
-from benchmarks.run_sets import markdown_table
+from benchmarks.pages import markdown_table
 from benchmarks.step_speed import (
     CHOSEN,
     POINTS,
@@ -46,10 +46,10 @@ from benchmarks.step_speed import (
     training_step,
 )
 from configs.load import load_config
-from configs.params import TrainParams
+from configs.training import TrainParams
 from stages.neural import encodings, losses
 from stages.neural.acceleration import short_products
-from stages.neural.encodings import HashGrid
+from stages.neural.encoding_shapes import HashGrid
 from stages.neural.fields import Fields, FieldShape
 from stages.neural.trainer import field_shape
 
@@ -59,7 +59,7 @@ PROCESS_SECONDS = 4.0  # each process of the two works that long
 
 def settings(log2_rows: int, device: str) -> TrainParams:
     """The preset of the device, with tables of 2**log2_rows rows a level."""
-    return load_config(preset_for(device), None, [f"train.log2_rows={log2_rows}"]).train
+    return load_config(preset_for(device), None, [f"train.field.log2_rows={log2_rows}"]).train
 
 
 def shape_of(log2_rows: int, device: str = "cpu") -> FieldShape:

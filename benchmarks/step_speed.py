@@ -30,13 +30,13 @@ import torch
 
 from benchmarks import ball_heap
 from benchmarks.ablate import BASE, VARIANTS, settings_of
-from benchmarks.run_sets import markdown_table
+from benchmarks.pages import markdown_table
 from configs.load import load_config
-from configs.params import TrainParams
+from configs.training import TrainParams
 from stages.geometry.cameras import PinholeCameras, PosedScene
 from stages.geometry.similarity import Similarity
 from stages.neural import encodings, fields
-from stages.neural.encodings import HashGrid
+from stages.neural.encoding_shapes import HashGrid
 from stages.neural.sightings import Sightings
 from stages.neural.trainer import Trainer, field_shape
 from stages.neural.training_photos import Photos
@@ -162,7 +162,8 @@ def ball_trainer(params: TrainParams, device: str = "cpu") -> Trainer:
 
 def points_of_step(params: TrainParams) -> int:
     """How many points a training step asks the distance of."""
-    return params.rays * params.samples + 4 * params.sparse_batch + params.free_points
+    sampling = params.sampling
+    return sampling.rays * sampling.samples + 4 * params.losses.sparse_batch + sampling.free_points
 
 
 def preset_for(device: str) -> str:

@@ -1,4 +1,4 @@
-"""Tables of docs/benchmarks.md from what `hineus bench` measured.
+"""Tables of docs/benchmarks/suites.md from what `hineus bench` measured.
 
 python -m benchmarks.suites OUT             take the results under OUT (that of `hineus bench --out`), then the tables
 python -m benchmarks.suites --table-only    only rewrite the tables
@@ -14,7 +14,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from benchmarks.run_sets import NOT_MEASURED, PAGE, RESULTS, markdown_table, with_table
+from benchmarks.pages import NOT_MEASURED, markdown_table, write_tables
+from benchmarks.run_sets import RESULTS
 from stages import artifacts
 from stages.evaluation.suites.paper import paper_tables
 from stages.evaluation.suites.registry import SUITES
@@ -41,10 +42,10 @@ def suites_tables(results: Sequence[dict[str, Any]]) -> str:
     for name, suite in SUITES.items():
         own = [result for result in results if result["suite"] == name]
         if own:
-            tables = tables_of(suite, own)
+            made = tables_of(suite, own)
             # the paper's figures stand on the page only beside some of ours
             scored = any(score_of(suite, result) is not None for result in own)
-            parts += [_markdown(table) for table in (tables if scored else tables[1:])]
+            parts += [_markdown(table) for table in (made if scored else made[1:])]
     return "\n\n".join(parts) or NOT_MEASURED
 
 
@@ -72,9 +73,9 @@ def averages_table() -> str:
     return markdown_table(["suite", "row", "printed", "of its figures", "rounding may explain it"], rows)
 
 
-def with_suites(page: str, results: Sequence[dict[str, Any]]) -> str:
-    """The page with the tables of suites and of the paper's averages made anew."""
-    return with_table(with_table(page, "suites", suites_tables(results)), "paper averages", averages_table())
+def tables() -> dict[str, str]:
+    """The tables of suites, from their result files, and of the paper's averages."""
+    return {"suites": suites_tables(load_results(FOLDER)), "paper averages": averages_table()}
 
 
 def main() -> int:
@@ -87,7 +88,7 @@ def main() -> int:
     if arguments.out is not None and take_results(arguments.out) == 0:
         print(f"there are no results in {arguments.out}", file=sys.stderr)
         return 1
-    PAGE.write_text(with_suites(PAGE.read_text(encoding="utf-8"), load_results(FOLDER)), encoding="utf-8")
+    write_tables(tables())
     return 0
 
 

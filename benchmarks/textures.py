@@ -3,11 +3,11 @@
 python -m benchmarks.textures WORKSPACES DATA                  every finished run in WORKSPACES that has no result yet
 python -m benchmarks.textures WORKSPACES DATA viking           this one
 python -m benchmarks.textures WORKSPACES DATA viking --cost    what the bake stage takes at three sizes of texture
-python -m benchmarks.textures --table-only                     only rewrite the tables of docs/benchmarks.md
+python -m benchmarks.textures --table-only                     only rewrite the tables of docs/benchmarks/textures.md
 
 WORKSPACES holds a workspace a set, named like the set in DATA, made with every eighth photo held out:
 
-    hineus run DATA/viking/images --workspace WORKSPACES/viking --set train.holdout=8
+    hineus run DATA/viking/images --workspace WORKSPACES/viking --set train.hold_out=8
 
 Each texture is baked from the other photos; the final mesh with it is drawn into the held-out ones and compared with
 them, inside the object's mask and where the mesh covers the pixel (how much of the mask that is has a column). Masks
@@ -33,10 +33,10 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.run_sets import GIB, NOT_MEASURED, OUT, PAGE, RESULTS, ROOT, machine, markdown_table, with_table
+from benchmarks.pages import NOT_MEASURED, markdown_table, write_tables
+from benchmarks.run_sets import GIB, OUT, RESULTS, ROOT, machine
 from stages import artifacts
 from stages.artifacts import AtlasMesh
-from stages.bake import load_photo
 from stages.drawing.rasterizing import NO_FACE, Texels, corner_weights, projected, rasterize, rasterize_atlas
 from stages.drawing.rasterizing import surface_points as _surface_points
 from stages.drawing.rendering import sample_texture
@@ -112,11 +112,11 @@ class Capture:
         self.cameras = artifacts.load_scene(self.undistorted).cameras
         held_out = artifacts.load_held_out(workspace / "train")
         if not held_out:
-            sys.exit(f"{workspace} held no photo out: run it with `--set train.holdout=8`")
+            sys.exit(f"{workspace} held no photo out: run it with `--set train.hold_out=8`")
         self.held_out = [i for i, name in enumerate(self.cameras.names) if name in held_out]
         self.training = [i for i, name in enumerate(self.cameras.names) if name not in held_out]
         self.atlas = artifacts.load_atlas(workspace / "atlas")
-        loaded = [load_photo(self.undistorted, self.cameras, i) for i in range(len(self.cameras))]
+        loaded = [artifacts.Pictures(self.undistorted).masked(name) for name in self.cameras.names]
         self.photos, self.own_masks = [photo for photo, _ in loaded], [mask for _, mask in loaded]
         self.masks_from = "the run" if self.own_masks[0] is not None else "silhouette"
         self.masks = list(self.own_masks)
@@ -456,10 +456,15 @@ def cost_table(results: Sequence[SetResult]) -> str:
     return markdown_table(["set", "texture size", "wall s", "CPU s", "peak GiB"], rows)
 
 
-def with_tables(page: str, results: Sequence[SetResult]) -> str:
-    """The page with both tables made anew."""
-    page = with_table(page, "textures", scores_table(results) if results else NOT_MEASURED)
-    return with_table(page, "texture cost", cost_table(results) if results else NOT_MEASURED)
+def tables_of(results: Sequence[SetResult]) -> dict[str, str]:
+    """Both tables."""
+    made = {"textures": scores_table, "texture cost": cost_table}
+    return {name: table(results) if results else NOT_MEASURED for name, table in made.items()}
+
+
+def tables() -> dict[str, str]:
+    """Both tables, from the result files."""
+    return tables_of(load_results())
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -490,7 +495,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                     cost = cost_of(arguments.workspaces / name, size)
                     before = replace(before, costs=before.costs | {str(size): cost})
                     save_result(before)
-    PAGE.write_text(with_tables(PAGE.read_text(encoding="utf-8"), load_results()), encoding="utf-8")
+    write_tables(tables())
     return 0
 
 

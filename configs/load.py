@@ -23,7 +23,9 @@ import yaml
 from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 
+from configs.dotted import nested
 from configs.params import Config
+from configs.renames import with_new_names
 from stages.errors import ConfigError
 
 
@@ -68,7 +70,7 @@ def load_config(preset: str | None = None, file: Path | None = None, sets: Seque
     merged: dict[str, Any] = {}
     origins: dict[str, str] = {}
     for group in groups:
-        layers = [(origin, _checked(layer, origin)) for origin, layer in group]
+        layers = [(origin, _checked(with_new_names(layer, origin), origin)) for origin, layer in group]
         backbones = [_backbone(layer.get("train", {}).get("backbone")) for _, layer in layers]
         for origin, layer in (*itertools.chain(*backbones), *layers):
             merged = _merge(merged, layer)
@@ -249,10 +251,7 @@ def _parse_set(text: str) -> dict[str, Any]:
             f"--set {text}: the value is not valid YAML ({getattr(error, 'problem', error)}).",
             "Quote it for the shell, for example `--set 'export.formats=[glb, ply]'`.",
         ) from error
-    layer: Any = value
-    for part in reversed(parts):
-        layer = {part: layer}
-    return layer
+    return nested({".".join(parts): value})
 
 
 def _merge(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
@@ -294,18 +293,23 @@ def _checked(
         elif value is not None:  # a section with all its lines commented out is fine
             raise ConfigError(
                 f"`{dotted}` in {origin} is a section of settings, not a value ({value!r}).",
-                f"Set one of its keys, for example `{dotted}.{next(iter(section.model_fields))}`.",
+                f"Set one of its keys, for example `{next(_fields(section, f'{dotted}.'))[0]}`.",
             )
     return checked
 
 
 def _nearest(key: str) -> str:
-    known = [setting for setting, _ in _fields()]
-    sections = list(Config.model_fields)
+    settings = dict(_fields())
+    known = dict.fromkeys([*settings, *(section for setting in settings for section in _ancestors(setting))])
     # The right name in the wrong section, or in none, is nearer than a similar one elsewhere.
+    by_name: dict[str, list[str]] = {}
+    for setting in known:
+        by_name.setdefault(setting.rpartition(".")[2], []).append(setting)
     name = key.rpartition(".")[2]
-    same_name = [setting for setting in known if setting.rpartition(".")[2] == name]
-    near = same_name or difflib.get_close_matches(key, [*known, *sections], 1, cutoff=0.5)
+    similar = by_name.get(name) or [
+        setting for near in difflib.get_close_matches(name, by_name, 3, cutoff=0.75) for setting in by_name[near]
+    ]
+    near = difflib.get_close_matches(key, similar, 1, cutoff=0) or difflib.get_close_matches(key, known, 1, cutoff=0.5)
     if near:
         return f"Did you mean `{near[0]}`? `hineus config --describe` lists all settings."
     return "`hineus config --describe` lists all settings."

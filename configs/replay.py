@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 import shlex
 from collections.abc import Mapping
-from typing import Any
 
+from configs.dotted import flatten
 from configs.load import load_config, preset_names
 from configs.params import Config
 
@@ -38,10 +38,7 @@ def settings_beyond(preset: str, config: Config) -> list[str]:
     backbone = []
     if load_config(preset).train.backbone != config.train.backbone:  # it brings settings of its own
         backbone = [f"train.backbone={config.train.backbone}"]
-    given, wanted = (_flat(settings) for settings in (load_config(preset, sets=backbone), config))
+    given, wanted = (
+        flatten(settings.model_dump(mode="json")) for settings in (load_config(preset, sets=backbone), config)
+    )
     return backbone + [f"{key}={json.dumps(value)}" for key, value in wanted.items() if value != given[key]]
-
-
-def _flat(config: Config) -> dict[str, Any]:
-    sections = config.model_dump(mode="json")
-    return {f"{section}.{key}": value for section, values in sections.items() for key, value in values.items()}

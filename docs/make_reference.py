@@ -6,7 +6,8 @@ python docs/make_reference.py
 from __future__ import annotations
 
 import inspect
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from stages import errors
 from stages.errors import HineusError
 
 PAGE = Path(__file__).parent / "reference.md"
+SHARED = 5  # options that so many commands take are explained once
 
 HEAD = """# Reference
 
@@ -33,16 +35,31 @@ def page() -> str:
 
 def _commands() -> Iterator[str]:
     yield "## Commands\n"
-    for name, command in all_commands().items():
+    commands = all_commands()
+    takers = Counter(_parameter_row(parameter) for command in commands.values() for parameter in command.params)
+    shared = [row for row, number in takers.items() if number >= SHARED]
+    yield "### Options of many commands\n"
+    yield "The commands below name those of them that they take.\n"
+    yield from _parameter_table(shared)
+    for name, command in commands.items():
         yield f"### hineus {name}\n"
         yield f"{inspect.cleandoc(command.help or '')}\n"
-        if not command.params:
-            continue
-        yield _row("parameter", "meaning", "default")
-        yield _row("---", "---", "---")
-        for parameter in command.params:
-            yield _row(_spelling(parameter), parameter.help or "", _default(parameter))
-        yield ""
+        rows = {parameter: _parameter_row(parameter) for parameter in command.params}
+        if own := [row for row in rows.values() if row not in shared]:
+            yield from _parameter_table(own)
+        if also := [f"`{_name(parameter)}`" for parameter, row in rows.items() if row in shared]:
+            yield f"{'Also t' if own else 'T'}akes {', '.join(also)}: see [above](#options-of-many-commands).\n"
+
+
+def _parameter_table(rows: Iterable[str]) -> Iterator[str]:
+    yield _row("parameter", "meaning", "default")
+    yield _row("---", "---", "---")
+    yield from rows
+    yield ""
+
+
+def _parameter_row(parameter: Any) -> str:
+    return _row(_spelling(parameter), parameter.help or "", _default(parameter))
 
 
 def all_commands() -> dict[str, Any]:
@@ -55,9 +72,13 @@ def all_commands() -> dict[str, Any]:
     return found
 
 
+def _name(parameter: Any) -> str:
+    return parameter.name.upper() if parameter.param_type_name == "argument" else parameter.opts[0]
+
+
 def _spelling(parameter: Any) -> str:
     if parameter.param_type_name == "argument":
-        return f"`{parameter.name.upper()}`"
+        return f"`{_name(parameter)}`"
     names = ", ".join(f"`{name}`" for name in parameter.opts)
     return names if parameter.is_flag else f"{names} VALUE"
 
@@ -74,16 +95,24 @@ def _settings() -> Iterator[str]:
         "Set them with `--set section.key=value`, or in a YAML file given with `--config`. The order is:\n"
         "defaults, then the preset, then the file, then `--set`.\n"
     )
-    settings = describe_settings()
-    for section, field in Config.model_fields.items():
-        yield f"### {section}\n"
-        yield f"{inspect.cleandoc(field.annotation.__doc__ or '').splitlines()[0]}\n"
+    described = {setting.key: setting for setting in describe_settings()}
+    for name, section in Config.model_fields.items():
+        yield from _group(name, section.annotation, described)
+
+
+def _group(name: str, kind: Any, described: dict[str, Setting], depth: int = 3) -> Iterator[str]:
+    """A group of settings, then the groups in it."""
+    yield f"{'#' * depth} {name}\n"
+    yield f"{inspect.cleandoc(kind.__doc__ or '').splitlines()[0]}\n"
+    keys = [f"{name}.{field}" for field in kind.model_fields]
+    if own := [described[key] for key in keys if key in described]:
         yield _row("setting", "values", "bounds", "default", "meaning")
         yield _row("---", "---", "---", "---", "---")
-        for setting in settings:
-            if setting.key.split(".")[0] == section:
-                yield _setting_row(setting)
+        yield from map(_setting_row, own)
         yield ""
+    for key, field in zip(keys, kind.model_fields.values(), strict=True):
+        if key not in described:
+            yield from _group(key, field.annotation, described, depth + 1)
 
 
 def _setting_row(setting: Setting) -> str:

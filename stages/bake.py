@@ -31,7 +31,7 @@ def run(context: StageContext[BakeParams]) -> dict[str, Any]:
     from stages.neural.trained_field import load_field
     from stages.texture.baking import bake_texture
     from stages.texture.relief import bake_normals, bake_occlusion
-    from stages.texture.vertex_quality import measure_quality
+    from stages.texture.vertex_quality import VertexWitness
 
     photos, cameras, held_out = context.read(PINHOLE_PHOTOS), context.read(CAMERAS), context.read(HELD_OUT)
     cameras = cameras.select([i for i, name in enumerate(cameras.names) if name not in held_out])
@@ -39,6 +39,7 @@ def run(context: StageContext[BakeParams]) -> dict[str, Any]:
     field = load_field(context.read(FIELD), context.device)
     params = context.params
     texels = rasterize_atlas(atlas.uvs, atlas.faces, atlas.texture_size)
+    witness = VertexWitness(atlas, len(cameras))
     try:
         baked = bake_texture(
             atlas,
@@ -53,6 +54,7 @@ def run(context: StageContext[BakeParams]) -> dict[str, Any]:
             robust_sigma=params.robust_sigma,
             workers=context.workers,
             listener=context.progress,
+            visit=witness.look,
         )
     except ValueError as error:
         raise ReconstructionError(
@@ -61,16 +63,7 @@ def run(context: StageContext[BakeParams]) -> dict[str, Any]:
         ) from error
     write_png(context.to_write(BASE_COLOR), baked.base_color)
     write_png(context.to_write(PROVENANCE), baked.provenance)
-    quality = measure_quality(
-        atlas,
-        texels,
-        cameras,
-        lambda index: photos.masked(cameras.names[index]),
-        baked.provenance,
-        baked.gains,
-        lambda done, total: context.progress(done, total, "judging vertices"),
-    )
-    context.write(QUALITY, quality)
+    context.write(QUALITY, witness.quality(texels, baked.provenance))
     numbers = dict(baked.numbers)
     if params.normal_map:
         full = context.read(CLEAN_FULL_MESH)

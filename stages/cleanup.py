@@ -49,8 +49,8 @@ def _masks(pictures: Pictures, cameras: PinholeCameras, margin: int) -> Iterator
 
 
 def run(context: StageContext[CleanupParams]) -> dict[str, Any]:
-    from stages.surface import triangle_mesh
-    from stages.surface.simplify import decimate
+    from stages.surface import selection, triangle_mesh
+    from stages.surface.decimation import decimate
 
     params = context.params
     scene = context.read(SCENE)
@@ -58,19 +58,19 @@ def run(context: StageContext[CleanupParams]) -> dict[str, Any]:
     vertices, faces = context.read(RAW_MESH)
     numbers: dict[str, Any] = {"faces_before": len(faces)}
 
-    def keep(selection: np.ndarray, what: str, hint: str) -> None:
+    def keep(chosen: np.ndarray, what: str, hint: str) -> None:
         nonlocal vertices, faces
-        numbers[what] = int(np.count_nonzero(~selection))
-        if not selection.any():
+        numbers[what] = int(np.count_nonzero(~chosen))
+        if not chosen.any():
             raise ReconstructionError(
                 f"Nothing of the mesh is left: its last {len(faces)} faces fell under '{what}'.", hint
             )
-        vertices, faces = triangle_mesh.compact(vertices, faces[selection])
+        vertices, faces = triangle_mesh.compact(vertices, faces[chosen])
 
     context.progress(0, 5, "region of interest and masks")
-    inside = triangle_mesh.inside_ball(vertices, faces, params.roi_radius)
+    inside = selection.inside_ball(vertices, faces, params.roi_radius)
     if params.keep_closed:
-        inside = triangle_mesh.whole_pieces(faces, inside)
+        inside = selection.whole_pieces(faces, inside)
     keep(
         inside, "outside_region", "Try `--set undistort.roi_scale=1.5`, or train for longer: `--set train.steps=6000`."
     )
@@ -81,14 +81,14 @@ def run(context: StageContext[CleanupParams]) -> dict[str, Any]:
     if scene.ground is not None and not params.keep_closed:
         under = _under_the_border(vertices, scene, UNDER_TOLERANCES * params.ground_tolerance)
         keep(np.asarray(~under[faces].all(1)), "under_ground", "Try `--set undistort.roi_scale=1.5`.")
-    selection, numbers["specks_dropped"] = triangle_mesh.large_pieces(faces, SPECK * params.min_component)
-    keep(selection, "speck_faces", "Try `--set cleanup.min_component=0`.")
+    large, numbers["specks_dropped"] = selection.large_pieces(faces, SPECK * params.min_component)
+    keep(large, "speck_faces", "Try `--set cleanup.min_component=0`.")
     if params.mask_hull:
         masks = _masks(context.read(PINHOLE_PHOTOS), cameras, params.mask_margin)
-        outside = triangle_mesh.outside_hull(vertices, cameras, masks, params.mask_outside)
+        outside = selection.outside_hull(vertices, cameras, masks, params.mask_outside)
         within = np.count_nonzero(outside[faces], axis=1) < 2
         keep(
-            triangle_mesh.whole_pieces(faces, within) if params.keep_closed else within,
+            selection.whole_pieces(faces, within) if params.keep_closed else within,
             "outside_masks",
             "Look at the masks (white is the object), or try `--set cleanup.mask_hull=false`.",
         )
@@ -100,7 +100,7 @@ def run(context: StageContext[CleanupParams]) -> dict[str, Any]:
 
     context.progress(2, 5, "what the cameras see")
     if params.min_views > 0:
-        views = triangle_mesh.count_views(
+        views = selection.count_views(
             vertices,
             faces,
             cameras,
@@ -111,8 +111,8 @@ def run(context: StageContext[CleanupParams]) -> dict[str, Any]:
         keep(_seen_faces(vertices, faces, views >= params.min_views, params), "unseen_faces", hint)
 
     context.progress(3, 5, "pieces")
-    selection, numbers["pieces_dropped"] = triangle_mesh.large_pieces(faces, params.min_component)
-    keep(selection, "piece_faces", "Try `--set cleanup.min_component=0`.")
+    large, numbers["pieces_dropped"] = selection.large_pieces(faces, params.min_component)
+    keep(large, "piece_faces", "Try `--set cleanup.min_component=0`.")
 
     context.progress(4, 5, "decimating")
     vertices, faces = decimate(*triangle_mesh.repair_manifold(vertices, faces), params.target_faces)
@@ -174,7 +174,9 @@ def _under_the_border(vertices: np.ndarray, scene: PosedScene, depth: float) -> 
     points = scene.points[np.linalg.norm(scene.points, axis=1) < 1]
     if scene.kind != "object" or (scene.ground.heights(points) < -depth).sum() > MAX_UNDER * len(points):
         return np.zeros(len(vertices), dtype=bool)
-    return (np.linalg.norm(vertices, axis=1) > BORDER_RADIUS) & (scene.ground.heights(vertices) < -depth)
+    hanging: np.ndarray = np.linalg.norm(vertices, axis=1) > BORDER_RADIUS
+    hanging &= scene.ground.heights(vertices) < -depth
+    return hanging
 
 
 def _without_bumps(
@@ -229,22 +231,22 @@ def _cut_above_ground(
 
 def _seen_faces(vertices: np.ndarray, faces: np.ndarray, seen: np.ndarray, params: CleanupParams) -> np.ndarray:
     """Faces [F] bool to keep, given which vertices [V] bool are seen: seen ones, their surroundings, small gaps."""
-    from stages.surface import triangle_mesh
+    from stages.surface import selection, triangle_mesh
 
-    chosen = seen[faces].any(1)
+    chosen: np.ndarray = seen[faces].any(1)
     if params.keep_closed:
-        return triangle_mesh.whole_pieces(faces, chosen)
+        return selection.whole_pieces(faces, chosen)
     if not chosen.any():
         return chosen
-    chosen = triangle_mesh.spread(faces, len(vertices), chosen, params.rings)
-    chosen = triangle_mesh.smooth_selection(faces, len(vertices), chosen, params.rings)
+    chosen = selection.spread(faces, len(vertices), chosen, params.rings)
+    chosen = selection.smooth_selection(faces, len(vertices), chosen, params.rings)
     area = np.linalg.norm(triangle_mesh.face_normals(vertices, faces), axis=1) / 2
-    return triangle_mesh.fill_small_gaps(vertices, faces, chosen, params.max_hidden_area * float(area[chosen].sum()))
+    return selection.fill_small_gaps(vertices, faces, chosen, params.max_hidden_area * float(area[chosen].sum()))
 
 
 CLEANUP: Stage[CleanupParams] = Stage(
     name="cleanup",
-    version=6,
+    version=7,
     settings=lambda config: config.cleanup,
     run=run,
     reads=(SCENE, PINHOLE_PHOTOS, GIVEN_REGION, RAW_MESH),

@@ -21,7 +21,7 @@ from stages.geometry.similarity import Similarity
 
 if TYPE_CHECKING:
     from configs.params import ExportParams
-    from stages.files.writing import Textures
+    from stages.files.contents import Textures
 
 
 @dataclass(frozen=True)
@@ -101,7 +101,7 @@ def _write_glb(asset: Asset) -> int:
 
 
 def _textured_glb(asset: Asset, mesh: artifacts.AtlasMesh, extras: dict[str, Any]) -> bytes:
-    from stages.files.writing import glb_bytes
+    from stages.files.glb import glb_bytes
 
     vertices, normals = asset.in_gltf(mesh)
     return glb_bytes(vertices, normals, mesh.uvs, mesh.faces, asset.textures, generator=generator(), extras=extras)
@@ -109,7 +109,7 @@ def _textured_glb(asset: Asset, mesh: artifacts.AtlasMesh, extras: dict[str, Any
 
 def _write_levels(asset: Asset, count: int) -> Iterator[tuple[int, int]]:
     """Faces and bytes of each level of detail."""
-    from stages.texture.levels import levels_of_detail
+    from stages.surface.levels_of_detail import levels_of_detail
 
     for level, light in enumerate(levels_of_detail(asset.mesh, count) if count else (), 1):
         data = _textured_glb(asset, light, {**asset.extras, "level_of_detail": level})
@@ -118,7 +118,7 @@ def _write_levels(asset: Asset, count: int) -> Iterator[tuple[int, int]]:
 
 def _write_collision(asset: Asset, count: int) -> tuple[int, int]:
     """Pieces and bytes of the collision shapes."""
-    from stages.files.writing import shapes_glb_bytes
+    from stages.files.glb import shapes_glb_bytes
     from stages.surface.collision import convex_pieces
 
     try:
@@ -155,7 +155,7 @@ def _write_usdz(asset: Asset) -> int:
 
 def _write_obj(asset: Asset) -> int:
     """The OBJ, its material and its images. Returns the bytes of the OBJ."""
-    from stages.files.writing import mtl_text, obj_text
+    from stages.files.obj import mtl_text, obj_text
 
     texture_path, mtl = artifacts.obj_texture_path(asset.out), artifacts.mtl_path(asset.out)
     texture_path.write_bytes(asset.textures.base_color)
@@ -170,7 +170,7 @@ def _write_obj(asset: Asset) -> int:
 
 
 def _write_ply(asset: Asset) -> int:
-    from stages.files.writing import ply_bytes
+    from stages.files.ply_stl import ply_bytes
 
     colors = vertex_colors(asset.textures.base_color, asset.mesh.uvs)
     data = ply_bytes(*asset.in_world(asset.mesh), colors, asset.mesh.faces, asset.note)
@@ -178,7 +178,7 @@ def _write_ply(asset: Asset) -> int:
 
 
 def _write_stl(asset: Asset) -> int:
-    from stages.files.writing import stl_bytes
+    from stages.files.ply_stl import stl_bytes
 
     vertices, _ = asset.in_world(asset.mesh)
     return artifacts.stl_path(asset.out).write_bytes(stl_bytes(vertices, asset.mesh.faces, asset.note))
@@ -186,7 +186,7 @@ def _write_stl(asset: Asset) -> int:
 
 def load_textures(context: StageContext[ExportParams]) -> Textures:
     """The images that the bake stage left."""
-    from stages.files.writing import Textures
+    from stages.files.contents import Textures
 
     optional = (context.read(NORMAL_MAP), context.read(OCCLUSION))
     normal, occlusion = (path.read_bytes() if path.exists() else None for path in optional)
@@ -208,7 +208,8 @@ def unit_normals(vertices: np.ndarray, normals: np.ndarray, faces: np.ndarray) -
             takes = usable & bad[faces[:, k]]
             unit[faces[takes, k]] = flat[takes]
         lengths = np.linalg.norm(unit, axis=1)
-    return unit / lengths[:, None]
+    unit /= lengths[:, None]
+    return unit
 
 
 def vertex_colors(texture_png: bytes, uvs: np.ndarray) -> np.ndarray:
@@ -252,7 +253,7 @@ def provenance(scene: PosedScene, place: Place, gltf_from_world: np.ndarray, run
 
 EXPORT: Stage[ExportParams] = Stage(
     name="export",
-    version=5,
+    version=6,
     settings=lambda config: config.export,
     run=run,
     reads=(SCENE, PLACE, ATLAS, BASE_COLOR, NORMAL_MAP, OCCLUSION),

@@ -37,7 +37,6 @@ REQUIRED = {
     "trimesh": "trimesh",
     "manifold3d": "manifold3d",
     "xatlas": "xatlas",
-    "fast_simplification": "fast-simplification",
     "jinja2": "jinja2",
     "pxr": "usd-core",
 }

@@ -17,7 +17,7 @@ FEW_PHOTOS = 20  # a full turn in steps of less than 20 degrees; sets below it l
 EXPECTED = ("not an image", "the raw file of", "the clip of")  # reasons to leave a file out that are no news
 NAMED = 4  # this many photos are named in a warning
 
-# All measured with `benchmarks/run_sets.py` on two cores, see docs/benchmarks.md.
+# All measured with `benchmarks/run_sets.py` on two cores, see docs/benchmarks/results.md.
 GIB = 1 << 30
 MEMORY_BASE_GIB = 1.5  # baking, the peak of all sets: 1.45 to 1.66 GiB
 MEMORY_OF_PHOTOS = 2.0  # training holds the photos' bytes twice while it puts them in a row
@@ -141,7 +141,8 @@ def _minutes(looked_at: list[float], config: Config, workers: int) -> float:
     count, train = len(looked_at), config.train
     pairs = count * (count - 1) / 2 if count <= config.sfm.exhaustive_max else 10 * count
     wall_per_cpu = 1 - PARALLEL_SHARE + PARALLEL_SHARE / workers
-    training_s = train.steps * train.rays * train.samples * TRAIN_CPU_S_PER_RAY_SAMPLE * wall_per_cpu
+    ray_samples = train.steps * train.sampling.rays * train.sampling.samples
+    training_s = ray_samples * TRAIN_CPU_S_PER_RAY_SAMPLE * wall_per_cpu
     if train.minutes is not None:
         training_s = 60 * train.minutes
     other_s = SFM_CPU_S_PER_MP * sum(looked_at) / 1e6 + SFM_CPU_S_PER_PAIR * pairs + OTHER_CPU_S

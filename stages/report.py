@@ -133,7 +133,7 @@ def describe_view(
 ) -> dict[str, Any]:
     """The 3D view and, where the bake stage left its measures, their colours and the next photos to take."""
     from stages.reporting import view3d
-    from stages.texture.next_views import suggest_views, vertex_needs
+    from stages.reporting.next_views import suggest_views, vertex_needs
 
     corners = region.box_corners() if region else None
     box = None if corners is None else scene.poses_from_scene.inverse().apply(corners)

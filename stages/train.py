@@ -20,7 +20,7 @@ from stages.errors import ConfigError, InputError, ReconstructionError
 from stages.geometry.cameras import PinholeCameras
 
 if TYPE_CHECKING:
-    from configs.params import TrainParams
+    from configs.training import TrainParams
 
 log = logging.getLogger(__name__)
 
@@ -43,8 +43,8 @@ def run(context: StageContext[TrainParams]) -> dict[str, Any]:
 
     _use_threads(context)
     params, scene = context.params, context.read(SCENE)
-    held_out = left_out(len(scene.cameras), params.holdout)
-    _check_hold_out(len(held_out), int(held_out.sum()), params.holdout)
+    held_out = left_out(len(scene.cameras), params.hold_out)
+    _check_hold_out(len(held_out), int(held_out.sum()), params.hold_out)
     images = _load_images(context.read(PINHOLE_PHOTOS), scene.cameras.names)
     photos = Photos(scene.cameras, *images, context.device, ~held_out)
     sightings = Sightings.from_scene(scene, context.device, (~held_out).numpy())
@@ -79,7 +79,7 @@ def run(context: StageContext[TrainParams]) -> dict[str, Any]:
     context.to_write(METRICS).write_bytes(metrics.read_bytes())
     seconds = spent + time.monotonic() - started
     summary: dict[str, Any] = _last_numbers(context.to_write(METRICS))
-    if params.holdout:
+    if params.hold_out:
         context.write(HELD_OUT, tuple(scene.cameras.names[i] for i in held_out.nonzero().flatten().tolist()))
         nothing = torch.zeros(0, 3, device=trainer.device)
         psnr = held_out_psnr(photos, lambda batch: trainer.render(batch, 1.0, nothing, None).colors)
@@ -87,7 +87,7 @@ def run(context: StageContext[TrainParams]) -> dict[str, Any]:
     return {
         "steps": trainer.step_index,
         "train_seconds": round(seconds, 1),
-        "rays_per_second": round(trainer.step_index * params.rays / max(seconds, 1e-9)),
+        "rays_per_second": round(trainer.step_index * params.sampling.rays / max(seconds, 1e-9)),
         "photos": len(photos),
         "sightings": len(sightings.weights),
         **summary,
@@ -122,7 +122,7 @@ def _start_from_shape(trainer: Any, cameras: PinholeCameras) -> None:
     """Where training is not to start from a sphere: bring the SDF to a room, or to the visual hull of the masks."""
     from stages.geometry.hull import room_distances
 
-    params = trainer.params
+    params = trainer.params.field
     inside = np.linalg.norm(cameras.centers, axis=1) < params.sphere_radius
     if params.init == "hull":
         error = trainer.start_from(_hull(cameras, trainer.photos))
@@ -140,9 +140,11 @@ def _hull(cameras: PinholeCameras, photos: Any) -> np.ndarray:
     """
     from stages.geometry.hull import hull_distances
 
-    advice = "Give a mask for each photo (`--masks FOLDER`), or start from a sphere: `--set train.init=sphere`."
+    advice = "Give a mask for each photo (`--masks FOLDER`), or start from a sphere: `--set train.field.init=sphere`."
     if photos.masks is None:
-        raise InputError(f"`train.init` = hull needs masks for all {len(cameras)} photos, and some have none.", advice)
+        raise InputError(
+            f"`train.field.init` = hull needs masks for all {len(cameras)} photos, and some have none.", advice
+        )
     masks = [photos.mask(i) if training else None for i, training in enumerate(photos.training.tolist())]
     distances = hull_distances(cameras, masks)
     if distances is None:
@@ -155,7 +157,7 @@ def _check_hold_out(num_photos: int, num_held_out: int, every: int) -> None:
     left = num_photos - num_held_out
     if every and (left < MIN_TRAINING or num_held_out == 0):
         found = f"leaves {left} of {num_photos} photos to train on (needed: {MIN_TRAINING} to {num_photos - 1})"
-        raise ConfigError(f"`train.holdout` = {every} {found}.", "Try `--hold-out 8`, or 0 for none.")
+        raise ConfigError(f"`train.hold_out` = {every} {found}.", "Try `--hold-out 8`, or 0 for none.")
 
 
 def _progress(step: int, seconds: float, params: TrainParams) -> float:
@@ -180,13 +182,13 @@ def _check(numbers: dict[str, float], step: int) -> None:
     if not np.isfinite(numbers["loss"]):
         raise ReconstructionError(
             f"Training diverged at step {step}: the loss is {numbers['loss']}.",
-            "Lower the learning rates: `--set train.lr_table=0.005 --set train.lr_network=0.001`",
+            "Lower the learning rates: `--set train.schedule.lr_table=0.005 --set train.schedule.lr_network=0.001`",
         )
     low, high = METRIC_GRADIENTS
     if step % SETTLED == 0 and not low <= numbers["gradient_norm"] <= high:
         log.warning(
             "step %d: the SDF's gradients have a mean length of %.2f, not about 1 (%.1f to %.1f); "
-            "`--set train.weight_eikonal=1` holds them, `train.eikonal` relaxes them",
+            "`--set train.losses.eikonal=1` holds them, `train.terms.eikonal` relaxes them",
             step, numbers["gradient_norm"], low, high,
         )  # fmt: skip
 

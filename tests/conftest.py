@@ -1,4 +1,4 @@
-"""Shared by all tests: where development data may lie. Nothing fails where it is absent."""
+"""Shared by all tests: `--check-shapes`, and where development data may lie. Nothing fails where it is absent."""
 
 from __future__ import annotations
 
@@ -12,6 +12,18 @@ settings.register_profile("project", deadline=None, derandomize=True)
 settings.load_profile("project")
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--check-shapes", action="store_true", help="check types and shapes of geometry and neural")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Before any test imports what is checked."""
+    if config.getoption("--check-shapes"):
+        from shape_checks import install
+
+        install()
 
 
 @pytest.fixture(scope="session")

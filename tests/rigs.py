@@ -1,12 +1,16 @@
-"""Captures of known geometry: poses, cameras and sparse points of the common ways to photograph."""
+"""Captures of known geometry: poses, cameras, scenes and sparse points of the common ways to photograph."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
 
-from stages.geometry.cameras import PinholeCameras
+from stages.geometry.cameras import PinholeCameras, PosedScene
 from stages.geometry.normalisation import rotation_onto
 from stages.geometry.region import frames_around
+from stages.geometry.similarity import Similarity
 
 EAST, NORTH, UP = np.eye(3)
 
@@ -30,6 +34,18 @@ def capture(poses: list[np.ndarray], size: tuple[int, int] = (640, 480), focal: 
     )
 
 
+def scene_without_points(
+    cameras: PinholeCameras, poses_from_scene: Similarity | None = None, **more: Any
+) -> PosedScene:
+    """Posed photos and nothing else; +z is up."""
+    none = {
+        "points": np.zeros((0, 3), np.float32),
+        "point_errors": np.zeros(0, np.float32),
+        "observations": np.zeros((0, 2), np.int32),
+    }
+    return PosedScene(cameras, poses_from_scene or Similarity.identity(), **none, up=UP, **more)
+
+
 def ring(
     target: np.ndarray,
     up: np.ndarray = UP,
@@ -46,6 +62,29 @@ def ring(
         offset = np.array([np.cos(angle) * np.cos(pitch), np.sin(angle) * np.cos(pitch), np.sin(pitch)])
         poses.append(look_at(target + distance * frame @ offset, target, up))
     return poses
+
+
+def three_rings(
+    count: int = 12, distance: float = 2.5, elevations: Sequence[float] = (15, 45, 75), size: int = 160
+) -> PinholeCameras:
+    """Cameras around and above the origin, looking at it; the unit sphere nearly fills their photos."""
+    extrinsics = []
+    for i in range(count):
+        turn, rise = 2 * np.pi * i / count, np.radians(elevations[i % len(elevations)])
+        center = distance * np.array([np.cos(turn) * np.cos(rise), np.sin(turn) * np.cos(rise), np.sin(rise)])
+        z = -center / distance
+        x = np.cross(z, [0, 0, 1.0])
+        x /= np.linalg.norm(x)
+        rotation = np.stack([x, np.cross(z, x), z])
+        extrinsics.append(np.column_stack([rotation, -rotation @ center]))
+    focal = 0.45 * size * np.sqrt(distance**2 - 1)
+    K = np.array([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]])
+    return PinholeCameras(
+        names=tuple(f"{i:02d}.png" for i in range(count)),
+        sizes=np.full((count, 2), size),
+        intrinsics=np.repeat(K[None], count, 0),
+        cam_from_scene=np.array(extrinsics),
+    )
 
 
 def dome_on_a_table(seed: int = 0, noise: float = 0.002) -> tuple[PinholeCameras, np.ndarray]:

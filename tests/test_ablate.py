@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import itertools
 import json
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from benchmarks import ablate
+from benchmarks import ablate, pages
 from benchmarks.ablate import BASE, VARIANTS, Plan, Run, ablation_table, load_runs, parse_extra, save_run, settings_of
 from configs.load import load_config
 from stages import artifacts
@@ -39,7 +39,7 @@ def here(tmp_path, monkeypatch):
     """Result files, run folders and a page of their own; a set with a known surface and one without."""
     monkeypatch.setattr(ablate, "RUNS", tmp_path / "runs")
     monkeypatch.setattr(ablate, "FOLDERS", tmp_path / "out")
-    monkeypatch.setattr(ablate, "PAGE", tmp_path / "page.md")
+    monkeypatch.setattr(pages, "DOCS", tmp_path)
     (tmp_path / "page.md").write_text("top\n<!-- table ablation -->\n<!-- end ablation -->\nbottom\n")
     for name in ("helmet", "scan"):
         (tmp_path / "data" / name / "images").mkdir(parents=True)
@@ -61,25 +61,28 @@ def test_no_two_variants_are_the_same():
 
 
 def test_the_base_has_every_term_off_whatever_the_defaults():
-    sets = ["train.planar=paper", "train.ambiguity=stable", *settings_of({})]
+    sets = ["train.terms.planar.form=paper", "train.terms.ambiguity.form=stable", *settings_of({})]
     train = load_config("cpu", None, sets).train
-    assert (train.ambiguity, train.reflection, train.planar, train.eikonal) == ("off", "off", "off", "plain")
+    terms = train.terms
+    forms = (terms.ambiguity.form, terms.reflection.form, terms.planar.form, terms.eikonal.form)
+    assert forms == ("off", "off", "off", "plain")
 
 
 @pytest.mark.parametrize("preset", ["cpu", "gpu", "demo"])
 def test_a_plan_fixes_steps_seed_and_hold_out_whatever_the_preset(preset):
     plan = Plan("helmet", "ambiguity", 3, 700, preset, settings_of(VARIANTS["ambiguity"]), 8)
     train = load_config(preset, None, plan.sets).train
-    assert (train.steps, train.minutes, train.seed, train.holdout, train.ambiguity) == (700, None, 3, 8, "stable")
+    assert (train.steps, train.minutes, train.seed, train.hold_out) == (700, None, 3, 8)
+    assert train.terms.ambiguity.form == "stable"
 
 
 def test_an_extra_variant_is_named_settings_on_top_of_the_base_or_of_a_variant():
     assert parse_extra("far:reflection_reach=0.3,cleanup.min_views=2") == (
-        "far", {"train.reflection_reach": "0.3", "cleanup.min_views": "2"}
+        "far", {"train.terms.reflection.reach": "0.3", "cleanup.min_views": "2"}
     )  # fmt: skip
     _, changes = parse_extra("far:planar-mlp,weight_planar=0.3")
-    assert changes == {**VARIANTS["planar-mlp"], "train.weight_planar": "0.3"}
-    assert load_config("cpu", None, settings_of(changes)).train.weight_planar == 0.3
+    assert changes == {**VARIANTS["planar-mlp"], "train.terms.planar.weight": "0.3"}
+    assert load_config("cpu", None, settings_of(changes)).train.terms.planar.weight == 0.3
 
 
 @pytest.mark.parametrize("text", ["far", "far:", "planar:steps=3", "a/b:steps=3", "far:nothing"])
@@ -105,7 +108,7 @@ def test_a_variant_is_compared_with_base_over_the_seeds():
     ]
     table = ablation_table(runs)
     assert table.startswith("**helmet**\n\n| variant |")
-    assert "- planar: `train.planar=stable`" in table
+    assert "- planar: `train.terms.planar.form=stable`" in table
 
 
 @pytest.mark.parametrize(
@@ -148,13 +151,6 @@ def test_results_of_other_code_are_marked():
     assert [row[6] for row in _rows(runs)] == ["-", "-50.0 % *", "-50.0 %"]
     assert "Versions: `c` base, eikonal; `d` planar." in ablation_table(runs)
     assert "Versions" not in ablation_table([_run(), _run("planar")])
-
-
-def test_the_table_of_the_page_is_that_of_the_result_files():
-    page = ablate.PAGE.read_text(encoding="utf-8")
-    runs = load_runs()
-    body = ablation_table(runs) if runs else ablate.NOT_MEASURED
-    assert page == ablate.with_table(page, "ablation", body), "run `make docs`"
 
 
 # ---------------------------------------------------------------- running
@@ -254,7 +250,7 @@ def test_a_run_calls_the_stages_on_the_shared_poses_and_leaves_its_figures_only(
     run = ablate.measure(plan, here / "data", jobs=2)
     train, extract = calls
     assert (dict(train.inputs), train.workers) == ({"undistort": shared}, 1)
-    assert (train.params.planar, train.params.seed, train.params.steps) == ("stable", 1, 9)
+    assert (train.params.terms.planar.form, train.params.seed, train.params.steps) == ("stable", 1, 9)
     assert extract.inputs["train"] == train.out
     assert (run.psnr, run.held_out_psnr, run.value, run.code) == (31.25, 28.5, 0.5, ablate.code_hash())
     assert run.machine["jobs"] == "2"
@@ -329,20 +325,23 @@ def test_the_mesh_is_scored_in_the_world_frame(here, monkeypatch):
 
 
 def test_a_scene_without_sparse_points_trains(tmp_path):
-    from sphere_scene import ring_of_cameras, sphere_scene, write_undistorted
+    from rigs import scene_without_points
+    from sphere_scene import ring_of_cameras, write_undistorted
+    from train_settings import small
 
-    from configs.params import TrainParams
     from stages import train
 
     cameras = ring_of_cameras()
     folder, out, scratch = (tmp_path / name for name in ("undistort", "out", "scratch"))
     write_undistorted(folder, cameras)
-    nothing = {"points": np.zeros((0, 3)), "point_errors": np.zeros(0), "observations": np.zeros((0, 2), np.int32)}
-    artifacts.save_scene(folder, replace(sphere_scene(cameras), **nothing))
+    artifacts.save_scene(folder, scene_without_points(cameras))
     out.mkdir()
     scratch.mkdir()
-    params = TrainParams(steps=2, rays=32, samples=8, levels=2, start_levels=2, log2_rows=9, coarsest=8, finest=16,
-                         sdf_width=8, radiance_width=8, cache_resolution=16, background=False)  # fmt: skip
+    params = small({
+        "steps": 2, "sampling.rays": 32, "sampling.samples": 8, "field.levels": 2, "schedule.start_levels": 2,
+        "field.log2_rows": 9, "field.coarsest": 8, "field.finest": 16, "field.sdf_width": 8, "field.radiance_width": 8,
+        "sampling.cache_resolution": 16, "field.background": False,
+    })  # fmt: skip
     numbers = train.run(StageContext({"undistort": folder}, {}, out, scratch, params))
     assert (numbers["steps"], numbers["sightings"]) == (2, 0)
     assert artifacts.field_path(out).exists()

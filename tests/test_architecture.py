@@ -44,15 +44,3 @@ def test_no_drawer_modules():
     """A module is named after what it does."""
     names = {path.stem for folder in ("hineus_cli", "stages", "configs") for path in (ROOT / folder).rglob("*.py")}
     assert not names & {"utils", "common", "helpers", "misc"}
-
-
-def test_stages_do_not_import_each_other():
-    """import-linter allows siblings in one layer only where they are independent; this says it in plain words."""
-    from stages.pipeline import PIPELINE
-
-    names = [stage.name for stage in PIPELINE]
-    for name in names:
-        source = (ROOT / "stages" / f"{name}.py").read_text(encoding="utf-8")
-        for other in set(names) - {name}:
-            assert f"from stages.{other} " not in source
-            assert f"import stages.{other}\n" not in source

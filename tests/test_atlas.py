@@ -12,8 +12,8 @@ from stages import artifacts
 from stages.atlas import ATLAS_STAGE
 from stages.engine.stage import StageContext
 from stages.errors import ReconstructionError
+from stages.surface.decimation import decimate
 from stages.surface.isosurface import extract_isosurface
-from stages.surface.simplify import decimate
 from stages.texture import charts
 
 TEXTURE, PADDING = 512, 4

@@ -8,16 +8,16 @@ from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
+from rigs import scene_without_points
 
 from configs.params import BakeParams
 from stages import artifacts
-from stages.artifacts import AtlasMesh, write_png
+from stages.artifacts import AtlasMesh, Pictures, write_png
 from stages.bake import BAKE
 from stages.drawing.rendering import look_at
 from stages.engine.stage import StageContext
 from stages.errors import ReconstructionError, WorkspaceError
-from stages.geometry.cameras import PinholeCameras, PosedScene
-from stages.geometry.similarity import Similarity
+from stages.geometry.cameras import PinholeCameras
 from stages.texture.baking import Provenance
 
 SKY = np.array([90, 160, 210], np.uint8)
@@ -56,8 +56,7 @@ def context(tmp_path, monkeypatch) -> StageContext:
         np.concatenate([view.intrinsics for view in views]),
         np.concatenate([view.cam_from_scene for view in views]),
     )
-    scene = PosedScene(cameras, Similarity.identity(), np.zeros((1, 3)), np.zeros(1), np.zeros((1, 2)), up)
-    artifacts.save_scene(folders["undistort"], scene)
+    artifacts.save_scene(folders["undistort"], scene_without_points(cameras))
     for name in cameras.names:
         path = artifacts.image_path(folders["undistort"], name)
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -112,6 +111,19 @@ def test_the_quality_of_each_vertex_is_kept(context):
     assert (quality.seen_by[4:] == 0).all()
     assert quality.invented[:4].max() < 0.5
     np.testing.assert_allclose(quality.texel_density, np.sqrt(64**2 * 0.4 * 0.8), rtol=1e-5)
+
+
+def test_each_photo_is_read_and_its_depths_drawn_once(context, monkeypatch):
+    from stages.texture import photo_views
+
+    loaded, drawn = [], []
+    draw = photo_views.depth_map
+    load = Pictures.masked
+    monkeypatch.setattr(Pictures, "masked", lambda photos, name: loaded.append(name) or load(photos, name))
+    monkeypatch.setattr(photo_views, "depth_map", lambda *what: drawn.append(what[1]) or draw(*what))
+    BAKE.run(context)
+    assert sorted(loaded) == ["one.png", "sub/two.png"]
+    assert sorted(drawn) == [0, 1]
 
 
 def test_a_mask_hides_what_lies_outside_it(context):

@@ -114,7 +114,7 @@ def test_one_json_a_run_with_settings_costs_and_scores(data: Path):
     assert (result["method"], result["preset"], result["seed"]) == ("hineus", "tiny", 0)
     assert result["settings"]["undistort.max_side"] == 64
     assert result["settings"]["train.steps"] == 500
-    assert "train.holdout" not in result["settings"]
+    assert "train.hold_out" not in result["settings"]
     assert [stage["name"] for stage in result["stages"]] == ["ingest", "sfm", "place", "undistort", "cleanup"]
     assert result["wall_s"] > 0
     assert result["wall_after_poses_s"] == pytest.approx(result["stages"][-1]["wall_s"], abs=0.01)
@@ -273,6 +273,7 @@ class GreyBall:
         return FieldDrawing(colors, covered.astype(np.float32), covered, background=False)
 
 
+@pytest.mark.slow
 def test_views_of_nerf_synthetic_are_whole_photos_on_white(data: Path, monkeypatch: pytest.MonkeyPatch):
     write_suite("nerf-synthetic", data)
     monkeypatch.setattr(scoring, "field_drawer", lambda workspace, device: GreyBall())
@@ -300,6 +301,7 @@ def test_views_of_nerf_synthetic_are_whole_photos_on_white(data: Path, monkeypat
 COPY = "import shutil, sys; shutil.copy(sys.argv[1], sys.argv[2])"
 
 
+@pytest.mark.slow
 def test_a_peer_s_mesh_is_scored_by_the_same_protocol_in_the_same_run(data: Path):
     truth = write_suite("known", data) / "gt_mesh.ply"
     peer = f'{sys.executable} -c "{COPY}" {truth} {{out}}'

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from benchmarks import blender_import
-from stages.files.writing import Textures, glb_bytes, shapes_glb_bytes
+from stages.files.contents import Textures
+from stages.files.glb import glb_bytes, shapes_glb_bytes
 
 CORNERS = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
 FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])

@@ -6,43 +6,23 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from rigs import scene_without_points, three_rings
 
 from configs.params import CleanupParams
 from stages import artifacts
 from stages.cleanup import CLEANUP
 from stages.engine.stage import StageContext
 from stages.errors import ReconstructionError
-from stages.geometry.cameras import PinholeCameras, PosedScene
+from stages.geometry.cameras import PinholeCameras
 from stages.geometry.place import given_region
 from stages.geometry.plane import Plane
 from stages.geometry.similarity import Similarity
-from stages.surface import triangle_mesh
+from stages.surface import selection, triangle_mesh
+from stages.surface.decimation import decimate
 from stages.surface.isosurface import extract_isosurface
-from stages.surface.simplify import AGGRESSIVENESS, decimate
 from stages.surface.solids import extract_solid
 
 SIZE = 160
-
-
-def ring_of_cameras(count=12, distance=2.5, elevations=(15, 45, 75)):
-    """Cameras around and above the origin, looking at it."""
-    extrinsics = []
-    for i in range(count):
-        turn, rise = 2 * np.pi * i / count, np.radians(elevations[i % len(elevations)])
-        center = distance * np.array([np.cos(turn) * np.cos(rise), np.sin(turn) * np.cos(rise), np.sin(rise)])
-        z = -center / distance
-        x = np.cross(z, [0, 0, 1.0])
-        x /= np.linalg.norm(x)
-        rotation = np.stack([x, np.cross(z, x), z])
-        extrinsics.append(np.column_stack([rotation, -rotation @ center]))
-    focal = 0.45 * SIZE * np.sqrt(distance**2 - 1)
-    K = np.array([[focal, 0, SIZE / 2], [0, focal, SIZE / 2], [0, 0, 1]])
-    return PinholeCameras(
-        names=tuple(f"{i:02d}.png" for i in range(count)),
-        sizes=np.full((count, 2), SIZE),
-        intrinsics=np.repeat(K[None], count, 0),
-        cam_from_scene=np.array(extrinsics),
-    )
 
 
 def ball(radius=0.5, center=(0, 0, 0), resolution=32):
@@ -64,10 +44,8 @@ def stage(tmp_path):
     def run(vertices, faces, masks=None, scene_extras=None, region=None, **params):
         for folder in (undistort, extract, place, out):
             folder.mkdir()
-        cameras = ring_of_cameras()
-        empty = np.zeros((0, 2), dtype=np.int32)
-        scene = PosedScene(cameras, Similarity.identity(), np.zeros((0, 3)), np.zeros(0), empty, np.array([0, 0, 1.0]))
-        artifacts.save_scene(undistort, replace(scene, **(scene_extras or {})))
+        cameras = three_rings()
+        artifacts.save_scene(undistort, replace(scene_without_points(cameras), **(scene_extras or {})))
         artifacts.save_given_region(place, region)
         artifacts.save_mesh(extract, vertices, faces)
         if masks is not None:
@@ -91,16 +69,16 @@ def stage(tmp_path):
 
 def test_small_pieces_go_and_their_number_is_told():
     vertices, faces = join(ball(), ball(0.06, (0.8, 0, 0)), ball(0.06, (-0.8, 0, 0)))
-    keep, dropped = triangle_mesh.large_pieces(faces, 0.1)
+    keep, dropped = selection.large_pieces(faces, 0.1)
     assert dropped == 2
     assert np.linalg.norm(vertices[faces[keep]], axis=2).max() < 0.55
-    assert triangle_mesh.large_pieces(faces, 0.0) == (pytest.approx(np.ones(len(faces), bool)), 0)
+    assert selection.large_pieces(faces, 0.0) == (pytest.approx(np.ones(len(faces), bool)), 0)
 
 
 def test_views_of_a_ball_are_those_on_its_near_side():
     vertices, faces = ball()
-    cameras = ring_of_cameras(count=1, elevations=(0,))  # at +x
-    seen = triangle_mesh.count_views(vertices, faces, cameras, enough=1) > 0
+    cameras = three_rings(count=1, elevations=(0,))  # at +x
+    seen = selection.count_views(vertices, faces, cameras, enough=1) > 0
     horizon = 0.5**2 / 2.5  # the tangent cone touches the ball at x = r^2 / d
     assert seen[vertices[:, 0] > horizon + 0.06].all()
     assert not seen[vertices[:, 0] < horizon - 0.06].any()
@@ -108,17 +86,17 @@ def test_views_of_a_ball_are_those_on_its_near_side():
 
 def test_views_are_counted_up_to_enough():
     vertices, faces = ball()
-    cameras = ring_of_cameras()
+    cameras = three_rings()
     top = vertices[:, 2].argmax()
-    assert triangle_mesh.count_views(vertices, faces, cameras, enough=3)[top] == 3
-    assert triangle_mesh.count_views(vertices, faces, cameras, enough=99)[top] == len(cameras)
+    assert selection.count_views(vertices, faces, cameras, enough=3)[top] == 3
+    assert selection.count_views(vertices, faces, cameras, enough=99)[top] == len(cameras)
 
 
 def test_what_lies_outside_the_image_is_not_seen():
     vertices, faces = ball()
-    cameras = ring_of_cameras(count=1, elevations=(0,))
+    cameras = three_rings(count=1, elevations=(0,))
     narrow = PinholeCameras(cameras.names, np.array([[SIZE // 2, SIZE]]), cameras.intrinsics, cameras.cam_from_scene)
-    seen = triangle_mesh.count_views(vertices, faces, narrow, enough=1) > 0
+    seen = selection.count_views(vertices, faces, narrow, enough=1) > 0
     pixels, _ = cameras.project(0, vertices)
     assert seen.any()
     assert not seen[pixels[:, 0] >= SIZE // 2].any()
@@ -128,7 +106,7 @@ def test_small_unseen_gaps_are_kept_and_large_ones_dropped():
     vertices, faces = ball()
     middle = vertices[faces].mean(1)
     small, large = middle[:, 2] > 0.48, middle[:, 2] < -0.1
-    keep = triangle_mesh.fill_small_gaps(vertices, faces, ~small & ~large, max_area=0.2)
+    keep = selection.fill_small_gaps(vertices, faces, ~small & ~large, max_area=0.2)
     assert keep[small].all()
     assert not keep[large].any()
 
@@ -136,16 +114,16 @@ def test_small_unseen_gaps_are_kept_and_large_ones_dropped():
 def test_unseen_islands_are_not_gaps():
     vertices, faces = join(ball(), ball(0.06, (0.8, 0, 0)))
     island = np.linalg.norm(vertices[faces].mean(1), axis=1) > 0.6
-    assert not triangle_mesh.fill_small_gaps(vertices, faces, ~island, max_area=10)[island].any()
+    assert not selection.fill_small_gaps(vertices, faces, ~island, max_area=10)[island].any()
 
 
 def test_smoothing_a_selection_fills_notches_only():
     vertices, faces = ball()
     notch = np.zeros(len(faces), dtype=bool)
     notch[np.flatnonzero(vertices[faces].mean(1)[:, 2] > 0)[0]] = True
-    assert triangle_mesh.smooth_selection(faces, len(vertices), ~notch, 2).all()
+    assert selection.smooth_selection(faces, len(vertices), ~notch, 2).all()
     half = vertices[faces].mean(1)[:, 2] > 0
-    smooth = triangle_mesh.smooth_selection(faces, len(vertices), half, 2)
+    smooth = selection.smooth_selection(faces, len(vertices), half, 2)
     assert smooth[half].all()
     assert vertices[faces[smooth]].mean(1)[:, 2].min() > -0.15
 
@@ -213,38 +191,41 @@ def test_decimation_keeps_shape_and_closedness():
     np.testing.assert_array_equal(same[1], faces)
 
 
-def test_decimation_falls_back_where_the_fast_one_breaks_the_mesh(monkeypatch):
-    import fast_simplification
-
-    vertices, faces = ball(resolution=24)
-    broken = np.concatenate([faces, [[faces[0, 0], faces[0, 1], 50]]]).astype(np.int32)
-    monkeypatch.setattr(fast_simplification, "simplify", lambda *a, **k: (vertices, broken))
-    _, kept = decimate(vertices, faces, 400)
-    assert len(kept) <= 400
-    assert triangle_mesh.mesh_state(kept).manifold
-    assert triangle_mesh.mesh_state(kept).watertight
-
-
-def test_decimation_of_a_closed_mesh_leaves_no_hole(monkeypatch):
-    import fast_simplification
-
-    vertices, faces = ball(resolution=24)
-    monkeypatch.setattr(fast_simplification, "simplify", lambda *a, **k: (vertices, faces[1:]))
-    _, kept = decimate(vertices, faces, 400)
-    assert len(kept) <= 400
-    assert triangle_mesh.mesh_state(kept) == triangle_mesh.MeshState(0, 0, 0)
-
-
-def test_decimation_reaches_its_target_where_the_fast_one_gives_up():
-    import fast_simplification
-
+def test_decimation_reaches_its_target_on_a_rough_surface_and_leaves_no_hole():
     vertices, faces = ball(resolution=48)
     rough = (vertices * np.random.default_rng(0).normal(1, 0.03, (len(vertices), 1))).astype(np.float32)
-    given_up = fast_simplification.simplify(rough, faces, target_count=1000, agg=AGGRESSIVENESS)[1]
-    assert len(given_up) > 2000
     _, kept = decimate(rough, faces, 1000)
     assert 990 <= len(kept) <= 1000
     assert triangle_mesh.mesh_state(kept) == triangle_mesh.MeshState(0, 0, 0)
+
+
+def test_decimation_keeps_a_border_in_place_and_lightens_it():
+    vertices, faces = ball(resolution=96)
+    upper, kept = triangle_mesh.clip(vertices, faces, np.array([0.0, 0, 1]), 0.1)
+    light, few = decimate(upper, kept, 600)
+    assert len(few) <= 600
+    before, after = triangle_mesh.mesh_state(kept), triangle_mesh.mesh_state(few)
+    assert after.manifold
+    assert 10 < after.open_edges < before.open_edges / 2
+    use = triangle_mesh.edge_use(few)
+    rim = few[use.face, use.slot][use.counts[use.edge] == 1]
+    np.testing.assert_allclose(light[rim, 2], 0.1, atol=0.005)
+    np.testing.assert_allclose(np.linalg.norm(light[rim, :2], axis=1), np.sqrt(0.5**2 - 0.1**2), atol=0.01)
+
+
+def test_decimation_does_not_depend_on_what_pymeshlab_did_before():
+    import pymeshlab
+
+    first = decimate(*ball(resolution=32), 500)
+    meshes = pymeshlab.MeshSet()
+    meshes.add_mesh(pymeshlab.Mesh(*ball(resolution=16)))
+    meshes.meshing_decimation_quadric_edge_collapse(
+        targetfacenum=100, optimalplacement=False, planarquadric=True, planarweight=1.0, qualitythr=1.0,
+        boundaryweight=9.0, qualityweight=False, autoclean=False,
+    )  # fmt: skip
+    again = decimate(*ball(resolution=32), 500)
+    for before, after in zip(first, again, strict=True):
+        np.testing.assert_array_equal(before, after)
 
 
 def test_decimation_refuses_an_impossible_target():
@@ -253,13 +234,13 @@ def test_decimation_refuses_an_impossible_target():
 
 
 def test_hull_drops_what_most_masks_exclude_but_trusts_no_single_mask():
-    cameras = ring_of_cameras()
+    cameras = three_rings()
     points = np.array([[0, 0, 0], [0.8, 0, 0.0], [0, 0, 0.3]])
     disk = silhouettes(cameras)
-    assert triangle_mesh.outside_hull(points, cameras, disk, 0.1).tolist() == [False, True, False]
+    assert selection.outside_hull(points, cameras, disk, 0.1).tolist() == [False, True, False]
     one_bad = [(i, mask if i else np.zeros_like(mask)) for i, mask in disk]
-    assert triangle_mesh.outside_hull(points, cameras, one_bad, 0.05).tolist() == [False, True, False]
-    assert not triangle_mesh.outside_hull(points, cameras, [], 0.1).any()
+    assert selection.outside_hull(points, cameras, one_bad, 0.05).tolist() == [False, True, False]
+    assert not selection.outside_hull(points, cameras, [], 0.1).any()
 
 
 def silhouettes(cameras, radius=0.5):
@@ -419,9 +400,8 @@ def test_stage_drops_flaps_under_the_ground_at_the_border_unless_points_lie_ther
     surface = extract_solid(lambda p: np.minimum(slab(p), np.minimum(flap(p), pit(p))), 64)
     points = np.random.default_rng(0).uniform([-0.6, -0.6, -0.1], [0.6, 0.6, 0.1], (200, 3))
     points[: 10 if seen_below else 1, 2] = -0.3
-    numbers, vertices, _ = stage(
-        surface.vertices, surface.faces, scene_extras={"ground": ground, "points": points}, min_views=0
-    )
+    seen = {"points": points.astype(np.float32), "point_errors": np.zeros(200, np.float32)}
+    numbers, vertices, _ = stage(surface.vertices, surface.faces, scene_extras={"ground": ground, **seen}, min_views=0)
     assert (numbers["under_ground"] > 0) != seen_below
     low = vertices[vertices[:, 2] < -0.2]
     assert (low[:, 0] < 0.4).any()
@@ -429,7 +409,7 @@ def test_stage_drops_flaps_under_the_ground_at_the_border_unless_points_lie_ther
 
 
 def test_stage_says_when_a_solid_was_wanted_and_is_none(stage, monkeypatch, caplog):
-    decimated = "stages.surface.simplify.decimate"
+    decimated = "stages.surface.decimation.decimate"
     monkeypatch.setattr(decimated, lambda vertices, faces, target: (vertices, faces[1:]))
     numbers, _, _ = stage(*ball(), keep_closed=True)
     assert numbers["open_edges"] > 0

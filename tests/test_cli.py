@@ -154,11 +154,11 @@ def test_time_sets_the_training_budget(folder: Path) -> None:
 def test_hold_out_keeps_every_nth_photo_back_and_is_remembered(folder: Path) -> None:
     config = folder / "photos_hineus" / "config.yaml"
     hineus("run", "photos", "--hold-out", "8")
-    assert "holdout: 8\n" in config.read_text()
+    assert "hold_out: 8\n" in config.read_text()
     hineus("run", "photos")
-    assert "holdout: 8\n" in config.read_text()
+    assert "hold_out: 8\n" in config.read_text()
     hineus("run", "photos", "--hold-out", "0")
-    assert "holdout: 0\n" in config.read_text()
+    assert "hold_out: 0\n" in config.read_text()
 
 
 def test_hold_out_is_a_number_of_photos_in_run_bench_and_help(monkeypatch: pytest.MonkeyPatch) -> None:

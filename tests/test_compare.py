@@ -35,6 +35,7 @@ def hineus(*args: str, monkeypatch, capsys) -> tuple[int, str]:
     return int(ended.value.code or 0), capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_the_command_tells_numbers_and_writes_the_map(tmp_path, monkeypatch, capsys):
     workspace = tmp_path / "run"
     (workspace / "export").mkdir(parents=True)

@@ -6,9 +6,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 
 from configs.load import config_yaml, describe_settings, load_config, preset_names, preset_summary, preset_text
 from configs.params import Config
+from configs.renames import REMOVED, RENAMED, section_with_new_names
+from configs.replay import settings_beyond
 from stages.errors import ConfigError
 
 
@@ -129,26 +132,121 @@ BACKBONES = {
 @pytest.mark.parametrize("name", BACKBONES)
 def test_a_backbone_sets_density_scale_gradients_and_encoding(name):
     train = load_config("cpu", None, [f"train.backbone={name}"]).train
-    assert (train.density, train.scale, train.gradients, train.encoding) == BACKBONES[name]
+    assert (train.density.form, train.density.scale, train.field.gradients, train.field.encoding) == BACKBONES[name]
 
 
 @pytest.mark.parametrize("backwards", [False, True])
 def test_what_is_named_beside_a_backbone_wins_in_any_order(backwards):
-    sets = ["train.backbone=neuralangelo", "train.density=laplace"]
+    sets = ["train.backbone=neuralangelo", "train.density.form=laplace"]
     train = load_config("cpu", None, sets[::-1] if backwards else sets).train
-    assert (train.density, train.gradients) == ("laplace", "numerical")
+    assert (train.density.form, train.field.gradients) == ("laplace", "numerical")
 
 
 def test_a_backbone_over_a_file_that_states_everything_wins_and_below_it_does_not(tmp_path):
     file = tmp_path / "config.yaml"
-    file.write_text(config_yaml(load_config("cpu", None, ["train.backbone=neus2", "train.density=laplace"])))
-    assert load_config(None, file).train.density == "laplace"
-    assert load_config(None, file, ["train.backbone=neus2"]).train.density == "neus"
+    file.write_text(config_yaml(load_config("cpu", None, ["train.backbone=neus2", "train.density.form=laplace"])))
+    assert load_config(None, file).train.density.form == "laplace"
+    assert load_config(None, file, ["train.backbone=neus2"]).train.density.form == "neus"
 
 
 def test_an_unknown_backbone_is_refused_with_those_there_are():
     with pytest.raises(ConfigError, match=r"hineus \| neus2"):
         load_config("cpu", None, ["train.backbone=../presets/cpu"])
+
+
+# ---------------------------------------------------------------- groups in groups, and names of before
+def test_settings_in_groups_are_set_named_and_refused_like_others():
+    sets = ["train.terms.planar.form=stable", "train.terms.planar.rays=9", "train.sampling.rays=8"]
+    train = load_config(sets=sets).train
+    assert (train.terms.planar.form, train.terms.planar.rays, train.sampling.rays) == ("stable", 9, 8)
+    assert train.terms.planar.radius == Config().train.terms.planar.radius
+    for text, said in {
+        "train.terms.planar.rays=0": "`train.terms.planar.rays` = 0 in --set train.terms.planar.rays=0 is out",
+        "train.terms.planar.form=no": "it must be off | paper | stable",
+        "train.terms.planar.from=1": "Unknown setting `train.terms.planar.from`",
+        "train.terms=3": "for example `train.terms.ambiguity.form`",
+        "train.terms.planer.form=off": "Did you mean `train.terms.planar`?",
+        "train.ray=3": "Did you mean `train.sampling.rays`?",
+        "train.term=3": "Did you mean `train.terms`?",
+    }.items():
+        with pytest.raises(ConfigError) as caught:
+            load_config(sets=[text])
+        assert said in f"{caught.value.message} {caught.value.hint}"
+
+
+def test_every_new_name_exists_and_no_old_one_does():
+    known = {setting.key for setting in describe_settings()}
+    assert set(RENAMED.values()) <= known
+    assert not {*RENAMED, *REMOVED} & known
+    assert len(set(RENAMED.values())) == len(RENAMED)
+
+
+def test_old_names_are_read_with_one_note(tmp_path, caplog):
+    assert load_config(sets=["train.holdout=8"]).train.hold_out == 8
+    assert [record.getMessage() for record in caplog.records] == [
+        "--set train.holdout=8: `train.holdout` is now `train.hold_out`. "
+        "Old names are read by this version and not by the next."
+    ]
+    caplog.clear()
+    file = tmp_path / "config.yaml"
+    file.write_text("train:\n  rays: 7\n  density: neus\n  planar: paper\n  planar_rays: 3\n  seed: 5\n")
+    train = load_config(file=file).train
+    assert (train.sampling.rays, train.density.form, train.terms.planar.form) == (7, "neus", "paper")
+    assert (train.terms.planar.rays, train.seed) == (3, 5)
+    assert len(caplog.records) == 1
+    assert "and 1 more" in caplog.text
+    caplog.clear()
+    load_config("gpu", sets=["train.density.form=neus"])
+    assert not caplog.records
+
+
+def test_a_new_name_wins_over_the_old_one_beside_it(tmp_path):
+    file = tmp_path / "mine.yaml"
+    file.write_text("train:\n  sampling: {rays: 5}\n  rays: 7\n  samples: 3\n")
+    sampling = load_config(file=file).train.sampling
+    assert (sampling.rays, sampling.samples) == (5, 3)
+
+
+def test_an_old_value_that_is_out_of_bounds_is_refused_by_the_new_name():
+    with pytest.raises(ConfigError, match=r"`train\.sampling\.rays` = 0 in --set train\.rays=0"):
+        load_config(sets=["train.rays=0"])
+
+
+def test_settings_that_are_gone_are_dropped_where_they_did_nothing(caplog):
+    sets = [
+        "train.weight_consistency=0.0",
+        "train.consistency_rays=99",
+        "train.eikonal_start=1",
+        "train.eikonal_end=1.0",
+    ]
+    assert load_config(sets=sets) == Config()
+    assert len(caplog.records) == len(sets)
+    assert "`train.eikonal_start` is gone" in caplog.text
+
+
+@pytest.mark.parametrize("text", ["train.weight_consistency=0.1", "train.eikonal_start=0.3", "train.eikonal_end=3"])
+def test_settings_that_are_gone_are_refused_where_they_did_something(text):
+    with pytest.raises(ConfigError, match="is gone, since") as caught:
+        load_config(sets=[text])
+    assert "Leave it out" in caught.value.hint
+
+
+def test_a_stage_s_old_settings_compare_equal_to_the_same_ones_of_today():
+    """What a finished stage was made with is no reason to make it again where only names have changed."""
+    old = yaml.safe_load((Path(__file__).parent / "config_before_groups.yaml").read_text())
+    for section in ("train", "undistort", "extract"):
+        now = getattr(load_config("demo"), section).model_dump(mode="json")
+        assert section_with_new_names(section, old[section]) == now
+        assert section_with_new_names(section, now) == now
+    compared = section_with_new_names("train", {**old["train"], "weight_consistency": 0.1, "rays": 7})
+    assert (compared["weight_consistency"], compared["sampling"]["rays"]) == (0.1, 7)
+
+
+def test_an_old_workspace_s_settings_are_read():
+    """All the settings of a run of before, as its config.yaml has them."""
+    old = load_config(file=Path(__file__).parent / "config_before_groups.yaml")
+    assert old.train == load_config("demo").train
+    assert load_config("demo", sets=settings_beyond("demo", old)) == old
 
 
 @pytest.mark.parametrize("text", ["auto", "sphere 1 -2.5 3e1 0.5", "box -1 -1 0 1 1 2"])

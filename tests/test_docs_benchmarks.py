@@ -1,10 +1,14 @@
-"""The benchmark runner's tables and set discovery, on made-up results."""
+"""The benchmarks' pages and tables, the runner's set discovery: on made-up results, and the pages as they are."""
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
+
 import pytest
 
-from benchmarks import run_sets
+from benchmarks import pages, run_sets, what_to_expect
+from benchmarks.pages import NOT_MEASURED, all_tables, read_pages, with_tables, write_tables
 from benchmarks.run_sets import (
     Result,
     StageCost,
@@ -12,8 +16,7 @@ from benchmarks.run_sets import (
     load_results,
     result_path,
     save_result,
-    updated_page,
-    with_tables,
+    tables_of,
 )
 
 
@@ -47,8 +50,7 @@ def test_seeds_share_a_row_with_their_spread_and_the_other_tables_have_the_first
     runs = [_result(score=SCORE), replace(_result(score=worse), seed=1)]
     row = [cell.strip() for cell in run_sets.summary_table(runs).splitlines()[2].strip("|").split("|")]
     assert (row[1], row[8], row[9]) == ("2", "0.71 (0.66 to 0.77)", "0.60")
-    page = "".join(f"<!-- table {name} -->\n<!-- end {name} -->\n" for name in run_sets.TABLES)
-    assert "| stage | banana |\n" in with_tables(page, runs)
+    assert "| stage | banana |\n" in tables_of(runs)["stages"]
     paths = [run_sets.result_path("banana", tmp_path, seed).name for seed in (0, 1)]
     assert paths == ["banana.json", "banana-seed1.json"]
 
@@ -65,24 +67,65 @@ def test_stage_table_has_a_column_for_each_set():
     assert table[-1] == "| all | 256 / 464 | 256 / 464 |"
 
 
+def test_without_results_the_tables_say_so():
+    assert set(tables_of([]).values()) == {NOT_MEASURED}
+
+
 def test_texture_table_has_the_numbers_only():
     table = run_sets.texture_table([_result()])
     assert "| seen | 0.91 |" in table
     assert "note" not in table
 
 
-def test_tables_are_replaced_between_their_markers_and_nothing_else():
-    page = "top\n" + "".join(f"<!-- table {n} -->\nold\n<!-- end {n} -->\n" for n in run_sets.TABLES) + "bottom\n"
-    once = with_tables(page, [_result()])
-    assert once.startswith("top\n")
-    assert once.endswith("bottom\n")
-    assert "old" not in once
-    assert with_tables(once, [_result()]) == once
-    assert "Not measured yet." in with_tables(page, [])
+# ---------------------------------------------------------------- pages
+def test_tables_are_replaced_between_their_markers_and_nothing_else(tmp_path, monkeypatch):
+    monkeypatch.setattr(pages, "DOCS", tmp_path)
+    first, second = tmp_path / "first.md", tmp_path / "deep" / "second.md"
+    second.parent.mkdir()
+    first.write_text("top\n<!-- table a -->\nold\n<!-- end a -->\nbottom\n<!-- table c -->\nkept\n<!-- end c -->\n")
+    second.write_text("<!-- table b -->\n<!-- end b -->\n")
+    made = {"a": "| one |", "b": "| two |"}
+    write_tables(made)
+    once = read_pages()
+    expected = "top\n<!-- table a -->\n| one |\n<!-- end a -->\nbottom\n<!-- table c -->\nkept\n<!-- end c -->\n"
+    assert once[first] == expected
+    assert once[second] == "<!-- table b -->\n| two |\n<!-- end b -->\n"
+    assert with_tables(once, made) == once
+
+
+@pytest.mark.parametrize("text", ["no markers", "<!-- table a -->\n<!-- end a -->\n" * 2, "<!-- table a -->"])
+def test_a_table_has_one_place(text):
     with pytest.raises(ValueError, match="expected once each"):
-        with_tables("no markers", [])
+        with_tables({Path("page.md"): text}, {"a": "| one |"})
 
 
+def test_the_tables_on_the_pages_are_those_of_the_result_files():
+    """And every table that a page has markers for is written by some benchmark."""
+    written, made = read_pages(), all_tables()
+    assert written == with_tables(written, made), "run `make docs`"
+    marked = {name for page in written.values() for name in re.findall(r"<!-- table (.+?) -->", page)}
+    assert marked - {"rooms"} == set(made)
+
+
+def test_what_to_expect_says_the_same_as_the_pages_behind_it():
+    """A row of each of its tables, worked out from the other pages' cells."""
+
+    def cells(table, first):
+        lines = [line.strip("| ").split(" | ") for line in all_tables()[table].splitlines()]
+        return next(dict(zip(lines[0], line, strict=True)) for line in lines if line[0] == first)
+
+    helmet = what_to_expect.SCENES["synth_helmet"]
+    summary = cells("summary", "synth_helmet")
+    assert cells("expect quality", helmet)["mean distance, %"] == summary["distance %"]
+    held_out = cells("held-out", "synth_helmet")["mesh, object: PSNR"]
+    assert cells("expect quality", helmet)["new photos, PSNR dB"] == f"{float(held_out):.0f}"
+    assert cells("expect cost", helmet)["all, min"] == summary["wall min"]
+    assert (
+        cells("expect hard", "as they are")["mean distance, %"] == cells("poses", "synth_helmet")["mesh distance %"][:4]
+    )
+
+
+# ---------------------------------------------------------------- sets
 def test_results_survive_their_files_and_the_demo_comes_first(tmp_path):
     for result in (_result("banana", SCORE), _result("demo")):
         save_result(result, tmp_path / f"{result.name}.json")
@@ -95,12 +138,12 @@ def test_results_of_our_own_scenes_lie_apart_and_have_their_own_table(tmp_path, 
     monkeypatch.setattr(run_sets, "RESULTS", tmp_path / "results")
     for name in ("thin", "banana"):
         save_result(_result(name), result_path(name, tmp_path / "data"))
-    names = [*run_sets.TABLES, run_sets.SYNTHETIC]
-    page = updated_page("".join(f"<!-- table {n} -->\nold\n<!-- end {n} -->\n" for n in names))
-    others, ours = page.split("<!-- table synthetic -->")
+    made = run_sets.tables()
+    ours = made.pop(run_sets.SYNTHETIC)
     assert "| thin |" in ours
     assert "banana" not in ours
-    assert "thin" not in others
+    assert "banana" in made["summary"]
+    assert not any("thin" in table for table in made.values())
 
 
 def test_sets_are_folders_with_photos(tmp_path):

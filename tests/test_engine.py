@@ -477,6 +477,7 @@ def test_manifest_round_trip_and_tampering() -> None:
         Manifest.from_json(manifest.to_json().replace('"a": 1.5', '"a": 1.6'))
 
 
+@pytest.mark.slow
 def test_meter_sees_memory_and_cpu_of_children() -> None:
     program = "b = bytearray(150_000_000); b[::4096] = b'x' * len(b[::4096]); import time; time.sleep(1)"
     with ResourceMeter() as meter:
@@ -558,12 +559,13 @@ def test_a_stage_that_reads_manifests_or_the_run_follows_them(bench: Bench) -> N
 
 
 def test_a_workspace_of_the_first_version_goes_on(bench: Bench) -> None:
-    """0.1.0 wrote one digest for all that a stage published."""
+    """0.1.0 wrote one digest for all that a stage published, and had other names for some settings."""
     bench.run()
     for stage, before in (("sfm", "ingest"), ("undistort", "sfm"), ("export", "undistort")):
         manifest = bench.workspace.published(stage)
         digest = bench.workspace.published(before).outputs_digest
-        old = replace(manifest, identity=replace(manifest.identity, inputs={before: digest}))
+        params = {**manifest.identity.params, **({"gps": True} if stage == "undistort" else {})}  # now place.gps
+        old = replace(manifest, identity=replace(manifest.identity, inputs={before: digest}, params=params))
         (bench.root / stage / MANIFEST).write_text(old.to_json())
     assert bench.ran() == {}
     for path in bench.photos.iterdir():

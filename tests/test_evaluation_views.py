@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 import torch
 from sphere_scene import RADIUS, render, ring_of_cameras, write_undistorted
+from train_settings import small
 from typer.testing import CliRunner
 
-from configs.params import TrainParams
 from hineus_cli.app import app
 from stages import artifacts
 from stages.artifacts import AtlasMesh
@@ -31,10 +31,12 @@ from stages.neural.trained_field import field_state
 from stages.neural.trainer import field_shape
 from stages.pipeline import PIPELINE
 
-PARAMS = TrainParams(
-    steps=1, rays=64, samples=24, levels=3, log2_rows=9, coarsest=8, finest=64, sdf_width=32, radiance_width=16,
-    sphere_radius=RADIUS, cache_resolution=48, background_log2_rows=8, background_samples=4, scale_end=0.01,
-)  # fmt: skip
+PARAMS = small({
+    "steps": 1, "sampling.rays": 64, "sampling.samples": 24, "field.levels": 3, "field.log2_rows": 9,
+    "field.coarsest": 8, "field.finest": 64, "field.sdf_width": 32, "field.radiance_width": 16,
+    "field.sphere_radius": RADIUS, "sampling.cache_resolution": 48, "field.background_log2_rows": 8,
+    "sampling.background_samples": 4, "density.scale_end": 0.01,
+})  # fmt: skip
 SIZE = (24, 32)
 
 

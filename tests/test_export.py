@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from rigs import scene_without_points
 
 from configs.params import ExportParams
 from stages import artifacts
@@ -23,8 +24,11 @@ from stages.engine.manifest import Manifest
 from stages.engine.stage import StageContext
 from stages.errors import ReconstructionError, SystemRequirementError
 from stages.export import EXPORT, unit_normals
-from stages.files.writing import Textures, glb_bytes, obj_text, ply_bytes, shapes_glb_bytes
-from stages.geometry.cameras import PinholeCameras, PosedScene
+from stages.files.contents import Textures
+from stages.files.glb import glb_bytes, shapes_glb_bytes
+from stages.files.obj import obj_text
+from stages.files.ply_stl import ply_bytes
+from stages.geometry.cameras import PinholeCameras
 from stages.geometry.orientation import y_up_rotation
 from stages.geometry.place import Place
 from stages.geometry.similarity import Similarity
@@ -85,8 +89,7 @@ def workspace(tmp_path: Path, params: ExportParams | None = None) -> StageContex
     cameras = PinholeCameras(
         ("a.jpg",), np.array([[8, 8]]), np.eye(3)[None], np.concatenate([np.eye(3), np.zeros((3, 1))], 1)[None]
     )
-    scene = PosedScene(cameras, WORLD, np.zeros((1, 3)), np.zeros(1), np.zeros((1, 2)), UP)
-    artifacts.save_scene(folders["undistort"], scene)
+    artifacts.save_scene(folders["undistort"], scene_without_points(cameras, WORLD))
     artifacts.save_place(folders["place"], Place(Similarity.identity()))
     artifacts.save_atlas(folders["atlas"], atlas)
     write_png(artifacts.base_color_path(folders["bake"]), texture)

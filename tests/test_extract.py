@@ -7,15 +7,13 @@ import types
 
 import numpy as np
 import pytest
-from test_cleanup import ring_of_cameras
+from rigs import scene_without_points, three_rings
 
 from configs.params import ExtractParams
 from stages import artifacts
 from stages.engine.stage import StageContext
 from stages.errors import ReconstructionError
 from stages.extract import EXTRACT, supported_resolution
-from stages.geometry.cameras import PosedScene
-from stages.geometry.similarity import Similarity
 
 
 @pytest.fixture
@@ -28,10 +26,7 @@ def stage(tmp_path, monkeypatch):
         stand_in = types.ModuleType("stages.neural.trained_field")
         stand_in.load_field = lambda path, device: types.SimpleNamespace(sdf=sdf)
         monkeypatch.setitem(sys.modules, "stages.neural.trained_field", stand_in)
-        empty = np.zeros((0, 2), dtype=np.int32)
-        up = np.array([0, 0, 1.0])
-        scene = PosedScene(ring_of_cameras(), Similarity.identity(), np.zeros((0, 3)), np.zeros(0), empty, up)
-        artifacts.save_scene(undistort, scene)
+        artifacts.save_scene(undistort, scene_without_points(three_rings()))
         seen = []
         context = StageContext(
             inputs={"undistort": undistort, "train": train},
@@ -56,7 +51,7 @@ def test_mesh_and_numbers(stage):
 
 def test_no_finer_than_the_photos(stage):
     numbers, *_ = stage(lambda p: np.linalg.norm(p, axis=1) - 0.5, resolution=512)
-    assert numbers["resolution"] == numbers["supported_resolution"] == supported_resolution(ring_of_cameras())
+    assert numbers["resolution"] == numbers["supported_resolution"] == supported_resolution(three_rings())
     # The unit sphere fills 90 % of the images' 160 pixels; a pixel at its centre is a bit larger than at its front.
     assert 110 < numbers["resolution"] < 160
 

@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from benchmarks import growth
-from benchmarks.run_sets import GIB, PAGE
+from benchmarks.run_sets import GIB
 
 
 def test_photos_are_chosen_evenly_and_enlarged_with_their_exif(tmp_path):
@@ -39,8 +39,3 @@ def test_the_table_has_a_column_a_stage_and_the_peaks():
     assert len({line.count("|") for line in lines}) == 1
     assert lines[2] == "| 47 photos | 0.3 | 1234 | " + "1.0 | " * len(growth.STAGES) + "3.00 | 2.00 |"
     assert lines[3].endswith("| 2.00 | 2.00 |")
-
-
-def test_the_page_has_the_table():
-    page = PAGE.read_text(encoding="utf-8")
-    assert growth.with_table(page, growth.load_rows()) == page

@@ -130,9 +130,3 @@ def test_results_survive_their_files_and_failures_stand_under_the_table(data):
     assert table[3] == "| synth helmet: no exif | 47 of 47 | 0.13 | 0.85 | **exhaustive matching 15** | 31 | - |"
     assert table[4] == "| synth helmet: blurred | 0 of 47 | - | - | - | - | - |"
     assert table[-1] == "- synth_helmet-blurred: None of the 47 photos could be registered. Add photos."
-
-
-def test_the_table_on_the_page_is_that_of_the_result_files():
-    page = hard.PAGE.read_text(encoding="utf-8")
-    rows = load_rows()
-    assert page == hard.with_table(page, "poses", pose_table(rows) if rows else hard.NOT_MEASURED)

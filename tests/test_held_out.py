@@ -8,18 +8,20 @@ import numpy as np
 import pytest
 import torch
 from sphere_scene import render, ring_of_cameras, sphere_scene, write_undistorted
+from train_settings import changed, small
 
-from configs.params import TrainParams
 from stages import artifacts, train
 from stages.engine.stage import StageContext
 from stages.errors import ConfigError
 from stages.neural.held_out_psnr import held_out_psnr, left_out, photo_psnr
 from stages.neural.training_photos import Photos
 
-TINY = TrainParams(
-    steps=50, rays=64, samples=8, levels=2, log2_rows=9, coarsest=8, finest=16, sdf_width=8, radiance_width=8,
-    start_levels=2, free_points=32, sparse_batch=16, cache_resolution=16, background_log2_rows=9, background_samples=4,
-)  # fmt: skip
+TINY = small({
+    "steps": 50, "sampling.rays": 64, "sampling.samples": 8, "field.levels": 2, "field.log2_rows": 9,
+    "field.coarsest": 8, "field.finest": 16, "field.sdf_width": 8, "field.radiance_width": 8,
+    "schedule.start_levels": 2, "sampling.free_points": 32, "losses.sparse_batch": 16,
+    "sampling.cache_resolution": 16, "field.background_log2_rows": 9, "sampling.background_samples": 4,
+})  # fmt: skip
 
 
 def make_photos(every: int = 4, masks: bool = False) -> Photos:
@@ -33,7 +35,7 @@ def run_train(folder: Path, **settings) -> dict:
     write_undistorted(undistort, ring_of_cameras())
     out.mkdir()
     scratch.mkdir()
-    return train.run(StageContext({"undistort": undistort}, {}, out, scratch, TINY.model_copy(update=settings)))
+    return train.run(StageContext({"undistort": undistort}, {}, out, scratch, changed(TINY, settings)))
 
 
 def test_every_nth_photo_is_left_out_from_the_middle_of_the_first_n():
@@ -107,6 +109,7 @@ def test_large_photos_are_judged_on_a_grid_of_pixels(monkeypatch):
     assert 100 < len(rays) <= 200
 
 
+@pytest.mark.slow
 def test_the_stage_reports_the_photos_left_out_and_trains_on_the_others(tmp_path, monkeypatch):
     drawn = set()
     original = Photos.draw
@@ -117,7 +120,7 @@ def test_the_stage_reports_the_photos_left_out_and_trains_on_the_others(tmp_path
         return batch
 
     monkeypatch.setattr(Photos, "draw", draw)
-    numbers = run_train(tmp_path, holdout=4)
+    numbers = run_train(tmp_path, hold_out=4)
     assert drawn == {0, 1, 3, 4, 5, 7}
     assert (numbers["held_out"], numbers["photos"]) == (2, 8)
     assert 5 < numbers["held_out_psnr"] < 40
@@ -147,7 +150,7 @@ def test_without_a_hold_out_there_is_no_number(tmp_path):
 @pytest.mark.parametrize(("every", "found"), [(1, "leaves 0 of 8"), (16, "leaves 8 of 8")])
 def test_too_few_photos_left_or_none_left_out_is_an_error(tmp_path, every, found):
     with pytest.raises(ConfigError, match=found):
-        run_train(tmp_path, holdout=every)
+        run_train(tmp_path, hold_out=every)
 
 
 def _every_pixel(photos: Photos, image: int) -> tuple[torch.Tensor, torch.Tensor]:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from stages.artifacts import AtlasMesh
-from stages.texture.levels import levels_of_detail
+from stages.surface.levels_of_detail import levels_of_detail
 
 
 def globe(rows: int = 48) -> AtlasMesh:

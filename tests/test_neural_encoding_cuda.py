@@ -16,7 +16,8 @@ import pytest
 import torch
 
 from stages.neural import encodings
-from stages.neural.encodings import HashGrid, disagreement, encode_reference, encode_with, kernels_for
+from stages.neural.encoding_shapes import HashGrid
+from stages.neural.encodings import disagreement, encode_reference, encode_with, kernels_for
 
 needs_triton = pytest.mark.skipif(
     importlib.util.find_spec("triton") is None, reason="triton is not installed (pip install -e .[triton])"

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from stages.neural.encodings import Frequencies, HashGrid, encode, encode_features, encode_reference, hash_jacobian
+from stages.neural.encoding_shapes import Frequencies, HashGrid
+from stages.neural.encodings import encode, encode_features, encode_reference, hash_jacobian
 
 GRID = HashGrid(levels=5, features=4, log2_rows=10, coarsest=4, finest=40)
 

@@ -7,7 +7,7 @@ import dataclasses
 import pytest
 import torch
 
-from stages.neural.encodings import Frequencies, HashGrid
+from stages.neural.encoding_shapes import Frequencies, HashGrid
 from stages.neural.fields import BEND, Fields, FieldShape, SdfNetwork, smooth_relu, smooth_relu_reference
 from stages.neural.trained_field import field_state, load_field
 

@@ -6,8 +6,9 @@ from collections import Counter
 
 import pytest
 import torch
-from test_train import TINY, assert_finds_the_ball, make_trainer
+from ball_training import TINY, assert_finds_the_ball, make_trainer
 from torch.utils._python_dispatch import TorchDispatchMode
+from train_settings import changed
 
 from stages.neural import acceleration
 from stages.neural.acceleration import first_rows
@@ -50,19 +51,19 @@ def like_cuda(monkeypatch):
 def waits_of_steps(trainer) -> Waits:
     """In the steps at the beginning, in the middle and at the end, with full and partial refreshes of the grid."""
     trainer.step(0.0)  # the optimiser makes its state
-    assert trainer.terms.color_precision is not None  # made once
     with Waits() as waits:
-        for step in range(1, 6 * TINY.cache_every):
+        for step in range(1, 6 * TINY.sampling.cache_every):
             trainer.step_index = step
-            trainer.step(step / (6 * TINY.cache_every))
+            trainer.step(step / (6 * TINY.sampling.cache_every))
     return waits
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("masks", "precision"), [(False, "mixed"), (True, "float32")])
 def test_a_step_does_not_wait_for_the_device(like_cuda, masks, precision):
     like_cuda()
-    settings = {"rays": 16, "precision": precision, "weight_consistency": 0.1}
-    waits = waits_of_steps(make_trainer(TINY.model_copy(update=settings), masks=masks))
+    settings = {"sampling.rays": 16, "precision": precision}
+    waits = waits_of_steps(make_trainer(changed(TINY, settings), masks=masks))
     assert waits.operations > 1000
     assert not waits.found
 
@@ -76,18 +77,19 @@ def test_a_step_on_cuda_does_not_wait(masks):
         trainer.step(0.1 * step)
     torch.cuda.set_sync_debug_mode("error")
     try:
-        for step in range(3, 6 * TINY.cache_every):
-            numbers = trainer.step(step / (6 * TINY.cache_every))
+        for step in range(3, 6 * TINY.sampling.cache_every):
+            numbers = trainer.step(step / (6 * TINY.sampling.cache_every))
     finally:
         torch.cuda.set_sync_debug_mode("default")
     assert torch.isfinite(numbers["loss"]).item()
 
 
+@pytest.mark.slow
 def test_the_step_of_the_cpu_would_wait(monkeypatch):
     """What the test above looks for is found where it is."""
     monkeypatch.setattr(acceleration, "_has_numba", lambda: False)
-    waits = waits_of_steps(make_trainer(TINY.model_copy(update={"rays": 16})))
-    assert waits.found["nonzero"] >= 3 * (6 * TINY.cache_every - 1)
+    waits = waits_of_steps(make_trainer(changed(TINY, {"sampling.rays": 16})))
+    assert waits.found["nonzero"] >= 3 * (6 * TINY.sampling.cache_every - 1)
 
 
 @pytest.mark.parametrize(
@@ -115,7 +117,7 @@ def test_rays_look_the_same_in_both_forms(like_cuda, masks, progress):
         switch()
         trainer = make_trainer(masks=masks)
         trainer._refresh_cache(trainer.moment(progress))
-        batch = trainer.photos.draw(TINY.rays, torch.Generator().manual_seed(0))
+        batch = trainer.photos.draw(TINY.sampling.rays, torch.Generator().manual_seed(0))
         rendered = trainer.render(batch, progress, torch.zeros(3, 3) + 0.2, None)
         (rendered.colors - batch.colors).square().mean().backward()
         forms.append((batch, rendered, trainer.fields))

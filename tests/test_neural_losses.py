@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from stages.neural import losses, schedules
+from stages.neural.terms import eikonal, planar
 
 
 def test_rgb_error_is_the_colour_distance():
@@ -40,16 +41,16 @@ def test_sparse_points_pull_evenly_beyond_the_tolerance():
 
 def test_relaxation_is_one_on_met_photos_and_bounded_below():
     error = torch.tensor([0.0, 0.1, 0.2, 5.0], requires_grad=True)
-    omega = losses.eikonal_relaxation(error)
+    omega = eikonal.eikonal_relaxation(error)
     expected = [1, 0.2 + 0.8 * math.exp(-0.5), *[0.2 + 0.8 * math.exp(-1)] * 2]
     assert omega.tolist() == pytest.approx(expected)
     assert not omega.requires_grad
-    assert losses.eikonal_relaxation(torch.zeros(1), planarity=0.0).item() == pytest.approx(0.6)
+    assert eikonal.eikonal_relaxation(torch.zeros(1), planarity=0.0).item() == pytest.approx(0.6)
 
 
 def test_relaxation_listens_to_gamma_and_clip_and_detaches_the_planarity():
     planarity = torch.tensor([0.5], requires_grad=True)
-    omega = losses.eikonal_relaxation(torch.tensor([0.3]), planarity, gamma=2.0, clip=0.25)
+    omega = eikonal.eikonal_relaxation(torch.tensor([0.3]), planarity, gamma=2.0, clip=0.25)
     assert omega.item() == pytest.approx(0.2 + 0.8 * math.exp(-0.5) * 0.75)
     assert not omega.requires_grad
 
@@ -57,7 +58,7 @@ def test_relaxation_listens_to_gamma_and_clip_and_detaches_the_planarity():
 def test_literal_relaxation_is_the_paper_s_product_and_differentiable_in_both():
     error = torch.tensor([0.0, 0.1, 0.3], requires_grad=True)
     planarity = torch.tensor([1.0, 0.4, 0.4], requires_grad=True)
-    omega = losses.eikonal_relaxation_literal(error, planarity, gamma=5.0, clip=0.2)
+    omega = eikonal.eikonal_relaxation_literal(error, planarity, gamma=5.0, clip=0.2)
     assert omega.tolist() == pytest.approx([1, 0.4 * math.exp(-0.5), 0.4 * math.exp(-1)])
     omega.sum().backward()
     assert error.grad.tolist() == pytest.approx([-5, -2 * math.exp(-0.5), 0])  # none beyond the clip
@@ -67,13 +68,13 @@ def test_literal_relaxation_is_the_paper_s_product_and_differentiable_in_both():
 def test_literal_relaxation_lets_the_eikonal_term_vanish():
     # Features a unit apart: lambda_pla = 1e-3 / 1.001. A gradient of length 2, wrong by all there is, then costs 1e-3.
     features = torch.nn.functional.one_hot(torch.zeros(16, 4, dtype=torch.long), 8).float()
-    flat = losses.planarity_literal(features, torch.zeros(16, 8)).mean(1)
+    flat = planar.planarity_literal(features, torch.zeros(16, 8)).mean(1)
     assert flat.tolist() == pytest.approx([1e-3 / 1.001] * 16)
     error, photo_error = losses.eikonal_error(torch.tensor([[0.0, 0, 2]]).expand(16, 3)), torch.full((16,), 0.05)
-    literal = (losses.eikonal_relaxation_literal(photo_error, flat) * error).mean().item()
+    literal = (eikonal.eikonal_relaxation_literal(photo_error, flat) * error).mean().item()
     assert literal == pytest.approx(1e-3 / 1.001 * math.exp(-0.25))  # 7.8e-4
     stable = (
-        losses.eikonal_relaxation(photo_error, losses.planarity(features, torch.zeros(16, 8)).mean(1)) * error
+        eikonal.eikonal_relaxation(photo_error, planar.planarity(features, torch.zeros(16, 8)).mean(1)) * error
     ).mean()
     assert stable.item() == pytest.approx(0.2 + 0.8 * math.exp(-0.25) * 0.75)  # 0.67: the median weight is 1/2
 
@@ -84,15 +85,15 @@ def test_planar_error_is_zero_on_a_plane_at_any_distance_and_not_on_an_edge():
     normals = torch.nn.functional.normalize(torch.randn(5, 3, generator=generator), dim=1)
     center = torch.full((5,), 0.003)
     plane = center[:, None] + torch.einsum("qc,qkc->qk", normals, offsets)
-    assert losses.planar_error(plane, center, normals, offsets, 0.05).abs().max() < 1e-8
+    assert planar.planar_error(plane, center, normals, offsets, 0.05).abs().max() < 1e-8
     edge = plane + offsets[..., 0].abs()
-    assert losses.planar_error(edge, center, normals, offsets, 0.05).mean() > 1e-3
+    assert planar.planar_error(edge, center, normals, offsets, 0.05).mean() > 1e-3
 
 
 def test_planar_error_pulls_the_neighbour_towards_the_plane():
     sdf = torch.tensor([[0.02]], requires_grad=True)
     offsets, normals = torch.tensor([[[0.04, 0, 0]]]), torch.tensor([[0.0, 0, 1]])
-    error = losses.planar_error(sdf, torch.zeros(1), normals, offsets, 0.05)
+    error = planar.planar_error(sdf, torch.zeros(1), normals, offsets, 0.05)
     assert error.item() == pytest.approx(0.1 * (0.5 - 0.05))  # slope error 0.5, Huber with delta 0.1
     error.sum().backward()
     assert sdf.grad.item() == pytest.approx(0.1 / 0.04)
@@ -103,17 +104,17 @@ def test_literal_planar_error_is_zero_on_a_plane_through_x_0_and_not_on_one_besi
     offsets = 0.1 * (torch.rand(5, 8, 3, generator=generator) - 0.5)
     normals = torch.nn.functional.normalize(torch.randn(5, 3, generator=generator), dim=1)
     plane = torch.einsum("qc,qkc->qk", normals, offsets)
-    assert losses.planar_error_literal(plane, normals, offsets).max() < 1e-5
-    beside = losses.planar_error_literal(plane + 1e-3, normals, offsets)
+    assert planar.planar_error_literal(plane, normals, offsets).max() < 1e-5
+    beside = planar.planar_error_literal(plane + 1e-3, normals, offsets)
     torch.testing.assert_close(beside, 1e-3 / offsets.norm(dim=2), rtol=1e-3, atol=1e-5)
     center = torch.full((5,), 1e-3)
-    assert losses.planar_error(plane + 1e-3, center, normals, offsets, 0.05).max() < 1e-8
+    assert planar.planar_error(plane + 1e-3, center, normals, offsets, 0.05).max() < 1e-8
 
 
 def test_literal_planar_error_weighs_an_error_by_the_inverse_length():
     sdf = torch.tensor([[0.02, -0.03]], requires_grad=True)
     offsets, normals = torch.tensor([[[0.04, 0, 0], [0, 0, -0.01]]]), torch.tensor([[0.0, 0, 1]])
-    error = losses.planar_error_literal(sdf, normals, offsets)
+    error = planar.planar_error_literal(sdf, normals, offsets)
     assert error[0].tolist() == pytest.approx([0.5, 2.0])
     error.sum().backward()
     assert sdf.grad[0].tolist() == pytest.approx([25, -100])
@@ -122,7 +123,7 @@ def test_literal_planar_error_weighs_an_error_by_the_inverse_length():
 def test_literal_planar_error_is_finite_at_x_0_itself():
     sdf = torch.tensor([[1e-3, 0.0]], requires_grad=True)
     offsets = torch.zeros(1, 2, 3, requires_grad=True)
-    error = losses.planar_error_literal(sdf, torch.tensor([[0.0, 0, 1]]), offsets)
+    error = planar.planar_error_literal(sdf, torch.tensor([[0.0, 0, 1]]), offsets)
     assert error[0].tolist() == pytest.approx([1e6, 0])
     error.sum().backward()
     assert sdf.grad.isfinite().all()
@@ -135,13 +136,13 @@ def test_literal_planar_terms_agree_with_finite_differences():
         torch.randn(*shape, generator=generator, dtype=torch.float64, requires_grad=True)
         for shape in ((3, 4), (3, 3), (3, 4, 3), (3, 4, 5), (3, 5))
     )
-    assert torch.autograd.gradcheck(losses.planar_error_literal, (sdf, normals, offsets))
-    assert torch.autograd.gradcheck(lambda f, c: losses.planarity_literal(f, c, 0.5), (features, center))
+    assert torch.autograd.gradcheck(planar.planar_error_literal, (sdf, normals, offsets))
+    assert torch.autograd.gradcheck(lambda f, c: planar.planarity_literal(f, c, 0.5), (features, center))
 
 
 def test_literal_planarity_is_one_for_equal_features_and_pulls_others_apart():
     features = torch.tensor([[[0.0], [1e-3], [1.0]]], requires_grad=True)
-    weight = losses.planarity_literal(features, torch.zeros(1, 1))
+    weight = planar.planarity_literal(features, torch.zeros(1, 1))
     assert weight[0].tolist() == pytest.approx([1, 0.5, 1e-3 / 1.001])
     weight.sum().backward()
     assert features.grad[0, :, 0].tolist() == pytest.approx([0, -250, -1e-3 / 1.001**2])
@@ -149,7 +150,7 @@ def test_literal_planarity_is_one_for_equal_features_and_pulls_others_apart():
 
 def test_planarity_is_one_for_equal_features_and_half_at_the_median():
     features = torch.tensor([[[0.0], [1.0], [3.0]]])
-    weight = losses.planarity(features.requires_grad_(), torch.zeros(1, 1))
+    weight = planar.planarity(features.requires_grad_(), torch.zeros(1, 1))
     assert weight[0].tolist() == pytest.approx([1, 0.5, 0.25])
     assert not weight.requires_grad
 

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import pytest
 import torch
-from test_train import TINY, assert_finds_the_ball, make_trainer
+from ball_training import TINY, assert_finds_the_ball, make_trainer
+from train_settings import changed
 
 from stages.neural.acceleration import is_mixed, short_products
 from stages.neural.mlp import mlp
 from stages.neural.trained_field import field_state, load_field
 
-EVERYTHING = {"reflection": "stable", "reflection_from": 0.0, "sampler": "proposal"}
+EVERYTHING = {"terms.reflection.form": "stable", "terms.reflection.start": 0.0, "sampling.sampler": "proposal"}
 
 
 def mixed(**settings):
-    return TINY.model_copy(update={"precision": "mixed", **settings})
+    return changed(TINY, {"precision": "mixed", **settings})
 
 
 def test_auto_is_mixed_on_cuda_only_where_it_is_fast(monkeypatch):

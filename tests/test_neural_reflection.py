@@ -7,8 +7,9 @@ import math
 import pytest
 import torch
 
-from stages.neural import reflection as refl
+from stages.neural.reflection_network import ReflectionNetwork
 from stages.neural.sampling import SdfCache
+from stages.neural.terms import reflection as refl
 
 
 def unit(*shape: int, seed: int = 0) -> torch.Tensor:
@@ -21,8 +22,8 @@ def cache_of(sdf, resolution: int = 96) -> SdfCache:
     return cache
 
 
-def network(features: int = 5) -> refl.ReflectionNetwork:
-    return refl.ReflectionNetwork(features, 16, torch.Generator().manual_seed(0))
+def network(features: int = 5) -> ReflectionNetwork:
+    return ReflectionNetwork(features, 16, torch.Generator().manual_seed(0))
 
 
 def test_reflection_keeps_length_and_tangent_and_turns_the_normal_part():

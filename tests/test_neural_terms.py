@@ -2,36 +2,47 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
+from ball_training import SMALL, TINY, make_trainer
 from sphere_scene import RADIUS, ring_of_cameras
-from test_train import TINY, make_trainer
+from train_settings import changed
 
+from configs.dotted import flatten
 from configs.load import load_config
-from configs.params import TrainParams
+from configs.training import TrainParams
 from stages.neural import visibility
+from stages.neural.terms.ambiguity import Ambiguity
 from stages.neural.trainer import Trainer
 
 FORMS = {
-    "ambiguity": ["paper", "stable"],
-    "reflection": ["paper", "stable"],
-    "planar": ["paper", "stable"],
-    "eikonal": ["paper", "stable"],
-    "density": ["neus"],
-    "scale": ["learned"],
-    "gradients": ["numerical"],
-    "encoding": ["frequency"],
-    "sampler": ["proposal"],
+    "terms.ambiguity.form": ["paper", "stable"],
+    "terms.reflection.form": ["paper", "stable"],
+    "terms.planar.form": ["paper", "stable"],
+    "terms.eikonal.form": ["paper", "stable"],
+    "density.form": ["neus"],
+    "density.scale": ["learned"],
+    "field.gradients": ["numerical"],
+    "field.encoding": ["frequency"],
+    "sampling.sampler": ["proposal"],
 }
-OFF = {name: TrainParams.model_fields[name].default for name in FORMS} | {
-    "ambiguity": "off", "reflection": "off", "planar": "off", "eikonal": "plain",
+DEFAULTS = flatten(TrainParams().model_dump())
+OFF = {name: DEFAULTS[name] for name in FORMS} | {
+    "terms.ambiguity.form": "off", "terms.reflection.form": "off", "terms.planar.form": "off",
+    "terms.eikonal.form": "plain",
 }  # fmt: skip
 
+SHARP_BALL = {"field.sphere_radius": RADIUS, "density.scale_start": 0.01}
+# so that the ball reaches the floor of `put_on_a_floor`
+FLOOR = {"sampling.cache_resolution": 64, "terms.reflection.reach": 0.5}
 
-def rough_trainer(**settings) -> Trainer:
+
+def rough_trainer(settings: dict[str, Any] | None = None) -> Trainer:
     """A trainer whose surface is dented: a perfect sphere has no Eikonal error and mirrors nothing of itself."""
-    trainer = make_trainer(TINY.model_copy(update={**OFF, "scale_start": 0.02, **settings}))
+    trainer = make_trainer(changed(TINY, {**OFF, "density.scale_start": 0.02, **(settings or {})}))
     generator = torch.Generator().manual_seed(0)
     with torch.no_grad():
         if trainer.fields.sdf.table is not None:
@@ -39,12 +50,16 @@ def rough_trainer(**settings) -> Trainer:
     return trainer
 
 
+def ambiguity_of(trainer: Trainer) -> Ambiguity:
+    return next(term for term in trainer.terms.all if isinstance(term, Ambiguity))
+
+
 def put_on_a_floor(trainer: Trainer) -> None:
     """Let the cached grid say that the ball stands on a floor, which it mirrors; the networks know nothing of it."""
     cache, side = trainer.cache, trainer.cache.resolution
     places = cache.points(torch.arange(side**3))
-    floor = places[:, 2] + TINY.sphere_radius
-    cache.values.view(-1).copy_(torch.minimum(places.norm(dim=1) - TINY.sphere_radius, floor))
+    floor = places[:, 2] + TINY.field.sphere_radius
+    cache.values.view(-1).copy_(torch.minimum(places.norm(dim=1) - TINY.field.sphere_radius, floor))
     trainer.cache_step = trainer.step_index
 
 
@@ -54,8 +69,7 @@ def gradients_of(trainer: Trainer) -> dict[str, torch.Tensor]:
 
 @pytest.mark.parametrize(("setting", "form"), [(name, form) for name, forms in FORMS.items() for form in forms])
 def test_each_form_of_each_part_changes_the_gradients_of_a_step(setting, form):
-    floor = {"cache_resolution": 64, "reflection_reach": 0.5}
-    base, other = rough_trainer(**floor), rough_trainer(**{**floor, setting: form})
+    base, other = rough_trainer(FLOOR), rough_trainer({**FLOOR, setting: form})
     for trainer in (base, other):
         put_on_a_floor(trainer)
     numbers = [trainer.step(0.5) for trainer in (base, other)]
@@ -84,8 +98,8 @@ def test_terms_that_are_off_count_nothing():
 @pytest.mark.parametrize(("visibility", "doubt"), [("paper", 0.95), ("network", 0.95), ("stable", 0.7), ("mesh", 0.7)])
 def test_the_ambiguity_weight_trusts_a_painted_ball_and_doubts_a_shifting_one(visibility, doubt):
     """Every second photo shows other colours in its upper half: rays at the ball's upper half are doubted."""
-    settings = {"ambiguity": "stable", "visibility": visibility, "sphere_radius": RADIUS, "scale_start": 0.01}
-    trainer = make_trainer(TINY.model_copy(update=settings))
+    settings = {"terms.ambiguity.form": "stable", "terms.ambiguity.visibility": visibility, **SHARP_BALL}
+    trainer = make_trainer(changed(TINY, settings))
     trainer._refresh_cache(trainer.moment(0.5))
     batch = trainer.photos.draw(400, torch.Generator().manual_seed(0))
     with torch.no_grad():
@@ -96,7 +110,7 @@ def test_the_ambiguity_weight_trusts_a_painted_ball_and_doubts_a_shifting_one(vi
     upper, lower = on_ball & (height > 0.05), on_ball & (height < -0.05)
 
     def trust(progress: float = 0.5) -> torch.Tensor:
-        weights = trainer.terms.trust(rendered, rendered.colors, trainer.moment(progress))
+        weights = trainer.terms.color_weight(rendered, rendered.colors, trainer.moment(progress))
         assert torch.equal(weights[~on_ball], torch.ones(400)[~on_ball])  # nothing is known there
         return weights
 
@@ -111,12 +125,12 @@ def test_the_ambiguity_weight_trusts_a_painted_ball_and_doubts_a_shifting_one(vi
 
 
 def test_the_ambiguity_weight_is_that_of_a_loop_over_rays_and_photos():
-    settings = {"ambiguity": "stable", "sphere_radius": RADIUS, "scale_start": 0.01}
-    trainer = make_trainer(TINY.model_copy(update=settings))
+    settings = {"terms.ambiguity.form": "stable", **SHARP_BALL}
+    trainer = make_trainer(changed(TINY, settings))
     photos, moment, cameras = trainer.photos, trainer.moment(0.5), ring_of_cameras()
     photos.training[3] = False
     trainer.fields.log_gains.data.copy_(0.1 * torch.randn(8, 3, generator=torch.Generator().manual_seed(0)))
-    gains, precision = trainer.fields.log_gains.exp().detach(), trainer.terms.color_precision
+    gains, precision = trainer.fields.log_gains.exp().detach(), ambiguity_of(trainer).color_precision
     trainer._refresh_cache(moment)
     batch = photos.draw(60, torch.Generator().manual_seed(0))
     with torch.no_grad():
@@ -146,17 +160,17 @@ def test_the_ambiguity_weight_is_that_of_a_loop_over_rays_and_photos():
     assert 10 < sum(each > 0 for each in doubt) < 50
     weights, met = 1 / (1 + torch.tensor(doubt)), rendered.opacity > 0.5
     weights[met] /= weights[met].mean()
-    fast = trainer.terms.trust(rendered, rendered.colors, moment)
+    fast = trainer.terms.color_weight(rendered, rendered.colors, moment)
     torch.testing.assert_close(fast, weights, rtol=1e-4, atol=1e-5)
 
 
 def test_masks_take_rays_out_of_the_ambiguity_weight():
-    trainer = make_trainer(TINY.model_copy(update={"ambiguity": "stable", "scale_start": 0.01}), masks=True)
+    trainer = make_trainer(changed(TINY, {"terms.ambiguity.form": "stable", "density.scale_start": 0.01}), masks=True)
     trainer._refresh_cache(trainer.moment(0.5))
     batch = trainer.photos.draw(400, torch.Generator().manual_seed(0))
     with torch.no_grad():
         rendered = trainer.render(batch, 0.5, torch.zeros(0, 3), None)
-    weights = trainer.terms.trust(rendered, rendered.colors, trainer.moment(0.5))
+    weights = trainer.terms.color_weight(rendered, rendered.colors, trainer.moment(0.5))
     counted = (rendered.opacity > 0.5) & (batch.masks > 0.5)
     assert int(counted.sum()) < int((rendered.opacity > 0.5).sum())  # the first sphere is larger than the ball
     assert weights[counted].mean().item() == pytest.approx(1)
@@ -165,28 +179,28 @@ def test_masks_take_rays_out_of_the_ambiguity_weight():
 
 def test_the_papers_weight_carries_a_gradient_and_the_stable_one_none():
     for form, carries in (("paper", True), ("stable", False)):
-        settings = {"ambiguity": form, "sphere_radius": RADIUS, "scale_start": 0.01}
-        trainer = make_trainer(TINY.model_copy(update=settings))
+        settings = {"terms.ambiguity.form": form, **SHARP_BALL}
+        trainer = make_trainer(changed(TINY, settings))
         trainer._refresh_cache(trainer.moment(0.5))
         batch = trainer.photos.draw(200, torch.Generator().manual_seed(0))
         rendered = trainer.render(batch, 0.5, torch.zeros(0, 3), None)
-        weights = trainer.terms.trust(rendered, rendered.colors, trainer.moment(0.5))
+        weights = trainer.terms.color_weight(rendered, rendered.colors, trainer.moment(0.5))
         assert weights.requires_grad is carries
 
 
 def test_a_learned_scale_learns_and_a_scheduled_one_ends_at_its_end():
-    trainer = rough_trainer(scale="learned")
+    trainer = rough_trainer({"density.scale": "learned"})
     before = trainer.moment(0.5).width
     assert before == pytest.approx(0.02 + 0.1 * trainer.fields.shape.sdf_grid.voxel_size(), rel=1e-5)
     trainer.step(0.5)
     assert trainer.moment(0.5).width != before
-    scheduled = rough_trainer(scale_end=0.011)
+    scheduled = rough_trainer({"density.scale_end": 0.011})
     half_voxel = 0.5 * scheduled.fields.shape.sdf_grid.voxel_size()
     assert scheduled.moment(1.0).width == pytest.approx(max(0.011, half_voxel))
 
 
 def test_reflection_waits_for_its_start_and_colours_only_rays_that_meet_something():
-    trainer = rough_trainer(reflection="stable", reflection_reach=0.5, cache_resolution=64)
+    trainer = rough_trainer({"terms.reflection.form": "stable", **FLOOR})
     put_on_a_floor(trainer)
     batch = trainer.photos.draw(400, torch.Generator().manual_seed(0))
     nothing = torch.zeros(0, 3)
@@ -204,10 +218,7 @@ def test_reflection_waits_for_its_start_and_colours_only_rays_that_meet_somethin
 
 @pytest.mark.parametrize("backbone", ["neus2", "hfneus", "neuralangelo"])
 def test_every_backbone_trains(backbone):
-    config = load_config(None, None, [f"train.backbone={backbone}"]).train
-    stated = {name: getattr(config, name) for name in config.model_fields_set}
-    small = {name: getattr(TINY, name) for name in TINY.model_fields_set}
-    trainer = make_trainer(TrainParams(**{**stated, **small}))
+    trainer = make_trainer(changed(load_config(None, None, [f"train.backbone={backbone}"]).train, SMALL))
     first, second = (trainer.step(progress) for progress in (0.3, 0.31))
     assert torch.isfinite(first["loss"])
     assert second["rgb"] < first["rgb"] * 1.5
@@ -215,18 +226,18 @@ def test_every_backbone_trains(backbone):
 
 
 def test_the_feature_mlp_is_trained_by_colours_where_a_stable_term_reads_it():
-    for settings in ({"planar": "stable"}, {"eikonal": "stable"}):
-        trainer = rough_trainer(planar_features="mlp", **settings)
+    for term in ("planar", "eikonal"):
+        trainer = rough_trainer({"terms.planar.features": "mlp", f"terms.{term}.form": "stable"})
         assert trainer.step(0.5)["appearance"] > 0
         assert trainer.fields.appearance.head.weight.grad.abs().max() > 0
-    literal = rough_trainer(planar_features="mlp", planar="paper")
+    literal = rough_trainer({"terms.planar.features": "mlp", "terms.planar.form": "paper"})
     assert literal.step(0.5)["appearance"] == 0
     assert literal.fields.appearance.layers[0].weight.grad.abs().max() > 0  # by lambda_pla alone
     assert literal.fields.appearance.head.weight.grad is None
 
 
 def test_the_proposal_network_learns_in_its_steps_only():
-    trainer = rough_trainer(sampler="proposal", proposal_updates=1)
+    trainer = rough_trainer({"sampling.sampler": "proposal", "sampling.proposal_updates": 1})
     assert trainer.step(0.5)["proposal"] > 0
     assert all(p.grad.abs().max() > 0 for p in trainer.fields.proposal.parameters())
     assert trainer.step(0.5)["proposal"] == 0
@@ -235,7 +246,7 @@ def test_the_proposal_network_learns_in_its_steps_only():
 
 def test_batches_that_meet_nothing_render(monkeypatch):
     """A strip of a preview may miss the region altogether."""
-    trainer = rough_trainer(reflection="stable")
+    trainer = rough_trainer({"terms.reflection.form": "stable"})
     batch = trainer.photos.rays(torch.zeros(3, dtype=torch.long), torch.full((3, 2), -1e6))
     assert len(batch.leave) == 0
     rendered = trainer.render(batch, 0.5, torch.zeros(0, 3), None)
@@ -244,11 +255,11 @@ def test_batches_that_meet_nothing_render(monkeypatch):
 
 def test_the_papers_preset_steps_with_small_networks():
     config = load_config("paper").train
-    small = {name: getattr(TINY, name) for name in TINY.model_fields_set} | {
-        "planar_rays": 16, "visibility_samples": 8, "reflection_samples": 4, "proposal_samples": 16, "finest": 64,
-        "sdf_layers": 3, "sparse_batch": 0,
+    smaller = SMALL | {
+        "terms.planar.rays": 16, "terms.ambiguity.samples": 8, "terms.reflection.samples": 4,
+        "sampling.proposal_samples": 16, "field.finest": 64, "field.sdf_layers": 3, "losses.sparse_batch": 0,
     }  # fmt: skip
-    trainer = make_trainer(config.model_copy(update=small))
+    trainer = make_trainer(changed(config, smaller))
     numbers = [trainer.step(progress) for progress in (0.0, 0.01)]
     assert all(torch.isfinite(value) for value in numbers[1].values())
     assert numbers[1]["planar"] > 0

@@ -10,10 +10,14 @@ import numpy as np
 import pytest
 import torch
 from sphere_scene import render, ring_of_cameras
+from train_settings import small
 
 from stages.errors import ReconstructionError, SystemRequirementError
 from stages.neural import visibility as vis
+from stages.neural.fields import Fields
 from stages.neural.sampling import SdfCache, free_outside
+from stages.neural.terms import ambiguity as amb
+from stages.neural.trainer import field_shape
 from stages.neural.training_photos import Photos
 
 
@@ -183,11 +187,18 @@ def test_a_camera_nearer_than_the_margin_sees():
     ).tolist() == [1]
 
 
+def ambiguity_term(form: str, photos: Photos | None = None, visibility: str = "stable") -> amb.Ambiguity:
+    params = small({"terms.ambiguity.form": form, "terms.ambiguity.visibility": visibility})
+    return amb.Ambiguity(Fields(field_shape(params, 8, background=False)), ball_cache((0, 0, 0, 0.5)), params, photos)
+
+
 def test_without_open3d_the_setting_that_needs_it_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "open3d", None)
-    with pytest.raises(SystemRequirementError, match=r"train\.visibility.*open3d") as error:
-        vis.MeshVisibility(ball_cache((0, 0, 0, 0.5)))(*paths((0, 0, 0.5), (0, 0, 3)), torch.tensor([0.05]))
-    assert "train.visibility=stable" in error.value.hint
+    with pytest.raises(ModuleNotFoundError):
+        vis.MeshVisibility(ball_cache((0, 0, 0, 0.5)))
+    with pytest.raises(SystemRequirementError, match=r"train\.terms\.ambiguity\.visibility.*open3d") as error:
+        _ = ambiguity_term("stable", visibility="mesh").mesh_visibility
+    assert "train.terms.ambiguity.visibility=stable" in error.value.hint
 
 
 def test_margin_grows_towards_grazing_angles_and_is_bounded():
@@ -196,29 +207,29 @@ def test_margin_grows_towards_grazing_angles_and_is_bounded():
 
 
 def test_trust_falls_with_ambiguity_and_keeps_its_mean():
-    weights = vis.trust(torch.tensor([0.0, 1.0, 3.0]))
+    weights = amb.trust(torch.tensor([0.0, 1.0, 3.0]))
     assert weights.mean().item() == pytest.approx(1)
     assert (weights / weights[0]).tolist() == pytest.approx([1, 0.5, 0.25])
 
 
 def test_literal_trust_is_not_renormalised():
-    assert vis.trust_literal(torch.tensor([0.0, 1.0, 3.0])).tolist() == [1, 0.5, 0.25]
+    assert amb.trust_literal(torch.tensor([0.0, 1.0, 3.0])).tolist() == [1, 0.5, 0.25]
 
 
 def test_the_loss_can_be_lowered_by_raising_literal_doubt_only():
     rendered = torch.tensor([[0.6, 0.2, 0.2]], requires_grad=True)
     others, visibility = torch.tensor([[[0.2, 0.2, 0.2], [0.4, 0.2, 0.2]]]), torch.tensor([[1.0, 0.96]])
-    doubt = vis.ambiguity(visibility, vis.mahalanobis(rendered[:, None], others, 4 * torch.eye(3)))
+    doubt = amb.ambiguity(visibility, amb.mahalanobis(rendered[:, None], others, 4 * torch.eye(3)))
     assert doubt.item() == pytest.approx((0.8 + 0.96 * 0.4) / 2)
-    vis.trust_literal(doubt).sum().backward()
+    amb.trust_literal(doubt).sum().backward()
     # d lambda / d red = (1 + 0.96) / 2 * sqrt(4), and d weight / d lambda = -1 / (1 + lambda)^2.
     assert rendered.grad[0].tolist() == pytest.approx([-1.96 / 1.592**2, 0, 0], abs=1e-6)
-    assert not vis.trust(doubt).requires_grad
+    assert not amb.trust(doubt).requires_grad
 
 
 def test_mahalanobis_has_a_finite_gradient_where_colours_agree():
     rendered = torch.full((1, 3), 0.3, requires_grad=True)
-    distance = vis.mahalanobis(rendered, torch.full((1, 3), 0.3), 50 * torch.eye(3))
+    distance = amb.mahalanobis(rendered, torch.full((1, 3), 0.3), 50 * torch.eye(3))
     distance.sum().backward()
     assert distance.item() < 2e-6
     assert rendered.grad[0].tolist() == [0, 0, 0]
@@ -226,14 +237,14 @@ def test_mahalanobis_has_a_finite_gradient_where_colours_agree():
 
 def test_mahalanobis_is_euclidean_for_unit_covariance_and_scales_with_it():
     colors, others = torch.tensor([[0.3, 0.4, 0.0]]), torch.zeros(1, 3)
-    assert vis.mahalanobis(colors, others, torch.eye(3)).item() == pytest.approx(0.5)
-    assert vis.mahalanobis(colors, others, 4 * torch.eye(3)).item() == pytest.approx(1.0)
+    assert amb.mahalanobis(colors, others, torch.eye(3)).item() == pytest.approx(0.5)
+    assert amb.mahalanobis(colors, others, 4 * torch.eye(3)).item() == pytest.approx(1.0)
 
 
 def test_precision_is_the_inverse_covariance_of_the_photos():
     cameras = ring_of_cameras()
     photos = Photos(cameras, [render(cameras, i)[0] for i in range(8)], None, "cpu")
-    precision = vis.color_precision(photos, torch.Generator().manual_seed(0))
+    precision = amb.color_precision(photos, torch.Generator().manual_seed(0))
     covariance = torch.cov((photos.pixels.float() / 255).T)
     torch.testing.assert_close(precision @ covariance, torch.eye(3), atol=0.05, rtol=0.05)
 
@@ -243,30 +254,34 @@ def test_the_paper_s_precision_is_the_plain_inverse_and_fails_on_grey_photos():
     images = [render(cameras, i)[0] for i in range(8)]
     draw = torch.Generator().manual_seed
     photos = Photos(cameras, images, None, "cpu")
-    literal = vis.color_precision(photos, draw(0), floor=0.0)
+    literal = amb.color_precision(photos, draw(0), floor=0.0)
     expected = np.linalg.inv(np.cov(photos.pixels.numpy().T / 255.0))
     assert np.abs(literal.numpy() - expected).max() < 0.05 * np.abs(expected).max()
-    assert not torch.equal(literal, vis.color_precision(photos, draw(0)))
+    assert not torch.equal(literal, amb.color_precision(photos, draw(0)))
 
     half = torch.arange(8) < 4  # photos that are held out have no say
     painted = [image if known else np.zeros_like(image) for image, known in zip(images, half, strict=True)]
-    known, all_known = (vis.color_precision(Photos(cameras, painted, None, "cpu", t), draw(0)) for t in (half, None))
+    known, all_known = (amb.color_precision(Photos(cameras, painted, None, "cpu", t), draw(0)) for t in (half, None))
     assert (known - all_known).abs().max() > 1
 
     grey = Photos(cameras, [image[..., :1].repeat(3, 2) for image in images], None, "cpu")
-    with pytest.raises(ReconstructionError, match="ambiguity=paper"):
-        vis.color_precision(grey, draw(0), floor=0.0)
-    assert vis.color_precision(grey, draw(0)).isfinite().all()
+    with pytest.raises(ValueError, match="no inverse"):
+        amb.color_precision(grey, draw(0), floor=0.0)
+    assert amb.color_precision(grey, draw(0)).isfinite().all()
+    with pytest.raises(ReconstructionError, match=r"train\.terms\.ambiguity\.form") as error:
+        _ = ambiguity_term("paper", grey).color_precision
+    assert "train.terms.ambiguity.form=stable" in error.value.hint
+    assert torch.equal(ambiguity_term("stable", grey).color_precision, amb.color_precision(grey, draw(0)))
 
 
 def test_ambiguity_counts_visible_views_only():
     visibility = torch.tensor([[0.95, 0.5, 1.0], [0.1, 0.2, 0.3]])
     distance = torch.tensor([[2.0, 100, 4], [5, 5, 5]])
-    assert vis.ambiguity(visibility, distance).tolist() == pytest.approx([(1.9 + 4) / 2, 0])
+    assert amb.ambiguity(visibility, distance).tolist() == pytest.approx([(1.9 + 4) / 2, 0])
 
 
 def test_without_another_view_nothing_is_doubted():
-    nothing = vis.ambiguity(torch.zeros(2, 3), torch.ones(2, 3)), vis.ambiguity(torch.ones(2, 0), torch.ones(2, 0))
+    nothing = amb.ambiguity(torch.zeros(2, 3), torch.ones(2, 3)), amb.ambiguity(torch.ones(2, 0), torch.ones(2, 0))
     for doubt in nothing:
         assert doubt.tolist() == [0, 0]
-        assert vis.trust(doubt).tolist() == vis.trust_literal(doubt).tolist() == [1, 1]
+        assert amb.trust(doubt).tolist() == amb.trust_literal(doubt).tolist() == [1, 1]

@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
+from rigs import scene_without_points
 
 from stages.artifacts import VertexQuality
 from stages.drawing.rendering import look_at
 from stages.geometry.cameras import PinholeCameras, PosedScene
 from stages.geometry.plane import Plane
-from stages.geometry.similarity import Similarity
-from stages.texture.next_views import describe_place, suggest_views, vertex_needs
+from stages.reporting.next_views import describe_place, suggest_views, vertex_needs
 
 UP = np.array([0.0, 0, 1])
 BALL = trimesh.creation.icosphere(3, 0.5)
@@ -32,8 +32,7 @@ def scene_from(places: dict[str, np.ndarray], **more) -> PosedScene:
         tuple(places), *(np.concatenate([getattr(view, part) for view in views])
         for part in ("sizes", "intrinsics", "cam_from_scene")),
     )  # fmt: skip
-    nothing = np.zeros((0, 3), np.float32), np.zeros(0), np.zeros((0, 2), np.int32)
-    return PosedScene(cameras, Similarity.identity(), *nothing, UP, **more)
+    return scene_without_points(cameras, **more)
 
 
 def seen_from(scene: PosedScene, vertices=VERTICES, normals=NORMALS) -> VertexQuality:

@@ -148,6 +148,7 @@ def silhouettes(cameras: PinholeCameras, center: np.ndarray, radius: float) -> l
     return masks
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("radius", [0.3, 1.2])
 def test_masks_give_the_sphere_about_the_object(radius: float):
     up = np.array([0.0, 0.0, 1.0])
@@ -160,6 +161,7 @@ def test_masks_give_the_sphere_about_the_object(radius: float):
     assert 1.0 < region.radius / radius < 1.5  # a hull is larger than its object
 
 
+@pytest.mark.slow
 def test_one_wrong_mask_does_not_cut_the_hull():
     up = np.array([0.0, 0.0, 1.0])
     cameras = capture(ring(np.zeros(3), up, count=16), size=(160, 120), focal=150.0)

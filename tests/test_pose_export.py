@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from test_undistort import DOTS, MODELS, NUM_CAMERAS, dots_seen, undistort, write_capture
+from dotted_capture import DOTS, MODELS, NUM_CAMERAS, dots_seen, undistort, write_capture
 from toy_pipeline import TOY
 from typer.testing import CliRunner
 

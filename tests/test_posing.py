@@ -540,7 +540,7 @@ def test_silhouettes_of_a_real_set_agree_with_its_cameras(data_dir: Path):
     def share(order: np.ndarray) -> float:
         outside = np.zeros(len(points))
         for mask, camera in zip(masks, order, strict=True):
-            pixels, depth = cameras.project(camera, points)
+            pixels, depth = cameras.project(int(camera), points)
             column, row = np.floor(pixels).astype(int).T
             inside = (depth > 0) & (row >= 0) & (column >= 0) & (row < mask.shape[0]) & (column < mask.shape[1])
             outside[inside] += ~mask[row[inside], column[inside]]

@@ -160,7 +160,7 @@ def test_needs_grow_with_photos_as_measured():
         config = load_config("cpu", sets=[f"{key}={value}" for key, value in sets.items()])
         return estimate(seen, config, "cpu", workers)
 
-    small = of(47, 554)  # 47 photos of 0.31 megapixels: docs/benchmarks.md has 3.9 to 4.1 minutes and 1.45 to 1.62 GiB
+    small = of(47, 554)  # 47 photos of 0.31 megapixels: docs/benchmarks had 3.9 to 4.1 minutes and 1.45 to 1.62 GiB
     assert small.minutes == pytest.approx(4.0, abs=0.4)
     # one core takes 1.5 to 1.8 times as long, and no number of cores does it in no time
     assert 1.5 < of(47, 554, workers=1).minutes / small.minutes < 1.8

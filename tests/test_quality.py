@@ -12,11 +12,12 @@ from sphere_scene import RADIUS, render, ring_of_cameras
 from stages.artifacts import AtlasMesh
 from stages.drawing.rasterizing import Texels, rasterize_atlas
 from stages.texture.baking import Provenance
+from stages.texture.photo_views import prepare_view
 from stages.texture.vertex_quality import (
+    VertexWitness,
     color_precision,
     invented_share,
     mean_disagreement,
-    measure_quality,
     texel_density,
 )
 
@@ -37,6 +38,13 @@ def square(size: int = 32) -> AtlasMesh:
     return AtlasMesh(corners, normals, corners[:, :2] / 4, np.array([[0, 1, 2], [0, 2, 3]], np.int32), size)
 
 
+def measure_quality(atlas, cameras, photos, provenance, gains):
+    witness = VertexWitness(atlas, len(photos))
+    for i, photo in enumerate(photos):
+        witness.look(i, prepare_view(cameras, i, photo, None, atlas.vertices, atlas.faces), gains[i])
+    return witness.quality(texels_of(atlas), provenance)
+
+
 def texels_of(atlas: AtlasMesh) -> Texels:
     return rasterize_atlas(atlas.uvs, atlas.faces, atlas.texture_size)
 
@@ -46,7 +54,7 @@ def measured():
     cameras, atlas = ring_of_cameras(8, 96, 80), ball()
     provenance = np.full((64, 64), Provenance.PHOTO, np.uint8)
     photos = [render(cameras, i)[0] for i in range(8)]
-    even = measure_quality(atlas, texels_of(atlas), cameras, lambda i: (photos[i], None), provenance, np.ones((8, 3)))
+    even = measure_quality(atlas, cameras, photos, provenance, np.ones((8, 3)))
     return cameras, atlas, photos, even
 
 
@@ -70,7 +78,7 @@ def test_photos_that_show_one_ball_agree_and_a_strange_one_is_noticed(measured):
     cameras, atlas, photos, quality = measured
     strange = [*photos[:3], 255 - photos[3], *photos[4:]]
     provenance = np.full((64, 64), Provenance.PHOTO, np.uint8)
-    worse = measure_quality(atlas, texels_of(atlas), cameras, lambda i: (strange[i], None), provenance, np.ones((8, 3)))
+    worse = measure_quality(atlas, cameras, strange, provenance, np.ones((8, 3)))
     before_it = atlas.normals @ cameras.centers[3] / np.linalg.norm(cameras.centers[3]) > 0.8
     assert np.median(worse.ambiguity[before_it]) > 3 * np.median(quality.ambiguity[before_it])
 
@@ -81,8 +89,19 @@ def test_gains_take_a_brighter_photo_back(measured):
     gains[2] = 2
     darker = [*photos[:2], photos[2] // 2, *photos[3:]]
     provenance = np.full((64, 64), Provenance.PHOTO, np.uint8)
-    again = measure_quality(atlas, texels_of(atlas), cameras, lambda i: (darker[i], None), provenance, gains)
+    again = measure_quality(atlas, cameras, darker, provenance, gains)
     np.testing.assert_allclose(again.ambiguity, quality.ambiguity, atol=0.03)
+
+
+def test_photos_count_as_they_are_and_not_as_smoothed_for_the_texture(measured):
+    cameras, atlas, photos, quality = measured
+    witness = VertexWitness(atlas, len(photos))
+    for i, photo in enumerate(photos):
+        view = prepare_view(cameras, i, photo, None, atlas.vertices, atlas.faces, texel_side=0.2)
+        assert (view.photo != photo).any()
+        witness.look(i, view, np.ones(3))
+    again = witness.quality(texels_of(atlas), np.full((64, 64), Provenance.PHOTO, np.uint8))
+    np.testing.assert_array_equal(again.ambiguity, quality.ambiguity)
 
 
 def test_disagreement_is_that_of_a_slow_loop():

@@ -7,8 +7,8 @@ import pytest
 
 from stages.artifacts import AtlasMesh
 from stages.drawing.rasterizing import Texels, rasterize_atlas
-from stages.files.tangents import to_tangent_space, vertex_tangents
 from stages.texture.relief import FLAT, bake_normals, bake_occlusion, sky_seen, spread_samples
+from stages.texture.tangents import to_tangent_space, vertex_tangents
 
 SIZE = 64
 QUAD = np.array([[0, 1, 2], [0, 2, 3]], np.int32)

@@ -20,8 +20,13 @@ def test_a_preset_alone_needs_no_settings(preset):
     [
         ["train.steps=77", "export.formats=[glb, stl]", "place.known_distance=0 0 0 1 0 0 2.5"],
         ["train.backbone=neuralangelo"],
-        ["train.backbone=neus2", "train.density=laplace", "train.minutes=1.5"],
-        ["sfm.deterministic=true", "train.scale_end=1e-5", "train.ambiguity=off", "place.region=box 0 0 0 1 1 2"],
+        ["train.backbone=neus2", "train.density.form=laplace", "train.minutes=1.5"],
+        [
+            "sfm.deterministic=true",
+            "train.density.scale_end=1e-5",
+            "train.terms.ambiguity.form=off",
+            "place.region=box 0 0 0 1 1 2",
+        ],
     ],
 )
 def test_what_differs_from_the_preset_gives_the_settings_back(sets):

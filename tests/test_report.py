@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import json
 import re
 import xml.etree.ElementTree as ET
 from dataclasses import replace
@@ -12,132 +11,31 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from report_inputs import BOX, UP, bare_inputs, full_inputs, manifest, page, pyramid, quality
 
 from configs.load import load_config
 from configs.params import ReportParams
 from stages import artifacts
-from stages.artifacts import (
-    AtlasMesh,
-    ImageRecord,
-    ImageSet,
-    Registration,
-    SkippedImage,
-    Unregistered,
-    VertexQuality,
-    write_png,
-)
-from stages.engine.fingerprint import Identity
-from stages.engine.manifest import Manifest
 from stages.engine.stage import StageContext
 from stages.engine.workspace import Record
-from stages.geometry.cameras import PinholeCameras, PosedScene
 from stages.geometry.orientation import y_up_rotation
-from stages.geometry.overview import overview_svg
-from stages.geometry.place import Place, given_region
-from stages.geometry.plane import Plane
-from stages.geometry.similarity import Similarity
-from stages.report import REPORT, THREE
+from stages.report import THREE
 from stages.reporting.curves import line_chart
 from stages.reporting.numbers import duration
 from stages.reporting.pictures import draw_stills
 from stages.reporting.view3d import NO_VALUE, pack_mesh, pack_overlays, pack_scene, region_lines
 
 ROOT = Path(__file__).parents[1]
-UP = np.array([0.0, 0, 1])
-BOX = np.array([[-0.5, -0.5, -0.2], [0.5, 0.5, 0.6]])
-
-
-def pyramid() -> AtlasMesh:
-    vertices = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0], [0, 0, 1.5]]) * 0.5
-    faces = np.array([[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]], np.int32)
-    normals = vertices / np.linalg.norm(vertices, axis=1, keepdims=True)
-    uvs = np.array([[0.1, 0.1], [0.9, 0.1], [0.9, 0.9], [0.1, 0.9], [0.5, 0.5]])
-    return AtlasMesh(vertices.astype(np.float32), normals.astype(np.float32), uvs.astype(np.float32), faces, 16)
-
-
-def quality() -> VertexQuality:
-    """The pyramid's tip was seen by one photo, its foot by none."""
-    tip = np.array([0, 0, 0, 0, 1.0])
-    return VertexQuality(tip.astype(np.uint16), 0.9 * tip, 0 * tip, 50 * tip, 100 + 0 * tip, 1 - tip)
-
-
-def manifest(stage: str, **numbers) -> Manifest:
-    return Manifest(
-        Identity(stage, 1, {"speed": 3}), {}, numbers, wall_s=75.0, cpu_s=100.5, peak_rss=2**30,
-        versions={"hineus": "0.1.0"}, created="2024-01-01T00:00:00+00:00",
-    )  # fmt: skip
 
 
 @pytest.fixture
 def context(tmp_path) -> StageContext:
-    """The bare minimum: a scene, an atlas and a texture."""
-    folders = {name: tmp_path / name for name in (*REPORT.needs, "out", "scratch")}
-    for folder in folders.values():
-        folder.mkdir()
-    pose = np.concatenate([np.eye(3), [[0], [0], [3]]], 1)[None]
-    K = np.array([[24.0, 0, 8], [0, 24, 8], [0, 0, 1]])
-    cameras = PinholeCameras(("a.png",), np.array([[16, 16]]), K[None], pose)
-    scene = PosedScene(cameras, Similarity.identity(), np.zeros((1, 3)), np.zeros(1), np.zeros((1, 2)), UP)
-    artifacts.save_scene(folders["undistort"], scene)
-    artifacts.save_place(folders["place"], Place(Similarity.identity()))
-    artifacts.save_given_region(folders["place"], None)
-    artifacts.save_atlas(folders["atlas"], pyramid())
-    texture = np.zeros((16, 16, 3), np.uint8)
-    texture[:8], texture[8:] = (230, 40, 40), (40, 70, 220)
-    write_png(artifacts.base_color_path(folders["bake"]), texture)
-    return StageContext(
-        inputs={name: folders[name] for name in REPORT.needs},
-        sources={},
-        out=folders["out"],
-        scratch=folders["scratch"],
-        params=ReportParams(),
-    )
+    return bare_inputs(tmp_path)
 
 
 @pytest.fixture
 def full(context) -> StageContext:
-    """Every stage left all it can."""
-    inputs = context.inputs
-    records = []
-    for name in ("a.png", "b <odd>.png", "c.png"):
-        path = artifacts.image_path(inputs["ingest"], name)
-        path.parent.mkdir(exist_ok=True)
-        write_png(path, np.full((30, 40, 3), 120, np.uint8))
-        records.append(ImageRecord(name, name, 40, 30, None, "0", 5.0, False, "00"))
-    skipped = (SkippedImage("notes.txt", "not an image"),)
-    artifacts.save_image_set(inputs["ingest"], ImageSet(tuple(records), skipped))
-    artifacts.save_registration(
-        inputs["sfm"],
-        Registration(
-            registered=("a.png", "c.png"),
-            unregistered=(Unregistered(name="b <odd>.png", reason="only 3 matches"),),
-        ),
-    )
-    lines = [{"step": 10 * i, "psnr": 10 + i, "loss": 0.5 / (i + 1), "rgb": None, "mask": 0.0} for i in range(50)]
-    text = "\n".join(json.dumps(line) for line in lines) + '\n{"step": 500, "psn'
-    artifacts.metrics_path(inputs["train"]).write_text(text)
-    preview = artifacts.preview_path(inputs["train"], 100)
-    preview.parent.mkdir()
-    write_png(preview, np.full((20, 20, 3), 90, np.uint8))
-    kinds = np.zeros((16, 16), np.uint8)
-    kinds[:4, :12], kinds[4:8, :4] = 255, 128
-    write_png(artifacts.provenance_path(inputs["bake"]), kinds)
-    random = np.random.default_rng(0)
-    scene = replace(
-        artifacts.load_scene(inputs["undistort"]),
-        points=random.normal(size=(300, 3)),
-        ground=Plane(UP, -0.2, 0.01, 0.5),
-    )
-    artifacts.save_scene(inputs["undistort"], scene)
-    still = Similarity.identity()
-    artifacts.save_place(inputs["place"], Place(still, True, "2 markers (8 sides)", 0.0042))
-    region = given_region("box", BOX.ravel(), still)
-    artifacts.save_given_region(inputs["place"], region)
-    artifacts.overview_path(inputs["undistort"]).write_text(overview_svg(scene, region.box_corners()))
-    artifacts.save_quality(inputs["bake"], quality())
-    artifacts.save_held_out(inputs["train"], ["a.png"])
-    write_png(artifacts.image_path(inputs["undistort"], "a.png"), np.full((16, 16, 3), 77, np.uint8))
-    return replace(context, manifests={name: manifest(name, faces=1234, share=0.123456) for name in REPORT.needs})
+    return full_inputs(context)
 
 
 class Links(HTMLParser):
@@ -160,13 +58,6 @@ class Links(HTMLParser):
 
     def handle_endtag(self, tag):
         assert self.open.pop() == tag
-
-
-def page(context: StageContext) -> str:
-    numbers = REPORT.run(context)
-    path = artifacts.report_path(context.out)
-    assert numbers["bytes"] == path.stat().st_size
-    return path.read_text(encoding="utf-8")
 
 
 def parsed(html: str) -> Links:
@@ -229,6 +120,7 @@ def test_the_overview_shows_each_camera_from_both_sides(full):
     assert len(views[1].findall("{*}path")) == len(views[0].findall("{*}path")) + 1  # the ground
 
 
+@pytest.mark.slow
 def test_the_size_is_told_in_metres_where_they_are_known(full):
     def sized(units: str) -> StageContext:
         exported = manifest("export", extent=[0.31234, 0.2, 12.0], units=units)

@@ -9,13 +9,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_report import context, full, page  # noqa: F401
+from report_inputs import bare_inputs, full_inputs, page
 
 from stages import artifacts
+from stages.engine.stage import StageContext
 
 BROWSER = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(BROWSER is None, reason="needs Chromium")]
 WEBGL = ("--enable-unsafe-swiftshader", "--use-gl=angle", "--use-angle=swiftshader")
+
+
+@pytest.fixture
+def full(tmp_path) -> StageContext:
+    return full_inputs(bare_inputs(tmp_path))
 
 
 def browse(folder: Path, url: str, *options: str, webgl: bool = True) -> subprocess.CompletedProcess[str]:
@@ -42,7 +48,7 @@ def screenshot(folder: Path, url: str, *options: str) -> np.ndarray:
     return cv2.imread(str(path))[..., ::-1].astype(int)
 
 
-def test_the_model_is_drawn_and_a_measure_changes_its_colours(full):  # noqa: F811
+def test_the_model_is_drawn_and_a_measure_changes_its_colours(full):
     page(full)
     url = artifacts.report_path(full.out).as_uri()
     red, green, blue = screenshot(full.scratch, url).transpose(2, 0, 1)
@@ -64,7 +70,7 @@ setTimeout(() => {
 </script></body>"""
 
 
-def test_a_photo_is_shown_in_the_view_and_photos_are_filtered(full):  # noqa: F811
+def test_a_photo_is_shown_in_the_view_and_photos_are_filtered(full):
     report = artifacts.report_path(full.out)
     report.write_text(page(full).replace("</body>", PRESS))
     html = browse(full.scratch, report.as_uri(), "--dump-dom").stdout
@@ -78,7 +84,7 @@ def test_a_photo_is_shown_in_the_view_and_photos_are_filtered(full):  # noqa: F8
     assert [state for state, hidden in states if not hidden] == ["out"]
 
 
-def test_without_webgl_the_page_says_so_and_keeps_its_pictures(full):  # noqa: F811
+def test_without_webgl_the_page_says_so_and_keeps_its_pictures(full):
     page(full)
     html = browse(full.scratch, artifacts.report_path(full.out).as_uri(), "--dump-dom", webgl=False).stdout
     assert 'data-viewer="none"' in html

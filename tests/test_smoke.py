@@ -86,7 +86,8 @@ def test_the_command_fails_when_a_figure_left_its_bounds(found, code, tmp_path, 
 def test_a_glb_is_read_back_into_the_frame_it_came_from(tmp_path):
     from PIL import Image
 
-    from stages.files.writing import Textures, glb_bytes
+    from stages.files.contents import Textures
+    from stages.files.glb import glb_bytes
 
     vertices = np.array([[0, 0, 0], [1, 0, 0.2], [0.3, 1, 0], [0.1, 0.2, 1]])
     faces = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stages.surface import triangle_mesh
+from stages.surface import selection, triangle_mesh
 from stages.surface.isosurface import extract_isosurface
 from stages.surface.solids import cut_at_plane, cut_to_ball, extract_solid
 
@@ -36,7 +36,7 @@ def test_a_surface_that_leaves_the_ball_is_closed_beyond_it():
     surface = extract_solid(beam, 48, block=16)
     assert triangle_mesh.mesh_state(surface.faces) == CLOSED
     assert volume(surface.vertices, surface.faces) > 0
-    inside = triangle_mesh.inside_ball(surface.vertices, surface.faces, 1.0)
+    inside = selection.inside_ball(surface.vertices, surface.faces, 1.0)
     open_one = extract_isosurface(beam, 48, block=16)
     middles = lambda vertices, faces: np.sort(vertices[faces].mean(1), axis=0)  # noqa: E731
     np.testing.assert_allclose(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pytest
 from torch.utils.flop_counter import FlopCounterMode
 
 from benchmarks import step_limit, step_speed
@@ -17,6 +18,7 @@ def test_the_products_are_those_of_a_step(monkeypatch):
     assert counter.get_total_flops() == expected
 
 
+@pytest.mark.slow
 def test_each_implementation_has_a_row(monkeypatch):
     monkeypatch.setitem(step_limit.POINTS, "cpu", 256)
     monkeypatch.setitem(step_limit.LOG2_ROWS, "cpu", (10,))

@@ -36,7 +36,7 @@ def test_the_heap_lies_in_the_region_and_its_points_are_seen_where_the_photos_sh
     assert (np.linalg.norm(ball_heap.CENTERS, axis=1) + ball_heap.RADII).max() < 1
     image, point = scene.observations[::97].T
     assert len(image) > 100
-    for i, place in zip(image, scene.points[point].astype(float), strict=True):
+    for i, place in zip(image.tolist(), scene.points[point].astype(float), strict=True):
         pixel, depth = cameras.project(i, place[None])
         assert depth > 0
         assert (pixel >= 0).all()

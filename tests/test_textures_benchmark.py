@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks.textures import BOUND, NAIVE, OURS, VERTEX, Look, Score, SetResult, matched, seam, with_tables
+from benchmarks.textures import BOUND, NAIVE, OURS, VERTEX, Look, Score, SetResult, matched, seam, tables_of
 from stages.artifacts import AtlasMesh
 from stages.drawing.rendering import look_at
 from stages.drawing.view_scores import draw_view
@@ -67,9 +67,7 @@ def test_tables_hold_a_row_a_texture_and_its_lead():
     scores = [Score(name, psnr, psnr, 0.9, psnr, 1.2, 1.1) for name, psnr in
               ((OURS, 27.0), (VERTEX, 24.5), (NAIVE, 25.0), (BOUND, 29.0))]  # fmt: skip
     result = SetResult("viking", 1024, 6, "silhouette", 1.0, tuple(scores), {"4096": (60.0, 90.0, 3 << 30)}, {})
-    page = "".join(f"<!-- table {name} -->\n<!-- end {name} -->\n" for name in ("textures", "texture cost"))
-    made = with_tables(page, [result])
-    assert "| viking | ours | 27.00 | +2.50 | +2.00 | 27.00 | 0.900 | 27.00 | 1.20 | 1.10 |" in made
-    assert "| viking | 4096 | 60 | 90 | 3.00 |" in made
-    assert with_tables(made, [result]) == made
-    assert "Not measured yet." in with_tables(page, [])
+    made = tables_of([result])
+    assert "| viking | ours | 27.00 | +2.50 | +2.00 | 27.00 | 0.900 | 27.00 | 1.20 | 1.10 |" in made["textures"]
+    assert "| viking | 4096 | 60 | 90 | 3.00 |" in made["texture cost"]
+    assert set(tables_of([]).values()) == {"Not measured yet."}

@@ -10,9 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from ball_training import TINY, assert_finds_the_ball, make_trainer
 from sphere_scene import RADIUS, render, ring_of_cameras, sphere_scene, write_undistorted
+from train_settings import changed
 
-from configs.params import TrainParams
+from configs.training import TrainParams
 from stages import artifacts, train
 from stages.engine.stage import StageContext
 from stages.errors import InputError
@@ -24,20 +26,6 @@ from stages.neural.sightings import Sightings
 from stages.neural.trained_field import load_field
 from stages.neural.trainer import Trainer
 from stages.neural.training_photos import Photos
-
-TINY = TrainParams(
-    steps=60, rays=128, samples=12, levels=4, log2_rows=10, coarsest=8, finest=32, sdf_width=16,
-    radiance_width=16, start_levels=2, free_points=64, sparse_batch=32,
-    cache_resolution=24, cache_every=16, background_log2_rows=9, background_samples=4,
-)  # fmt: skip
-
-
-def make_trainer(params: TrainParams = TINY, masks: bool = False, device: str = "cpu") -> Trainer:
-    cameras = ring_of_cameras()
-    views = [render(cameras, i) for i in range(len(cameras))]
-    photos = Photos(cameras, [v[0] for v in views], [v[1] for v in views] if masks else None, device)
-    scene = sphere_scene(cameras)
-    return Trainer(photos, Sightings.from_scene(scene, device), params, device)
 
 
 def test_rays_see_the_pixels_they_were_drawn_from():
@@ -68,7 +56,7 @@ def test_the_field_is_a_sphere_before_training():
     trainer = make_trainer()
     points = torch.rand(100, 3, generator=torch.Generator().manual_seed(0)) * 2 - 1
     sdf, _, gradients = trainer.fields.sdf(points, 4)
-    assert (sdf - (points.norm(dim=1) - TINY.sphere_radius)).abs().max() < 1e-3
+    assert (sdf - (points.norm(dim=1) - TINY.field.sphere_radius)).abs().max() < 1e-3
     assert (gradients.norm(dim=1) - 1).abs().max() < 2e-2
     alone = trainer.fields.sdf.sdf(points, 4)
     torch.testing.assert_close(alone, sdf, rtol=1e-5, atol=1e-6)
@@ -138,19 +126,6 @@ def test_training_finds_the_ball():
     assert_finds_the_ball({})
 
 
-def assert_finds_the_ball(settings: dict[str, object]) -> None:
-    params = TINY.model_copy(update={"steps": 300, "rays": 256, "sphere_radius": 0.6, **settings})
-    trainer = make_trainer(params, masks=True)
-    numbers = [trainer.step(i / params.steps) for i in range(params.steps)]
-    first, last = (float(np.mean([float(n["rgb"]) for n in part])) for part in (numbers[:10], numbers[-10:]))
-    assert last < 0.4 * first
-    points = torch.nn.functional.normalize(torch.randn(500, 3, generator=torch.Generator().manual_seed(0)), dim=1)
-    # The sides the cameras see: within 60 degrees of the horizon.
-    points = RADIUS * points[points[:, 2].abs() < 0.8]
-    with torch.no_grad():
-        assert trainer.fields.sdf.sdf(points, params.levels).abs().median() < 0.02
-
-
 def context(tmp_path: Path, name: str, params: TrainParams) -> StageContext:
     folder = tmp_path / "undistort"
     if not folder.exists():
@@ -166,16 +141,18 @@ def metric_lines(path: Path) -> list[dict]:
 
 
 EVERYTHING = {
-    "ambiguity": "stable", "visibility": "mesh", "reflection": "stable", "planar": "stable", "planar_features": "mlp",
-    "eikonal": "stable", "scale": "learned", "sampler": "proposal",
+    "terms.ambiguity.form": "stable", "terms.ambiguity.visibility": "mesh", "terms.reflection.form": "stable",
+    "terms.planar.form": "stable", "terms.planar.features": "mlp",
+    "terms.eikonal.form": "stable", "density.scale": "learned", "sampling.sampler": "proposal",
 }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("settings", [{}, EVERYTHING], ids=["default", "everything"])
 def test_a_killed_run_goes_on_with_the_same_loss_curve(tmp_path, monkeypatch, settings):
     monkeypatch.setattr(train, "LOG_EVERY", 5)
     monkeypatch.setattr(train, "CHECKPOINT_EVERY", 0)
-    params = TINY.model_copy(update={"preview_every": 1.0, **settings})
+    params = changed(TINY, {"preview_every": 1.0, **settings})
     whole = context(tmp_path, "whole", params)
     numbers = train.run(whole)
     assert numbers["steps"] == TINY.steps
@@ -210,7 +187,7 @@ def test_a_killed_run_goes_on_with_the_same_loss_curve(tmp_path, monkeypatch, se
 
 
 def test_the_published_field_answers_in_numpy(tmp_path):
-    run_context = context(tmp_path, "out", TINY.model_copy(update={"steps": 3}))
+    run_context = context(tmp_path, "out", changed(TINY, {"steps": 3}))
     train.run(run_context)
     field = load_field(artifacts.field_path(run_context.out))
     points = np.array([[0.0, 0, 0.9], [0, 0, 0.1]])
@@ -223,8 +200,9 @@ def test_the_published_field_answers_in_numpy(tmp_path):
     assert colors.max() <= 1
 
 
+@pytest.mark.slow
 def test_a_budget_in_minutes_ends_on_time_whatever_the_steps(tmp_path):
-    numbers = train.run(context(tmp_path, "out", TINY.model_copy(update={"steps": 10**9, "minutes": 0.02})))
+    numbers = train.run(context(tmp_path, "out", changed(TINY, {"steps": 10**9, "minutes": 0.02})))
     assert numbers["train_seconds"] < 60  # the first step may have to compile the kernels
 
 
@@ -265,7 +243,9 @@ def test_photos_show_a_place_where_it_projects():
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 @pytest.mark.parametrize("settings", [{}, EVERYTHING], ids=["default", "everything"])
 def test_a_step_on_cuda_matches_the_cpu(settings):
-    params = TINY.model_copy(update={**settings, "scale": "scheduled", "sampler": "grid", "precision": "float32"})
+    params = changed(
+        TINY, {**settings, "density.scale": "scheduled", "sampling.sampler": "grid", "precision": "float32"}
+    )
     cameras = ring_of_cameras()
     scene = sphere_scene(cameras)
     rendered = []
@@ -304,8 +284,9 @@ def test_the_hull_of_a_ball_is_a_little_more_than_the_ball():
     assert hull_distances(cameras, [np.zeros((40, 48), np.uint8)] * 16, cells=20) is None
 
 
+@pytest.mark.slow
 def test_training_can_start_from_the_hull():
-    trainer = make_trainer(TINY.model_copy(update={"sphere_radius": 0.8, "init": "hull"}), masks=True)
+    trainer = make_trainer(changed(TINY, {"field.sphere_radius": 0.8, "field.init": "hull"}), masks=True)
     cameras = ring_of_cameras()
     train._start_from_shape(trainer, cameras)
     levels = trainer.moment(0.0).levels
@@ -338,7 +319,7 @@ def test_a_hull_without_masks_is_refused(tmp_path):
     write_undistorted(tmp_path / "undistort", ring_of_cameras(), masks=False)
     for name in ("out", "scratch"):
         (tmp_path / name).mkdir()
-    params = TINY.model_copy(update={"init": "hull"})
+    params = changed(TINY, {"field.init": "hull"})
     context = StageContext({"undistort": tmp_path / "undistort"}, {}, tmp_path / "out", tmp_path / "scratch", params)
     with pytest.raises(InputError, match="needs masks for all 8 photos"):
         train.TRAIN.run(context)

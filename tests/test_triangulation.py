@@ -9,7 +9,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from test_sfm import FOCAL, HEIGHT, WIDTH, ingested, look_at, render
+from printed_box import FOCAL, HEIGHT, WIDTH, ingested, render
+from rigs import look_at
 
 from configs.params import SfmParams
 from stages import artifacts
@@ -42,6 +43,7 @@ def run_sfm(ingest: Path, poses: Path, root: Path, **params: object) -> tuple[di
     return SFM.run(StageContext({"ingest": ingest}, {"poses": poses}, out, scratch, settings, workers=2)), out
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("exhaustive_max", [150, 2])
 def test_poses_stay_and_points_are_found(tmp_path: Path, exhaustive_max: int):
     import pycolmap

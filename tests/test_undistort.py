@@ -8,95 +8,30 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from dotted_capture import (
+    BALL,
+    CENTER,
+    DOTS,
+    FOCAL,
+    HEIGHT,
+    MODELS,
+    NUM_CAMERAS,
+    UP,
+    WIDTH,
+    cam_from_world,
+    dots_seen,
+    undistort,
+    write_capture,
+)
 
-from configs.params import PlaceParams, UndistortParams
 from stages import artifacts
-from stages.artifacts import ImageRecord, ImageSet
-from stages.engine.stage import StageContext
+from stages.artifacts import ImageSet
 from stages.errors import ConfigError, InputError, WorkspaceError
 from stages.geometry.cameras import PinholeCameras, PosedScene
 from stages.geometry.place import Place, given_region
 from stages.geometry.plane import Plane
 from stages.geometry.similarity import Similarity
-from stages.place import PLACE_STAGE
 from stages.posing.undistortion import png_names
-from stages.undistort import UNDISTORT
-
-WIDTH, HEIGHT, FOCAL = 320, 240, 300.0
-CENTER, UP = np.array([2.0, -1.0, 0.5]), np.array([0.0, -1.0, 0.0])  # COLMAP's world often has y down
-BALL = 0.6  # radius of the ball the masks show
-DOTS = CENTER + np.array([[0, 0, 0], [0.4, 0, 0], [0, 0.4, 0], [0, 0, -0.4], [-0.3, -0.3, 0], [0.2, -0.4, 0.3]])
-NUM_CAMERAS = 8
-
-
-def cam_from_world(index: int) -> np.ndarray:
-    angle = 2 * np.pi * index / NUM_CAMERAS
-    offset = np.array([3.0 * np.cos(angle), -1.2, 3.0 * np.sin(angle)])
-    z = -offset / np.linalg.norm(offset)
-    x = np.cross(z, UP)
-    x /= np.linalg.norm(x)
-    rotation = np.stack([x, np.cross(z, x), z])
-    return np.concatenate([rotation, -(rotation @ (CENTER + offset))[:, None]], 1)
-
-
-def write_capture(root: Path, model_name: str, parameters: list[float], masks: bool) -> dict[str, Path]:
-    """Ingest and sfm folders: black photos with a white dot where each point projects, and masks of the ball."""
-    import pycolmap
-
-    ingest, sfm = root / "ingest", root / "sfm"
-    camera = pycolmap.Camera.create_from_model_name(1, model_name, FOCAL, WIDTH, HEIGHT)
-    camera.camera_id = 1
-    camera.params = parameters
-    model = pycolmap.Reconstruction()
-    model.add_camera_with_trivial_rig(camera)
-
-    x, y = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
-    pixels = np.stack([x.ravel(), y.ravel()], 1)
-    rays = np.concatenate([np.asarray(camera.cam_from_img(pixels)), np.ones((len(pixels), 1))], 1)
-    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    records = []
-    for i in range(NUM_CAMERAS):
-        pose, name = cam_from_world(i), f"photo_{i}.jpg"
-        at = np.asarray(camera.img_from_cam(DOTS @ pose[:, :3].T + pose[:, 3]))
-        photo = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
-        for dot in at:
-            distance = np.hypot(x - dot[0], y - dot[1])
-            photo = np.maximum(photo, (255 * np.clip(3.5 - distance, 0, 1))[..., None].astype(np.uint8))
-        path = artifacts.image_path(ingest, name)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        assert cv2.imwrite(str(path), photo, [cv2.IMWRITE_JPEG_QUALITY, 100])
-        if masks:
-            center = pose[:, :3] @ CENTER + pose[:, 3]
-            miss = np.linalg.norm(center - (rays @ center)[:, None] * rays, axis=1)
-            path = artifacts.mask_path(ingest, name)
-            path.parent.mkdir(parents=True, exist_ok=True)
-            assert cv2.imwrite(str(path), (miss < BALL).reshape(HEIGHT, WIDTH).astype(np.uint8) * 255)
-        records.append(ImageRecord(name, name, WIDTH, HEIGHT, None, "camera", 1.0, masks, str(i)))
-        image = pycolmap.Image(name, pycolmap.Point2DList([pycolmap.Point2D(p) for p in at]), 1, i + 1)
-        pose3d = pycolmap.Rigid3d(pycolmap.Rotation3d(pose[:, :3]), pose[:, 3])
-        model.add_image_with_trivial_frame(image, pose3d)
-    for k, dot in enumerate(DOTS):
-        track = pycolmap.Track()
-        for i in range(NUM_CAMERAS):
-            track.add_element(i + 1, k)
-        model.add_point3D(dot, track, np.zeros(3, np.uint8))
-    artifacts.save_image_set(ingest, ImageSet(tuple(records)))
-    folder = artifacts.model_path(sfm)
-    folder.mkdir(parents=True)
-    model.write(str(folder))
-    return {"ingest": ingest, "sfm": sfm}
-
-
-def undistort(inputs: dict[str, Path], root: Path, **params: object) -> tuple[PosedScene, Path, dict[str, object]]:
-    """Place and undistort; settings of either. Scene, folder and numbers of both."""
-    out, place = root / "undistort", root / "place"
-    for folder in (out, place):
-        folder.mkdir()
-    placing = PlaceParams(**{key: params[key] for key in params if key in PlaceParams.model_fields})  # type: ignore[arg-type]
-    rest = UndistortParams(**{key: params[key] for key in params if key not in PlaceParams.model_fields})  # type: ignore[arg-type]
-    placed = PLACE_STAGE.run(StageContext(inputs, {}, place, root, placing))
-    numbers = UNDISTORT.run(StageContext({**inputs, "place": place}, {}, out, root, rest, workers=2))
-    return artifacts.load_scene(out), out, {**numbers, **{key: value for key, value in placed.items() if value != ""}}
 
 
 def place_of(root: Path) -> Place:
@@ -105,26 +40,6 @@ def place_of(root: Path) -> Place:
 
 def world_from(scene: PosedScene, root: Path) -> Similarity:
     return scene.world_from_scene(place_of(root))
-
-
-def dots_seen(photo: np.ndarray, expected: np.ndarray) -> np.ndarray:
-    """Centroid of the white pixels around each expected position [P, 2] (pixel centres at .5)."""
-    found = []
-    for u, v in expected:
-        x0, y0 = int(u) - 6, int(v) - 6
-        patch = photo[y0 : y0 + 13, x0 : x0 + 13].astype(float)
-        patch[patch < 20] = 0
-        y, x = np.mgrid[: patch.shape[0], : patch.shape[1]]
-        found.append([x0 + 0.5 + (x * patch).sum() / patch.sum(), y0 + 0.5 + (y * patch).sum() / patch.sum()])
-    return np.array(found)
-
-
-MODELS = [
-    ("SIMPLE_PINHOLE", [FOCAL, WIDTH / 2, HEIGHT / 2]),
-    ("SIMPLE_RADIAL", [FOCAL, WIDTH / 2, HEIGHT / 2, -0.15]),
-    ("SIMPLE_RADIAL", [FOCAL, WIDTH / 2, HEIGHT / 2, 0.12]),
-    ("OPENCV", [FOCAL, 1.02 * FOCAL, WIDTH / 2 + 6, HEIGHT / 2 - 4, -0.1, 0.02, 0.002, -0.001]),
-]
 
 
 @pytest.mark.parametrize(("model_name", "parameters"), MODELS)
@@ -159,6 +74,7 @@ def test_image_pixels_all_come_from_the_photo(tmp_path: Path):
         assert cv2.imread(str(artifacts.image_path(out, name))).min() == 255
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("model_name", "parameters"), MODELS[1:3])
 @pytest.mark.parametrize("max_side", [1600, 200])
 def test_masks_are_warped_by_the_same_maps(tmp_path: Path, model_name: str, parameters: list[float], max_side: int):
@@ -381,16 +297,14 @@ def test_a_distance_that_contradicts_gps_is_believed_and_told(tmp_path: Path, ca
     assert place_of(tmp_path).origin is not None
 
 
-def test_coordinates_far_from_the_origin_keep_their_precision(tmp_path: Path, monkeypatch):
+def test_coordinates_far_from_the_origin_keep_their_precision(tmp_path: Path):
     far = np.array([465123.0, 5247811.0, 410.0])
-    monkeypatch.setitem(globals(), "CENTER", CENTER + far)
-    monkeypatch.setitem(globals(), "DOTS", DOTS + far)
-    inputs = write_capture(tmp_path, *MODELS[0], masks=False)
+    inputs = write_capture(tmp_path, *MODELS[0], masks=False, shift=far)
     scene, _, _ = undistort(inputs, tmp_path)
     model_from_world = place_of(tmp_path).world_from_poses.inverse()
     assert np.abs(world_from(scene, tmp_path).translation).max() < 5
     world = world_from(scene, tmp_path).apply(scene.points.astype(float)).astype(np.float32)
-    np.testing.assert_allclose(model_from_world.apply(world.astype(float)), DOTS, atol=1e-5)
+    np.testing.assert_allclose(model_from_world.apply(world.astype(float)), DOTS + far, atol=1e-5)
 
 
 def test_a_known_distance_changes_nothing_of_the_scene(tmp_path: Path):

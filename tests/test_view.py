@@ -54,6 +54,7 @@ def get(url: str) -> str:
         return answer.read().decode()
 
 
+@pytest.mark.slow
 def test_a_training_run_is_shown_as_it_goes_and_then_the_report(workspace):
     with workspace.lock():
         train_a_little(workspace)
@@ -104,6 +105,7 @@ def test_where_there_is_nothing_to_see_it_says_what_to_do(workspace, tmp_path):
     assert "no report yet" in result.stderr
 
 
+@pytest.mark.slow
 def test_the_command_prints_its_address_and_ends_with_ctrl_c(workspace):
     write_report(workspace)
     command = [sys.executable, "-m", "hineus_cli", "view", str(workspace.root), "--no-browser"]

@@ -26,7 +26,7 @@ def save_held_out(folder: Path, names: Sequence[str]) -> None:
 
 
 def load_held_out(folder: Path) -> tuple[str, ...]:
-    """Names of the photos that `train.holdout` keeps back from training and texture; none where it is off."""
+    """Names of the photos that `train.hold_out` keeps back from training and texture; none where it is off."""
     path = folder / HELD_OUT_FILE
     return tuple(read_json(path)) if path.exists() else ()
 

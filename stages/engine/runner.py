@@ -201,7 +201,9 @@ def _run_stage(
     return manifest
 
 
-def _call(stage: Stage[Any], context: StageContext, workspace: Workspace, status: StageStatus) -> Mapping[str, Any]:
+def _call(
+    stage: Stage[Any], context: StageContext[Any], workspace: Workspace, status: StageStatus
+) -> Mapping[str, Any]:
     """Run the stage; tell of a full disk, a missing library or exhausted memory in the user's terms."""
     try:
         return stage.run(context) or {}

@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel
 
+from configs.renames import section_with_new_names
 from stages.engine.fingerprint import RUN_KEY, FileDigests, Identity, SourceDigests, digest, manifest_key
 from stages.engine.manifest import Manifest, ManifestDamaged, jsonable, output_problem
 from stages.engine.stage import Stage
@@ -62,7 +63,8 @@ def stage_status(
     reasons = [damage] if damage else []
     if before is not None:
         # Of a stage that will run again only the run itself can tell whether its outputs change.
-        before = replace(before, inputs=_by_artifact(before.inputs, stage, earlier))
+        params = section_with_new_names(stage.name, before.params)
+        before = replace(before, params=params, inputs=_by_artifact(before.inputs, stage, earlier))
         unsettled = {name: old for name, old in before.inputs.items() if _owner(name) in {s.name for s in waiting}}
         reasons += replace(identity, inputs={**identity.inputs, **unsettled}).changes_since(before)
         reasons += [f"input stage {status.name} is {status.state}" for status in waiting]

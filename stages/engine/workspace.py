@@ -432,6 +432,6 @@ def _sync_tree(folder: Path) -> None:
 
 def _scratch_owner(path: Path) -> str | None:
     try:
-        return json.loads(path.read_text(encoding="utf-8"))["fingerprint"]
+        return str(json.loads(path.read_text(encoding="utf-8"))["fingerprint"])
     except (OSError, ValueError, KeyError, TypeError):
         return None

@@ -7,7 +7,8 @@ from collections.abc import Iterable
 import numpy as np
 
 from stages.geometry.cameras import PinholeCameras
-from stages.surface.triangle_mesh import outside_hull, raycaster
+from stages.surface.selection import outside_hull
+from stages.surface.triangle_mesh import raycaster
 
 # The way from a point to a camera starts this part of it off the point, whose own surface would hide it.
 CLEAR = 1e-5

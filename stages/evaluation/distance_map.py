@@ -8,7 +8,7 @@ import numpy as np
 
 from stages.errors import InputError
 from stages.evaluation.surfaces import Surface
-from stages.files.writing import ply_bytes
+from stages.files.ply_stl import ply_bytes
 from stages.surface.triangle_mesh import vertex_normals
 
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from stages.files.writing import ROUGHNESS, Textures, checked_mesh
+from stages.files.contents import ROUGHNESS, Textures, checked_mesh
 
 ROOT_LAYER = "model.usdc"  # AR viewers want the binary form, and first in the package
 # Where files may begin in a package, in bytes; and the id of the zip's field that USD fills up with.

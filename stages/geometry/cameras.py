@@ -9,12 +9,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from stages.geometry.place import Place
 from stages.geometry.plane import Plane
 from stages.geometry.similarity import Similarity
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float, Float32, Float64, Integer
 
 
 @dataclass(frozen=True)
@@ -23,15 +27,15 @@ class PinholeCameras:
 
     Attributes:
         names: N image names, relative posix paths.
-        sizes: [N, 2] int, width and height in pixels.
-        intrinsics: [N, 3, 3] float64, pixels.
-        cam_from_scene: [N, 3, 4] float64, rotation and translation.
+        sizes: width and height in pixels.
+        intrinsics: pixels.
+        cam_from_scene: rotation and translation.
     """
 
     names: tuple[str, ...]
-    sizes: np.ndarray
-    intrinsics: np.ndarray
-    cam_from_scene: np.ndarray
+    sizes: Integer[np.ndarray, "n 2"]
+    intrinsics: Float64[np.ndarray, "n 3 3"]
+    cam_from_scene: Float64[np.ndarray, "n 3 4"]
 
     def __len__(self) -> int:
         return len(self.names)
@@ -43,18 +47,20 @@ class PinholeCameras:
         return PinholeCameras(names, self.sizes[chosen], self.intrinsics[chosen], self.cam_from_scene[chosen])
 
     @property
-    def centers(self) -> np.ndarray:
-        """[N, 3] projection centres in the scene frame."""
+    def centers(self) -> Float[np.ndarray, "n 3"]:
+        """Projection centres in the scene frame."""
         rotation, translation = self.cam_from_scene[:, :, :3], self.cam_from_scene[:, :, 3]
         return -np.einsum("nji,nj->ni", rotation, translation)
 
     @property
-    def forward(self) -> np.ndarray:
-        """[N, 3] unit viewing directions in the scene frame."""
+    def forward(self) -> Float[np.ndarray, "n 3"]:
+        """Unit viewing directions in the scene frame."""
         return self.cam_from_scene[:, 2, :3]
 
-    def project(self, index: int, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Pixel coordinates [P, 2] and depths [P] of scene points [P, 3] in one camera. Depth <= 0 is behind it."""
+    def project(
+        self, index: int, points: Float[np.ndarray, "p 3"]
+    ) -> tuple[Float[np.ndarray, "p 2"], Float[np.ndarray, " p"]]:
+        """Pixel coordinates and depths of scene points in one camera. Depth <= 0 is behind it."""
         in_cam = points @ self.cam_from_scene[index, :, :3].T + self.cam_from_scene[index, :, 3]
         depth = in_cam[:, 2]
         safe = np.where(np.abs(depth) < 1e-12, 1e-12, depth)
@@ -64,13 +70,15 @@ class PinholeCameras:
             [K[0, 0] * pixels[:, 0] + K[0, 1] * pixels[:, 1] + K[0, 2], K[1, 1] * pixels[:, 1] + K[1, 2]], 1
         ), depth
 
-    def in_frame(self, index: int, points: np.ndarray) -> np.ndarray:
-        """[P] bool: which scene points [P, 3] lie before one camera and within its photo, hidden or not."""
+    def in_frame(self, index: int, points: Float[np.ndarray, "p 3"]) -> Bool[np.ndarray, " p"]:
+        """Which scene points lie before one camera and within its photo, hidden or not."""
         pixels, depth = self.project(index, points)
         return (depth > 0) & (pixels >= 0).all(1) & (pixels < self.sizes[index]).all(1)
 
-    def rays(self, index: int, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Origins and unit directions [P, 3] in the scene frame of rays through pixel positions [P, 2]."""
+    def rays(
+        self, index: int, pixels: Float[np.ndarray, "p 2"]
+    ) -> tuple[Float[np.ndarray, "p 3"], Float[np.ndarray, "p 3"]]:
+        """Origins and unit directions in the scene frame of rays through pixel positions."""
         K, rotation = self.intrinsics[index], self.cam_from_scene[index, :, :3]
         y = (pixels[:, 1] - K[1, 2]) / K[1, 1]
         x = (pixels[:, 0] - K[0, 2] - K[0, 1] * y) / K[0, 0]
@@ -86,20 +94,20 @@ class PosedScene:
     Attributes:
         cameras: the registered, undistorted images.
         poses_from_scene: similarity from the normalised frame to the one in which the poses were found or given.
-        points: [P, 3] float32 sparse points in the scene frame.
-        point_errors: [P] float32 mean reprojection error in pixels.
-        observations: [M, 2] int32 rows (image index, point index): which image saw which point.
-        up: [3] unit vector, the estimated up direction in the scene frame.
+        points: sparse points in the scene frame.
+        point_errors: mean reprojection error in pixels.
+        observations: rows (image index, point index): which image saw which point.
+        up: unit vector, the estimated up direction in the scene frame.
         kind: "object" (cameras around one thing) or "forward" (a room, a facade, a survey flight).
         ground: plane of the ground or table in the scene frame, or None where none was found.
     """
 
     cameras: PinholeCameras
     poses_from_scene: Similarity
-    points: np.ndarray
-    point_errors: np.ndarray
-    observations: np.ndarray
-    up: np.ndarray
+    points: Float32[np.ndarray, "p 3"]
+    point_errors: Float32[np.ndarray, " p"]
+    observations: Integer[np.ndarray, "m 2"]
+    up: Float[np.ndarray, " 3"]
     kind: str = "object"
     ground: Plane | None = None
 
@@ -107,6 +115,6 @@ class PosedScene:
         """To the frame of the results."""
         return place.world_from_poses.compose(self.poses_from_scene)
 
-    def up_in(self, place: Place) -> np.ndarray:
-        """[3] unit, scene frame: up as the place tells it, else as the capture does."""
+    def up_in(self, place: Place) -> Float[np.ndarray, " 3"]:
+        """Unit, scene frame: up as the place tells it, else as the capture does."""
         return self.up if place.up is None else place.up @ self.world_from_scene(place).rotation

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from stages.geometry.cameras import PinholeCameras
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float, Float32, Shaped
 
 # A voxel belongs to the hull when it is inside the silhouette in this part of the views it projects into;
 # less than 1, because a mask or a pose may be wrong.
@@ -18,17 +22,20 @@ ROOM_RADIUS = 0.9
 
 
 def visual_hull_sphere(
-    cameras: PinholeCameras, masks: Sequence[np.ndarray | None], center: np.ndarray, radius: float
-) -> tuple[np.ndarray, float] | None:
+    cameras: PinholeCameras,
+    masks: Sequence[Shaped[np.ndarray, "_ _"] | None],
+    center: Float[np.ndarray, " 3"],
+    radius: float,
+) -> tuple[Float[np.ndarray, " 3"], float] | None:
     """Sphere about the visual hull of silhouettes, looked for in the cube `center` +- `radius`.
 
     The cube is carved on a coarse grid, then once more on the hull's own box; without margin.
 
     Args:
-        masks: one [H, W] bool (or 0/255) array per camera, of the camera's size, or None where there is none.
+        masks: one array (not zero on the object) per camera, of the camera's size, or None where there is none.
 
     Returns:
-        Centre [3] and radius, or None where nothing is left after carving.
+        Centre and radius, or None where nothing is left after carving.
     """
     low, high = center - radius, center + radius
     for _ in range(2):
@@ -46,8 +53,10 @@ def visual_hull_sphere(
     return hull_center, float(hull_radius)
 
 
-def _inside_silhouettes(cameras: PinholeCameras, masks: Sequence[np.ndarray | None], points: np.ndarray) -> np.ndarray:
-    """[P] whether points [P, 3] lie inside the silhouettes of nearly all the views they project into."""
+def _inside_silhouettes(
+    cameras: PinholeCameras, masks: Sequence[Shaped[np.ndarray, "_ _"] | None], points: Float[np.ndarray, "p 3"]
+) -> Bool[np.ndarray, " p"]:
+    """Whether points lie inside the silhouettes of nearly all the views they project into."""
     seen, inside = np.zeros(len(points)), np.zeros(len(points))
     masked = [i for i, mask in enumerate(masks) if mask is not None]
     for i in masked:
@@ -63,15 +72,15 @@ def _inside_silhouettes(cameras: PinholeCameras, masks: Sequence[np.ndarray | No
 
 
 def hull_distances(
-    cameras: PinholeCameras, masks: Sequence[np.ndarray | None], cells: int = DISTANCE_CELLS
-) -> np.ndarray | None:
+    cameras: PinholeCameras, masks: Sequence[Shaped[np.ndarray, "_ _"] | None], cells: int = DISTANCE_CELLS
+) -> Float32[np.ndarray, "{cells} {cells} {cells}"] | None:
     """Signed distance to the hull, negative inside, at the centres of a grid over the cube [-1, 1]^3.
 
     Args:
-        masks: one [H, W] array per camera, not zero on the object, or None where there is none.
+        masks: one array per camera, not zero on the object, or None where there is none.
 
     Returns:
-        [cells, cells, cells] float32, axes x, y, z; or None where nothing, or all, is inside.
+        Axes x, y, z; or None where nothing, or all, is inside.
     """
     from scipy.ndimage import distance_transform_edt
 
@@ -86,12 +95,12 @@ def hull_distances(
     return (cell * (outside_by - inside_by)).astype(np.float32)
 
 
-def room_distances(cells: int = DISTANCE_CELLS) -> np.ndarray:
+def room_distances(cells: int = DISTANCE_CELLS) -> Float32[np.ndarray, "{cells} {cells} {cells}"]:
     """Signed distance to a round room's wall, positive within, at the centres of a grid as of `hull_distances`."""
     return (ROOM_RADIUS - np.linalg.norm(_cube(cells), axis=-1)).astype(np.float32)
 
 
-def _cube(cells: int) -> np.ndarray:
-    """[cells, cells, cells, 3] centres of a grid over the cube [-1, 1]^3."""
+def _cube(cells: int) -> Float[np.ndarray, "{cells} {cells} {cells} 3"]:
+    """Centres of a grid over the cube [-1, 1]^3."""
     axis = (np.arange(cells) + 0.5) * 2.0 / cells - 1
     return np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1)

@@ -5,11 +5,15 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from stages.geometry.cameras import PinholeCameras
 from stages.geometry.region import meeting_point
+
+if TYPE_CHECKING:
+    from jaxtyping import Float, UInt8
 
 # Rays from two photos tell a corner's depth from this angle on, degrees.
 MIN_PARALLAX_DEG = 3.0
@@ -33,8 +37,8 @@ class MarkerScale:
     sides: int
 
 
-def detect_markers(image: np.ndarray, dictionary: str) -> dict[int, np.ndarray]:
-    """Corners [4, 2] in pixels (centres at .5) of each marker in an RGB image [H, W, 3], by its number.
+def detect_markers(image: UInt8[np.ndarray, "h w 3"], dictionary: str) -> dict[int, Float[np.ndarray, "4 2"]]:
+    """Corners in pixels (centres at .5) of each marker in an RGB image, by its number.
 
     A number seen twice in one image names no one marker, and is left out.
     """
@@ -52,7 +56,9 @@ def detect_markers(image: np.ndarray, dictionary: str) -> dict[int, np.ndarray]:
     }
 
 
-def measure_markers(cameras: PinholeCameras, seen: Sequence[dict[int, np.ndarray]], size: float) -> MarkerScale | None:
+def measure_markers(
+    cameras: PinholeCameras, seen: Sequence[dict[int, Float[np.ndarray, "4 2"]]], size: float
+) -> MarkerScale | None:
     """The scale from markers seen in at least two photos, or None where no side could be measured.
 
     Args:
@@ -82,9 +88,13 @@ def measure_markers(cameras: PinholeCameras, seen: Sequence[dict[int, np.ndarray
 
 
 def _place_corner(
-    cameras: PinholeCameras, seen: Sequence[dict[int, np.ndarray]], indices: list[int], number: int, k: int
-) -> np.ndarray | None:
-    """[3] where corner `k` of a marker is, or None where its sightings do not tell."""
+    cameras: PinholeCameras,
+    seen: Sequence[dict[int, Float[np.ndarray, "4 2"]]],
+    indices: list[int],
+    number: int,
+    k: int,
+) -> Float[np.ndarray, " 3"] | None:
+    """Where corner `k` of a marker is, or None where its sightings do not tell."""
     rays = [cameras.rays(i, seen[i][number][k][None]) for i in indices]
     origins = np.concatenate([origin for origin, _ in rays])
     directions = np.concatenate([direction for _, direction in rays])

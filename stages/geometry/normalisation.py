@@ -5,14 +5,19 @@ Cameras of the world frame are `PinholeCameras` whose "scene" is the world.
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from stages.geometry.cameras import PinholeCameras
 from stages.geometry.similarity import Similarity
 
+if TYPE_CHECKING:
+    from jaxtyping import Float
 
-def rotation_onto(source: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """[3, 3] smallest rotation that takes unit vector `source` to unit vector `target`."""
+
+def rotation_onto(source: Float[np.ndarray, " 3"], target: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "3 3"]:
+    """The smallest rotation that takes unit vector `source` to unit vector `target`."""
     cross, cosine = np.cross(source, target), float(source @ target)
     if cosine < -1 + 1e-9:  # opposite: half a turn about any axis perpendicular to it
         axis = np.cross(source, np.eye(3)[np.argmin(np.abs(source))])
@@ -22,7 +27,7 @@ def rotation_onto(source: np.ndarray, target: np.ndarray) -> np.ndarray:
     return np.eye(3) + K + K @ K / (1 + cosine)
 
 
-def scene_frame(center: np.ndarray, radius: float, up: np.ndarray) -> Similarity:
+def scene_frame(center: Float[np.ndarray, " 3"], radius: float, up: Float[np.ndarray, " 3"]) -> Similarity:
     """world_from_scene: the unit sphere to the sphere (center, radius), scene +z to `up`."""
     if not radius > 0:
         raise ValueError(f"got radius {radius}, expected a positive one")

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
+if TYPE_CHECKING:
+    from jaxtyping import Float
 
-def y_up_rotation(up: np.ndarray) -> np.ndarray:
-    """The smallest proper rotation [3, 3] that turns the unit vector `up` to +Y (glTF's up)."""
+
+def y_up_rotation(up: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "3 3"]:
+    """The smallest proper rotation that turns the unit vector `up` to +Y (glTF's up)."""
     target = np.array([0.0, 1.0, 0.0])
     up = up / np.linalg.norm(up)
     axis, cos = np.cross(up, target), float(up @ target)

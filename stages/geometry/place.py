@@ -8,10 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from stages.geometry.similarity import Similarity, align_points
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float
 
 # WGS 84: semi-major axis in metres and flattening.
 EARTH_RADIUS, FLATTENING = 6378137.0, 1 / 298.257223563
@@ -41,7 +45,7 @@ class Place:
         origin: latitude and longitude in degrees and altitude in metres of the world's origin (x east, y north,
             z up), or None.
         gps_residual: root mean square distance in metres of the cameras from their GPS positions, or None.
-        up: [3] unit, in the world, where GPS or the settings tell it; None: as the scene has it.
+        up: unit, in the world, where GPS or the settings tell it; None: as the scene has it.
     """
 
     world_from_poses: Similarity
@@ -50,7 +54,7 @@ class Place:
     scale_error: float | None = None
     origin: tuple[float, float, float] | None = None
     gps_residual: float | None = None
-    up: np.ndarray | None = None
+    up: Float[np.ndarray, " 3"] | None = None
 
     @property
     def units(self) -> str:
@@ -81,7 +85,7 @@ class Place:
             scale_error=scale_error,
         )
 
-    def near(self, center: np.ndarray, radius: float) -> Place:
+    def near(self, center: Float[np.ndarray, " 3"], radius: float) -> Place:
         """The same place with its origin near `center` (world) where 32-bit coordinates would lose precision."""
         if np.abs(center).max() * np.finfo(np.float32).eps < PRECISION * radius:
             return self
@@ -94,18 +98,18 @@ class GivenRegion:
     """The region of interest that the user gave, brought into the frame of the poses.
 
     Attributes:
-        center: [3] of the sphere. radius: of it, or of the sphere about the box.
-        box: [2, 3] lowest and highest corner in the world of the box that the mesh is cropped to, or None.
+        center: of the sphere. radius: of it, or of the sphere about the box.
+        box: lowest and highest corner in the world of the box that the mesh is cropped to, or None.
         world_from_poses: as it was when the region was given.
     """
 
-    center: np.ndarray
+    center: Float[np.ndarray, " 3"]
     radius: float
-    box: np.ndarray | None
+    box: Float[np.ndarray, "2 3"] | None
     world_from_poses: Similarity
 
-    def box_corners(self) -> np.ndarray | None:
-        """[8, 3] corners of the box in the frame of the poses; bit k of a corner's number is its side of axis k."""
+    def box_corners(self) -> Float[np.ndarray, "8 3"] | None:
+        """Corners of the box in the frame of the poses; bit k of a corner's number is its side of axis k."""
         if self.box is None:
             return None
         picks = np.array([[i >> k & 1 for k in range(3)] for i in range(8)])
@@ -145,21 +149,21 @@ class Located:
     used: int
 
     @property
-    def up(self) -> np.ndarray:
-        """[3] unit, in the model's frame."""
+    def up(self) -> Float[np.ndarray, " 3"]:
+        """Unit, in the frame of the poses."""
         return self.world_from_poses.rotation[2]
 
 
-def east_north_up(positions: np.ndarray, origin: tuple[float, float, float]) -> np.ndarray:
-    """[N, 3] metres east, north and up of `origin` of positions [N, 3]: latitude, longitude (degrees), altitude (m)."""
+def east_north_up(positions: Float[np.ndarray, "n 3"], origin: tuple[float, float, float]) -> Float[np.ndarray, "n 3"]:
+    """Metres east, north and up of `origin` of positions: latitude, longitude (degrees), altitude (m)."""
     latitude, longitude = np.radians(origin[:2])
     east = np.array([-np.sin(longitude), np.cos(longitude), 0.0])
     up = np.array([np.cos(latitude) * np.cos(longitude), np.cos(latitude) * np.sin(longitude), np.sin(latitude)])
     return (_earth_centred(positions) - _earth_centred(np.array([origin]))) @ np.stack([east, np.cross(up, east), up]).T
 
 
-def _earth_centred(positions: np.ndarray) -> np.ndarray:
-    """[N, 3] metres from the Earth's centre (WGS 84)."""
+def _earth_centred(positions: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    """Metres from the Earth's centre (WGS 84)."""
     latitude, longitude = np.radians(positions[:, :2]).T
     altitude = positions[:, 2]
     squared_eccentricity = FLATTENING * (2 - FLATTENING)
@@ -169,14 +173,14 @@ def _earth_centred(positions: np.ndarray) -> np.ndarray:
     return np.stack([across * np.cos(longitude), across * np.sin(longitude), along_axis], 1)
 
 
-def locate(centers: np.ndarray, positions: np.ndarray, seed: int = 0) -> Located:
+def locate(centers: Float[np.ndarray, "n 3"], positions: Float[np.ndarray, "n 3"], seed: int = 0) -> Located:
     """Align camera centres to their GPS positions.
 
     The least median of squares over triples, then least squares over the photos that fit.
 
     Args:
-        centers: [N, 3] in the model's frame.
-        positions: [N, 3] latitude, longitude (degrees), altitude (metres).
+        centers: in the model's frame.
+        positions: latitude, longitude (degrees), altitude (metres).
         seed: of the triples.
 
     Raises:
@@ -211,8 +215,10 @@ def locate(centers: np.ndarray, positions: np.ndarray, seed: int = 0) -> Located
     return Located(world_from_poses, origin, residual, residual / np.sqrt(3 * count) / total, float(tilt), count)
 
 
-def _agreeing(centers: np.ndarray, targets: np.ndarray, seed: int) -> np.ndarray:
-    """[N] bool: photos whose position agrees with the similarity that most agree with."""
+def _agreeing(
+    centers: Float[np.ndarray, "n 3"], targets: Float[np.ndarray, "n 3"], seed: int
+) -> Bool[np.ndarray, " n"]:
+    """Photos whose position agrees with the similarity that most agree with."""
     random = np.random.default_rng(seed)
     best, best_misses = np.inf, np.zeros(len(centers))
     for _ in range(SAMPLES):

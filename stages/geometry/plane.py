@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from stages.geometry.similarity import Similarity
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
 
 # Points this far from the region's centre count, in its radii: the table's edge and the floor below it do not.
 REACH = 2.0
@@ -32,19 +36,19 @@ class Plane:
     """The plane normal . x = offset.
 
     Attributes:
-        normal: [3] unit, pointing up.
+        normal: unit, pointing up.
         offset: distance of the plane from the origin along the normal.
         rms: root mean square distance of its points to it.
         share: part of the points near that lie on it.
     """
 
-    normal: np.ndarray
+    normal: Float[np.ndarray, " 3"]
     offset: float
     rms: float
     share: float
 
-    def heights(self, points: np.ndarray) -> np.ndarray:
-        """[P] signed distance of points [P, 3], positive above."""
+    def heights(self, points: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, " p"]:
+        """Signed distance of points, positive above."""
         return points @ self.normal - self.offset
 
     def within(self, world_from_scene: Similarity) -> Plane:
@@ -55,16 +59,20 @@ class Plane:
 
 
 def find_ground(
-    points: np.ndarray, camera_centers: np.ndarray, up: np.ndarray, center: np.ndarray, radius: float, seed: int = 0
+    points: Float[np.ndarray, "p 3"],
+    camera_centers: Float[np.ndarray, "n 3"],
+    up: Float[np.ndarray, " 3"],
+    center: Float[np.ndarray, " 3"],
+    radius: float,
+    seed: int = 0,
 ) -> Plane | None:
     """The plane nearly all else stands on, or None where the points show none.
 
     RANSAC over triples of points, the best that has its normal near `up`, the cameras above and little below.
 
     Args:
-        points: [P, 3] sparse points.
-        camera_centers: [N, 3].
-        up: [3] unit, roughly.
+        points: sparse points.
+        up: unit, roughly.
         center, radius: the region of interest; lengths are judged against its radius.
         seed: of the triples.
     """
@@ -109,8 +117,10 @@ def find_ground(
     return Plane(normal, offset + float(normal @ center), rms, share)
 
 
-def fit_plane(points: np.ndarray, up: np.ndarray, weights: np.ndarray | None = None) -> tuple[np.ndarray, float]:
-    """Least-squares normal [3] (on the side of `up`) and offset of points [P, 3] with weights [P]."""
+def fit_plane(
+    points: Float[np.ndarray, "p 3"], up: Float[np.ndarray, " 3"], weights: Float[np.ndarray, " p"] | None = None
+) -> tuple[Float[np.ndarray, " 3"], float]:
+    """Least-squares normal (on the side of `up`) and offset of points, each with its weight."""
     mean = np.average(points, axis=0, weights=weights)
     normal = np.linalg.eigh(np.cov(points.T, aweights=weights))[1][:, 0]
     normal = normal if normal @ up > 0 else -normal

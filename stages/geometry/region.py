@@ -14,13 +14,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from stages.geometry.cameras import PinholeCameras
 from stages.geometry.hull import visual_hull_sphere
 from stages.geometry.plane import Plane
+
+if TYPE_CHECKING:
+    from jaxtyping import Float, Int, Shaped
 
 # Axes that spread less than this (root mean square angle to their mean) are "nearly parallel".
 MIN_AXIS_SPREAD_DEG = 8.0
@@ -67,28 +70,31 @@ class RegionOfInterest:
     """The sphere that becomes the unit sphere.
 
     Attributes:
-        center: [3] in the frame of the poses.
+        center: in the frame of the poses.
         radius: in its units.
         kind: "object" or "forward".
         source: what the sphere was found from, in words.
     """
 
-    center: np.ndarray
+    center: Float[np.ndarray, " 3"]
     radius: float
     kind: str
     source: str
 
 
-def meeting_point(origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Point with the least summed distance to N lines (L1, by iteratively re-weighted squares).
+def meeting_point(
+    origins: Float[np.ndarray, "n 3"], directions: Float[np.ndarray, "n 3"]
+) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " n"]]:
+    """Point with the least summed distance to lines (L1, by iteratively re-weighted squares).
 
     Minimises sum_i |(I - d_i d_i^T)(p - o_i)|; L1 so that a few photos taken of something else do not count.
 
     Args:
-        origins: [N, 3]. directions: [N, 3] unit.
+        origins: a point of each line.
+        directions: unit.
 
     Returns:
-        The point [3] and each line's distance to it [N].
+        The point and each line's distance to it.
 
     Raises:
         ValueError: fewer than two lines, or all of them parallel.
@@ -108,14 +114,14 @@ def meeting_point(origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarr
     return point, misses
 
 
-def axis_spread_deg(directions: np.ndarray) -> float:
-    """Root mean square angle in degrees of unit directions [N, 3] to their principal axis (sign ignored)."""
+def axis_spread_deg(directions: Float[np.ndarray, "n 3"]) -> float:
+    """Root mean square angle in degrees of unit directions to their principal axis (sign ignored)."""
     largest = np.linalg.eigvalsh(directions.T @ directions / len(directions))[-1]
     return float(np.degrees(np.arcsin(np.sqrt(np.clip(1.0 - largest, 0.0, 1.0)))))
 
 
-def seen_whole_radii(cameras: PinholeCameras, center: np.ndarray) -> np.ndarray:
-    """[N] radius of the largest sphere about `center` [3] that each camera sees whole.
+def seen_whole_radii(cameras: PinholeCameras, center: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " n"]:
+    """Radius of the largest sphere about `center` that each camera sees whole.
 
     The least distance from the centre to the four side planes of the frustum; <= 0 where the centre itself is
     out of view.
@@ -134,16 +140,16 @@ def seen_whole_radii(cameras: PinholeCameras, center: np.ndarray) -> np.ndarray:
     return radii
 
 
-def frames_around(cameras: PinholeCameras, points: np.ndarray) -> np.ndarray:
-    """[P] photos that have each of the points [P, 3] within their frame, hidden or not."""
+def frames_around(cameras: PinholeCameras, points: Float[np.ndarray, "p 3"]) -> Int[np.ndarray, " p"]:
+    """How many photos have each of the points within their frame, hidden or not."""
     frames = np.zeros(len(points), dtype=np.int64)
     for i in range(len(cameras)):
         frames += cameras.in_frame(i, points)
     return frames
 
 
-def present_share(cameras: PinholeCameras, points: np.ndarray, place: np.ndarray) -> float:
-    """Part of the points [P, 3] in the middle of the photos that lie about as far away as `place` [3]; median photo."""
+def present_share(cameras: PinholeCameras, points: Float[np.ndarray, "p 3"], place: Float[np.ndarray, " 3"]) -> float:
+    """Part of the points in the middle of the photos that lie about as far away as `place`; median photo."""
     thinned = points[:: -(-len(points) // MAX_JUDGED)]
     shares = []
     for i, distance in enumerate(np.linalg.norm(cameras.centers - place, axis=1)):
@@ -156,9 +162,9 @@ def present_share(cameras: PinholeCameras, points: np.ndarray, place: np.ndarray
 
 
 def robust_sphere(
-    points: np.ndarray, percentiles: tuple[float, float] = FORWARD_PERCENTILES
-) -> tuple[np.ndarray, float]:
-    """Centre [3] and radius of a sphere about points [P, 3] with the extremes of each axis cut off."""
+    points: Float[np.ndarray, "p 3"], percentiles: tuple[float, float] = FORWARD_PERCENTILES
+) -> tuple[Float[np.ndarray, " 3"], float]:
+    """Centre and radius of a sphere about points with the extremes of each axis cut off."""
     if len(points) == 0:
         raise ValueError("got 0 points, expected at least 1")
     low, high = np.percentile(points, percentiles, axis=0)
@@ -170,16 +176,16 @@ def robust_sphere(
 
 def find_region(
     cameras: PinholeCameras,
-    points: np.ndarray,
-    masks: Sequence[np.ndarray | None] | None = None,
+    points: Float[np.ndarray, "p 3"],
+    masks: Sequence[Shaped[np.ndarray, "_ _"] | None] | None = None,
     stated: RegionOfInterest | None = None,
 ) -> RegionOfInterest:
     """The sphere the capture is about; of an object without ground, see `grown_alone`.
 
     Args:
         cameras: at least two, in the frame of the poses.
-        points: [P, 3] sparse points, likewise.
-        masks: one [H, W] silhouette per camera (or None for it), or None without masks.
+        points: sparse points, likewise.
+        masks: one silhouette per camera (or None for it), or None without masks.
         stated: what the poses' file says; taken unless the silhouettes' hull is smaller, for both hold the object.
 
     Raises:
@@ -216,8 +222,8 @@ def find_region(
     return RegionOfInterest(center, radius * FORWARD_MARGIN, "forward", FROM_POINTS)
 
 
-def grown_alone(region: RegionOfInterest, points: np.ndarray, ground: Plane | None) -> RegionOfInterest:
-    """The region about the sparse points [P, 3] where these are one object and nothing else; else as it was.
+def grown_alone(region: RegionOfInterest, points: Float[np.ndarray, "p 3"], ground: Plane | None) -> RegionOfInterest:
+    """The region about the sparse points where these are one object and nothing else; else as it was.
 
     Where there is a ground, the points above it are asked, and only where they are the most: a table around the object
     lies as near as its far ends do, and reflections in it are as many as the points of a plain object.
@@ -241,9 +247,9 @@ def grown_alone(region: RegionOfInterest, points: np.ndarray, ground: Plane | No
 
 
 class _Meeting(NamedTuple):
-    """Where optical axes meet: the point [3], the radius about it that the views show whole, the axes' median miss."""
+    """Where optical axes meet: the point, the radius about it that the views show whole, the axes' median miss."""
 
-    point: np.ndarray
+    point: Float[np.ndarray, " 3"]
     radius: float
     miss: float
 

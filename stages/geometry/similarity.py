@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
 
 
 @dataclass(frozen=True)
@@ -15,20 +19,19 @@ class Similarity:
 
     Attributes:
         scale: positive number.
-        rotation: [3, 3] proper rotation.
-        translation: [3].
+        rotation: proper.
     """
 
     scale: float
-    rotation: np.ndarray
-    translation: np.ndarray
+    rotation: Float[np.ndarray, "3 3"]
+    translation: Float[np.ndarray, " 3"]
 
     @staticmethod
     def identity() -> Similarity:
         return Similarity(1.0, np.eye(3), np.zeros(3))
 
-    def apply(self, points: np.ndarray) -> np.ndarray:
-        """Map points [..., 3]."""
+    def apply(self, points: Float[np.ndarray, "*any 3"]) -> Float[np.ndarray, "*any 3"]:
+        """Map points."""
         return self.scale * points @ self.rotation.T + self.translation
 
     def inverse(self) -> Similarity:
@@ -43,16 +46,16 @@ class Similarity:
             self.apply(other.translation),
         )
 
-    def matrix(self) -> np.ndarray:
-        """[4, 4] homogeneous matrix."""
+    def matrix(self) -> Float[np.ndarray, "4 4"]:
+        """Homogeneous matrix."""
         matrix = np.eye(4)
         matrix[:3, :3] = self.scale * self.rotation
         matrix[:3, 3] = self.translation
         return matrix
 
 
-def align_points(source: np.ndarray, target: np.ndarray) -> Similarity:
-    """The similarity `target_from_source` with the least squared error between paired points [P, 3].
+def align_points(source: Float[np.ndarray, "p 3"], target: Float[np.ndarray, "p 3"]) -> Similarity:
+    """The similarity `target_from_source` with the least squared error between paired points.
 
     Source: Umeyama, "Least-squares estimation of transformation parameters between two point patterns", 1991.
 

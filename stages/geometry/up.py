@@ -7,10 +7,14 @@ photos by it, and that is what makes the cameras' own up worth something.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from stages.geometry.cameras import PinholeCameras
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
 
 IRLS_STEPS = 30
 TINY = 1e-12  # keeps divisions finite; far below any length that occurs
@@ -23,12 +27,12 @@ MAX_SLOPE_DEG = 10.0
 @dataclass(frozen=True)
 class Up:
     """Attributes:
-    direction: [3] unit.
+    direction: unit.
     source: what it was found from, in words.
     sure: whether the cameras were held level in enough directions to tell (of the cameras' estimate).
     """
 
-    direction: np.ndarray
+    direction: Float[np.ndarray, " 3"]
     source: str
     sure: bool = True
 
@@ -54,18 +58,18 @@ def estimate_up(cameras: PinholeCameras) -> Up:
     return Up(up if up @ mean_up > 0 else -up, "level cameras")
 
 
-def choose_up(cameras: Up, ground: np.ndarray | None) -> Up:
+def choose_up(cameras: Up, ground: Float[np.ndarray, " 3"] | None) -> Up:
     """Which to believe: level ground, then the cameras.
 
     Args:
         cameras: see `estimate_up`.
-        ground: [3] unit normal of the ground's plane, or None.
+        ground: unit normal of the ground's plane, or None.
     """
     if ground is not None and (not cameras.sure or angle_deg(ground, cameras.direction) <= MAX_SLOPE_DEG):
         return Up(ground, "the ground's plane")
     return cameras
 
 
-def angle_deg(a: np.ndarray, b: np.ndarray) -> float:
-    """Angle in degrees between unit vectors [3]."""
+def angle_deg(a: Float[np.ndarray, " 3"], b: Float[np.ndarray, " 3"]) -> float:
+    """Angle in degrees between unit vectors."""
     return float(np.degrees(np.arccos(np.clip(a @ b, -1, 1))))

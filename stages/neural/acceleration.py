@@ -6,8 +6,13 @@ import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
+from typing import TYPE_CHECKING
 
 import torch
+from torch import Tensor
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Int
 
 log = logging.getLogger(__name__)
 
@@ -17,7 +22,7 @@ SHORT_CAPABILITY = (8, 0)
 ASYNCHRONOUS = {"cuda"}
 
 
-def takes_kernel(*tensors: torch.Tensor) -> bool:
+def takes_kernel(*tensors: Tensor) -> bool:
     """Whether the kernels of `stages.neural.kernels` take these: float32 on the CPU, and numba is there."""
     return all(t.device.type == "cpu" and t.dtype == torch.float32 for t in tensors) and _has_numba()
 
@@ -30,8 +35,8 @@ def fixed_shapes(device: torch.device) -> bool:
     return device.type in ASYNCHRONOUS
 
 
-def first_rows(chosen: torch.Tensor, count: int) -> torch.Tensor:
-    """Indices [count] of the first rows that are chosen [N] bool, from the start again where they are fewer.
+def first_rows(chosen: Bool[Tensor, " n"], count: int) -> Int[Tensor, " {count}"]:
+    """Indices of the first rows that are chosen, from the start again where they are fewer.
 
     Without waiting for how many they are. Where none is chosen, the last row.
     """

@@ -6,9 +6,13 @@ Shapes: N points, L frequencies. All live in the scene frame.
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import torch
-from torch import nn
+from torch import Tensor, nn
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
 
 # Paper: gamma(x, 10) and gamma(v, 4).
 POSITION_FREQUENCIES = 10
@@ -17,8 +21,8 @@ DIRECTION_FREQUENCIES = 4
 _SKIP_AFTER = 4
 
 
-def positional_encoding(x: torch.Tensor, frequencies: int) -> torch.Tensor:
-    """gamma(x, L) [..., C (1 + 2 L)] of x [..., C] in [-1, 1] (NeRF, eq. 4, the input itself in front).
+def positional_encoding(x: Float[Tensor, "*any c"], frequencies: int) -> Float[Tensor, "*any c*(1+2*{frequencies})"]:
+    """gamma(x, L) of x in [-1, 1] (NeRF, eq. 4, the input itself in front).
 
     x, then sin(2^l pi x) and cos(2^l pi x) for l = 0 .. L - 1.
     """
@@ -49,8 +53,8 @@ class FeatureMlp(nn.Module):
         nn.init.kaiming_uniform_(self.head.weight, nonlinearity="linear", generator=generator)
         nn.init.zeros_(self.head.bias)
 
-    def forward(self, points: torch.Tensor, view_dirs: torch.Tensor) -> torch.Tensor:
-        """Features [N, width], not negative, of points [N, 3] seen along unit view_dirs [N, 3] (camera to point).
+    def forward(self, points: Float[Tensor, "*n 3"], view_dirs: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n width"]:
+        """Features, not negative, of points seen along unit view_dirs (camera to point).
 
         The paper's v_k points from x_k to the surface point on its ray: the ray's own direction, which is also the one
         to give for x_0, where the paper's quotient is 0 / 0.
@@ -66,6 +70,6 @@ class FeatureMlp(nn.Module):
             activation = torch.relu(layer(activation))
         return activation
 
-    def color(self, features: torch.Tensor) -> torch.Tensor:
-        """sRGB colour [N, 3] in [0, 1] of features [N, width]."""
+    def color(self, features: Float[Tensor, "*n width"]) -> Float[Tensor, "*n 3"]:
+        """sRGB colour in [0, 1] of features."""
         return torch.sigmoid(self.head(features))

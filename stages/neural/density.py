@@ -6,15 +6,21 @@ tau optical depth (dimensionless), delta length of a ray section.
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import torch
+from torch import Tensor
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
 
 # Below this change of f over a section, in units of b, the mid-point rule replaces the difference quotient, which
 # would lose all its digits in float32; the mid-point's relative error there is (0.05)^2 / 24 ~ 1e-4.
 FLAT = 0.05
 
 
-def laplace_density(sdf: torch.Tensor, scale: torch.Tensor | float) -> torch.Tensor:
-    """Density sigma = Psi_b(-f) / b [any shape], Psi_b the CDF of the zero-mean Laplace distribution.
+def laplace_density(sdf: Float[Tensor, "*any"], scale: Float[Tensor, ""] | float) -> Float[Tensor, "*any"]:
+    """Density sigma = Psi_b(-f) / b, Psi_b the CDF of the zero-mean Laplace distribution.
 
     1 / (2b) on the surface, 1 / b deep inside, 0 far outside (paper eq. density with alpha = 1 / b).
     """
@@ -23,8 +29,8 @@ def laplace_density(sdf: torch.Tensor, scale: torch.Tensor | float) -> torch.Ten
 
 
 def logistic_section_optical_depth(
-    sdf_start: torch.Tensor, sdf_end: torch.Tensor, scale: torch.Tensor | float
-) -> torch.Tensor:
+    sdf_start: Float[Tensor, "*any"], sdf_end: Float[Tensor, "*any"], scale: Float[Tensor, ""] | float
+) -> Float[Tensor, "*any"]:
     """Optical depth tau of ray sections from f at their ends, with the alpha of NeuS (Wang et al. 2021, eq. 13).
 
     alpha = max((Phi(f_start) - Phi(f_end)) / Phi(f_start), 0), Phi(f) = sigmoid(f / b), and tau = -log(1 - alpha) =
@@ -36,14 +42,17 @@ def logistic_section_optical_depth(
     )
 
 
-def _density_integral(sdf: torch.Tensor, scale: torch.Tensor | float) -> torch.Tensor:
+def _density_integral(sdf: Float[Tensor, "*any"], scale: Float[Tensor, ""] | float) -> Float[Tensor, "*any"]:
     """Integral of b * laplace_density from `sdf` to infinity: its antiderivative, up to sign. Units: scene."""
     return torch.relu(-sdf) + 0.5 * scale * torch.exp(-sdf.abs() / scale)
 
 
 def section_optical_depth(
-    sdf_start: torch.Tensor, sdf_end: torch.Tensor, delta: torch.Tensor, scale: torch.Tensor | float
-) -> torch.Tensor:
+    sdf_start: Float[Tensor, "*any"],
+    sdf_end: Float[Tensor, "*any"],
+    delta: Float[Tensor, "*#any"],
+    scale: Float[Tensor, ""] | float,
+) -> Float[Tensor, "*any"]:
     """Optical depth tau of ray sections on which f runs linearly from sdf_start to sdf_end over length delta.
 
     The exact integral of `laplace_density`, so a section may be far longer than b. Zero where f is large on the

@@ -7,11 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from configs.params import TrainParams
+from configs.training import TrainParams
 from stages.geometry.cameras import PinholeCameras
 from stages.neural.fields import Fields, points_at_a_time
 from stages.neural.renderer import Renderer
 from stages.neural.sampling import SdfCache, intersect_unit_sphere
+from stages.neural.terms import Terms
 from stages.neural.training_photos import RayBatch
 
 _RAYS = 4096  # rendered at a time
@@ -48,8 +49,8 @@ class FieldDrawer:
     def __init__(self, fields: Fields, params: TrainParams, device: torch.device | str) -> None:
         self.device = torch.device(device)
         fields = fields.to(device).eval().requires_grad_(False)
-        cache = SdfCache(params.cache_resolution, device)
-        self.renderer = Renderer(fields, cache, params)
+        cache = SdfCache(params.sampling.cache_resolution, device)
+        self.renderer = Renderer(fields, cache, params, Terms(fields, cache, params))
         self.moment = self.renderer.moment(1.0)
         cache.refresh(lambda p: fields.sdf.sdf(p, self.moment.levels), None, points_at_a_time(self.device))
 

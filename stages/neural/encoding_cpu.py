@@ -5,14 +5,10 @@ What each function computes: `stages.neural.encodings.EncodingKernels`. The Jaco
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import torch
 
 from stages.neural import kernels
-
-if TYPE_CHECKING:
-    from stages.neural.encodings import HashGrid
+from stages.neural.encoding_shapes import HashGrid
 
 
 def forward(

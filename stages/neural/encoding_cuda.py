@@ -13,15 +13,13 @@ Only the channels of active levels are computed; the rest of what is handed on i
 from __future__ import annotations
 
 from functools import cache
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 import triton
 import triton.language as tl
 
-if TYPE_CHECKING:
-    from stages.neural.encodings import HashGrid
+from stages.neural.encoding_shapes import HashGrid
 
 BLOCK = 128  # points a program
 PRIME_Y, PRIME_Z = tl.constexpr(2654435761), tl.constexpr(805459861)

@@ -19,104 +19,30 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
-from functools import cache, cached_property, partial
-from typing import Protocol
+from functools import cache, partial
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
-import numpy as np
 import torch
+from torch import Tensor
 
 from stages.neural.acceleration import takes_kernel
+from stages.neural.encoding_shapes import Encoding, Frequencies, HashGrid
+
+if TYPE_CHECKING:
+    from jaxtyping import Float, Int
 
 log = logging.getLogger(__name__)
 
 # Müller et al. 2022, eq. 4: the spatial hash's factors for y and z (x has factor 1).
 PRIME_Y, PRIME_Z = 2654435761, 805459861
-# A table starts as small noise: features begin near zero, so the geometric initialisation is what is rendered.
-INITIAL_AMPLITUDE = 1e-4
 # CUDA kernels that err by more than this, relative to the largest value, are not used: float32 rounding is below.
 AGREEMENT = 1e-5
 
 
-@dataclass(frozen=True)
-class HashGrid:
-    """The shape of a hash encoding over the cube [-1, 1]^3.
-
-    Attributes:
-        levels: number of lattices, geometrically spaced from `coarsest` to `finest` cells along a side.
-        features: channels per level (the CPU kernels are written for 4, those for CUDA for powers of two).
-        log2_rows: a level holds at most 2**log2_rows rows.
-        coarsest, finest: cells along a side of the first and last level.
-    """
-
-    levels: int = 8
-    features: int = 4
-    log2_rows: int = 17
-    coarsest: int = 16
-    finest: int = 512
-
-    @property
-    def channels(self) -> int:
-        return self.levels * self.features
-
-    @cached_property
-    def resolutions(self) -> np.ndarray:
-        """[L] int64 cells along a side per level."""
-        if self.levels == 1:
-            return np.array([self.coarsest], dtype=np.int64)
-        growth = np.exp(np.log(self.finest / self.coarsest) / (self.levels - 1))
-        return np.round(self.coarsest * growth ** np.arange(self.levels)).astype(np.int64)
-
-    @cached_property
-    def dense(self) -> np.ndarray:
-        """[L] bool: whether the level's (res + 1)^3 lattice fits its rows without hashing."""
-        return (self.resolutions + 1) ** 3 <= 2**self.log2_rows
-
-    @cached_property
-    def offsets(self) -> np.ndarray:
-        """[L + 1] int64 first row of each level; the last entry is the number of rows."""
-        rows = np.where(self.dense, (self.resolutions + 1) ** 3, 2**self.log2_rows)
-        return np.concatenate([[0], np.cumsum(rows)]).astype(np.int64)
-
-    @property
-    def num_rows(self) -> int:
-        return int(self.offsets[-1])
-
-    def voxel_size(self, active_levels: int | None = None) -> float:
-        """Side of a cell of the finest active level, in scene units."""
-        return 2.0 / float(self.resolutions[(active_levels or self.levels) - 1])
-
-    def initial_table(self, generator: torch.Generator) -> torch.Tensor:
-        """[rows, features] float32 uniform noise of amplitude `INITIAL_AMPLITUDE`."""
-        noise = torch.rand(self.num_rows, self.features, generator=generator)
-        return (noise * 2 - 1) * INITIAL_AMPLITUDE
+Vjp = Callable[[Tensor], Tensor]
 
 
-@dataclass(frozen=True)
-class Frequencies:
-    """NeRF's positional encoding: level k holds sin(2^k pi x) and cos(2^k pi x) of the three coordinates.
-
-    It has no table. Channels of a level: three sines, then three cosines.
-
-    Attributes:
-        levels: number of octaves.
-    """
-
-    levels: int = 8
-
-    @property
-    def channels(self) -> int:
-        return 6 * self.levels
-
-    def voxel_size(self, active_levels: int | None = None) -> float:
-        """Half a wavelength of the highest active frequency, in scene units."""
-        return 0.5 ** ((active_levels or self.levels) - 1)
-
-
-Encoding = HashGrid | Frequencies
-Vjp = Callable[[torch.Tensor], torch.Tensor]
-
-
+@runtime_checkable
 class EncodingKernels(Protocol):
     """What `encode` asks of the kernels of a hash grid on a device: `encoding_cpu` (numba), `encoding_cuda` (Triton).
 
@@ -124,40 +50,40 @@ class EncodingKernels(Protocol):
     """
 
     def forward(
-        self, points: torch.Tensor, table: torch.Tensor, grid: HashGrid, active_levels: int
-    ) -> tuple[torch.Tensor, torch.Tensor]:
+        self, points: Float[Tensor, "n 3"], table: Float[Tensor, "rows f"], grid: HashGrid, active_levels: int
+    ) -> tuple[Tensor, Tensor]:
         """Features [N, C] and their Jacobian."""
 
     def features_forward(
-        self, points: torch.Tensor, table: torch.Tensor, grid: HashGrid, active_levels: int
-    ) -> torch.Tensor:
+        self, points: Float[Tensor, "n 3"], table: Float[Tensor, "rows f"], grid: HashGrid, active_levels: int
+    ) -> Tensor:
         """Features [N, C] alone."""
 
     def backward(
         self,
-        points: torch.Tensor,
+        points: Tensor,
         grid: HashGrid,
         active_levels: int,
-        grad_features: torch.Tensor | None,
-        grad_jacobian: tuple[torch.Tensor, torch.Tensor] | None,
-        grad_table: torch.Tensor,
+        grad_features: Tensor | None,
+        grad_jacobian: tuple[Tensor, Tensor] | None,
+        grad_table: Tensor,
     ) -> None:
         """Add d loss / d table to grad_table [rows, F], given the gradients of features [N, C] and of the Jacobian.
 
         The latter is of rank one and given by its factors g [N, 3] and u [N, C]. At least one of the two is given.
         """
 
-    def vjp_forward(self, jacobian: torch.Tensor, cotangent: torch.Tensor) -> torch.Tensor:
+    def vjp_forward(self, jacobian: Tensor, cotangent: Tensor) -> Tensor:
         """The Jacobian times cotangent [N, C] -> [N, 3]."""
 
-    def vjp_backward(self, jacobian: torch.Tensor, grad_gradients: torch.Tensor, channels: int) -> torch.Tensor:
+    def vjp_backward(self, jacobian: Tensor, grad_gradients: Tensor, channels: int) -> Tensor:
         """The transposed Jacobian times grad_gradients [N, 3] -> [N, C], C = channels."""
 
 
 def encode(
-    points: torch.Tensor, table: torch.Tensor | None, encoding: Encoding, active_levels: int
-) -> tuple[torch.Tensor, Vjp]:
-    """Features [N, C] of points [N, 3], and their vjp [N, C] -> [N, 3], which may be called once.
+    points: Float[Tensor, "n 3"], table: Float[Tensor, "rows f"] | None, encoding: Encoding, active_levels: int
+) -> tuple[Float[Tensor, "n c"], Vjp]:
+    """Features of points, and their vjp [N, C] -> [N, 3], which may be called once.
 
     Channels of levels >= active_levels are zero. A hash grid clamps points to [-1, 1]^3.
     """
@@ -170,9 +96,9 @@ def encode(
 
 
 def encode_features(
-    points: torch.Tensor, table: torch.Tensor | None, encoding: Encoding, active_levels: int
-) -> torch.Tensor:
-    """Features [N, C] alone, differentiable with respect to the table: for density without normals."""
+    points: Float[Tensor, "n 3"], table: Float[Tensor, "rows f"] | None, encoding: Encoding, active_levels: int
+) -> Float[Tensor, "n c"]:
+    """Features alone, differentiable with respect to the table: for density without normals."""
     kernels = kernels_for(points, encoding)
     if kernels is None:
         return _reference_features(points, table, encoding, active_levels)
@@ -180,7 +106,7 @@ def encode_features(
 
 
 # ---------------------------------------------------------------- which kernels
-def kernels_for(points: torch.Tensor, encoding: Encoding) -> EncodingKernels | None:
+def kernels_for(points: Float[Tensor, "n 3"], encoding: Encoding) -> EncodingKernels | None:
     """The kernels that take these points, or None where the reference does: frequencies, float64, no kernels."""
     if isinstance(encoding, Frequencies):
         return None
@@ -236,8 +162,8 @@ def disagreement(kernels: EncodingKernels, grid: HashGrid, device: torch.device 
 
 # ---------------------------------------------------------------- the reference
 def encode_reference(
-    points: torch.Tensor, table: torch.Tensor | None, encoding: Encoding, active_levels: int
-) -> tuple[torch.Tensor, Vjp]:
+    points: Float[Tensor, "n 3"], table: Float[Tensor, "rows f"] | None, encoding: Encoding, active_levels: int
+) -> tuple[Float[Tensor, "n c"], Vjp]:
     """`encode` in plain torch: the reference of the kernels, and what there is without them."""
     if isinstance(encoding, Frequencies):
         return _encode_frequencies(points, encoding, active_levels)
@@ -247,8 +173,8 @@ def encode_reference(
 
 
 def _reference_features(
-    points: torch.Tensor, table: torch.Tensor | None, encoding: Encoding, active_levels: int
-) -> torch.Tensor:
+    points: Float[Tensor, "n 3"], table: Float[Tensor, "rows f"] | None, encoding: Encoding, active_levels: int
+) -> Float[Tensor, "n c"]:
     """`encode_features` in plain torch."""
     if isinstance(encoding, Frequencies):
         return _encode_frequencies(points, encoding, active_levels)[0]
@@ -256,14 +182,16 @@ def _reference_features(
     return _hash_features(points, table, encoding, active_levels)
 
 
-def _encode_frequencies(points: torch.Tensor, encoding: Frequencies, active_levels: int) -> tuple[torch.Tensor, Vjp]:
+def _encode_frequencies(
+    points: Float[Tensor, "n 3"], encoding: Frequencies, active_levels: int
+) -> tuple[Float[Tensor, "n c"], Vjp]:
     frequencies = math.pi * 2.0 ** torch.arange(active_levels, device=points.device, dtype=points.dtype)
     angles = points[:, None] * frequencies[:, None]  # [N, levels, 3]
     sines, cosines = torch.sin(angles), torch.cos(angles)
     padding = encoding.channels - 6 * active_levels
     features = torch.nn.functional.pad(torch.cat([sines, cosines], 2).flatten(1), (0, padding))
 
-    def vjp(cotangent: torch.Tensor) -> torch.Tensor:
+    def vjp(cotangent: Tensor) -> Tensor:
         of_sines, of_cosines = cotangent[:, : 6 * active_levels].view(-1, active_levels, 6).split(3, 2)
         return torch.einsum("nka,k->na", of_sines * cosines - of_cosines * sines, frequencies)
 
@@ -271,9 +199,9 @@ def _encode_frequencies(points: torch.Tensor, encoding: Frequencies, active_leve
 
 
 def hash_jacobian(
-    points: torch.Tensor, table: torch.Tensor, grid: HashGrid, active_levels: int
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Features [N, C] and Jacobian [N, 3, C] (d feature / d coordinate) of a hash grid, in plain torch."""
+    points: Float[Tensor, "n 3"], table: Float[Tensor, "rows f"], grid: HashGrid, active_levels: int
+) -> tuple[Float[Tensor, "n c"], Float[Tensor, "n 3 c"]]:
+    """Features and Jacobian (d feature / d coordinate) of a hash grid, in plain torch."""
     features, jacobians = [], []
     for level in range(active_levels):
         corners, fraction, scale = _corners(points, grid, level)
@@ -296,7 +224,9 @@ def hash_jacobian(
     return torch.nn.functional.pad(feature, (0, padding)), torch.nn.functional.pad(jacobian, (0, padding))
 
 
-def _hash_features(points: torch.Tensor, table: torch.Tensor, grid: HashGrid, active_levels: int) -> torch.Tensor:
+def _hash_features(
+    points: Float[Tensor, "n 3"], table: Float[Tensor, "rows f"], grid: HashGrid, active_levels: int
+) -> Float[Tensor, "n c"]:
     features = []
     for level in range(active_levels):
         corners, fraction, _ = _corners(points, grid, level)
@@ -307,8 +237,10 @@ def _hash_features(points: torch.Tensor, table: torch.Tensor, grid: HashGrid, ac
     return torch.nn.functional.pad(torch.cat(features, 1), (0, padding))
 
 
-def _corners(points: torch.Tensor, grid: HashGrid, level: int) -> tuple[torch.Tensor, torch.Tensor, float]:
-    """Table rows [N, 8] of the cell's corners, position in the cell [N, 3], cells per scene unit."""
+def _corners(
+    points: Float[Tensor, "n 3"], grid: HashGrid, level: int
+) -> tuple[Int[Tensor, "n 8"], Float[Tensor, "n 3"], float]:
+    """Table rows of the cell's corners, position in the cell, cells per scene unit."""
     resolution = int(grid.resolutions[level])
     scale = resolution / 2
     position = (points.clamp(-1, 1) + 1) * scale
@@ -327,13 +259,17 @@ def _corners(points: torch.Tensor, grid: HashGrid, level: int) -> tuple[torch.Te
 
 # ---------------------------------------------------------------- the kernels in autograd
 def encode_with(
-    kernels: EncodingKernels, points: torch.Tensor, table: torch.Tensor, grid: HashGrid, active_levels: int
-) -> tuple[torch.Tensor, Vjp]:
+    kernels: EncodingKernels,
+    points: Float[Tensor, "n 3"],
+    table: Float[Tensor, "rows f"],
+    grid: HashGrid,
+    active_levels: int,
+) -> tuple[Float[Tensor, "n c"], Vjp]:
     """`encode` by these kernels."""
     features, jacobian, *factors = _KernelEncode.apply(points, table, grid, active_levels, kernels)
     called = False
 
-    def vjp(cotangent: torch.Tensor) -> torch.Tensor:
+    def vjp(cotangent: Tensor) -> Tensor:
         nonlocal called
         if called:  # the factors of two products cannot be added
             raise RuntimeError("the vjp of an encoding was called twice, expected once")
@@ -370,7 +306,7 @@ class _KernelEncode(torch.autograd.Function):
         return None, None, None, None, None
 
 
-def _grad_of(table: torch.Tensor) -> torch.Tensor:
+def _grad_of(table: Tensor) -> Tensor:
     """The table's gradient [rows, F], which the kernels add to where it lies.
 
     Through autograd each query of the encoding would make and add a gradient as large as the table.

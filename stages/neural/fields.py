@@ -7,22 +7,27 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from stages.neural.acceleration import short_products, takes_kernel
 from stages.neural.appearance import FeatureMlp
-from stages.neural.encodings import Encoding, Frequencies, HashGrid, encode, encode_features
+from stages.neural.encoding_shapes import Encoding, Frequencies, HashGrid
+from stages.neural.encodings import encode, encode_features
 from stages.neural.mlp import Mlp, kaiming_uniform, mlp, spherical_harmonics
 from stages.neural.proposal import ProposalNetwork
-from stages.neural.reflection import ReflectionNetwork
+from stages.neural.reflection_network import ReflectionNetwork
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
 
 # Half width of the smooth ReLU's bend: about the blur of the softplus(beta = 100) that IDR and NeuS use.
 BEND = 0.05
 
 
-def smooth_relu(z: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+def smooth_relu(z: Float[Tensor, "*any"]) -> tuple[Float[Tensor, "*any"], Float[Tensor, "*any"]]:
     """A ReLU with a parabola of half width `BEND` for a kink, and its derivative, a ramp from 0 to 1.
 
     The second derivative exists almost everywhere, so normals get gradients; no exponential is needed.
@@ -32,7 +37,7 @@ def smooth_relu(z: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     return smooth_relu_reference(z)
 
 
-def smooth_relu_reference(z: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+def smooth_relu_reference(z: Float[Tensor, "*any"]) -> tuple[Float[Tensor, "*any"], Float[Tensor, "*any"]]:
     """`smooth_relu` in plain torch: the reference of the kernel, and the path on CUDA."""
     slope = (z * (0.5 / BEND) + 0.5).clamp(0, 1)
     return BEND * slope * slope + torch.relu(z - BEND), slope
@@ -132,8 +137,10 @@ class SdfNetwork(nn.Module):
         biases = [torch.zeros(shape.sdf_width), *(-0.25 * BEND * weight.sum(1) for weight in weights[1:])]
         self.weights, self.biases = nn.ParameterList(weights), nn.ParameterList(biases)
 
-    def forward(self, points: torch.Tensor, active_levels: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """f [N], geometry features [N, G] and grad f [N, 3] at points [N, 3], all differentiable once.
+    def forward(
+        self, points: Float[Tensor, "n 3"], active_levels: int
+    ) -> tuple[Float[Tensor, " n"], Float[Tensor, "n g"], Float[Tensor, "n 3"]]:
+        """f, geometry features and grad f at points, all differentiable once.
 
         The gradient is a reverse sweep through the layers, written out, or central differences over one active voxel
         to either side (Neuralangelo).
@@ -153,21 +160,23 @@ class SdfNetwork(nn.Module):
         gradients = vjp(cotangent) + points / radius.clamp(min=1e-6)
         return (values + radius).squeeze(1) - self.radius, features, gradients
 
-    def sdf(self, points: torch.Tensor, active_levels: int) -> torch.Tensor:
-        """f [N] alone."""
+    def sdf(self, points: Float[Tensor, "n 3"], active_levels: int) -> Float[Tensor, " n"]:
+        """f alone."""
         activation, _ = self._hidden(encode_features(points, self.table, self.grid, active_levels))
         values = activation @ self.weights[-1][0] + self.biases[-1][0]
         return values + torch.linalg.vector_norm(points, dim=1) - self.radius
 
-    def _mlp(self, encoded: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, list[torch.Tensor]]:
-        """f but for the sphere [N, 1], geometry features [N, G] and the slopes [N, W] of the hidden layers."""
+    def _mlp(
+        self, encoded: Float[Tensor, "n c"]
+    ) -> tuple[Float[Tensor, "n 1"], Float[Tensor, "n g"], list[Float[Tensor, "n w"]]]:
+        """f but for the sphere, geometry features and the slopes of the hidden layers."""
         activation, slopes = self._hidden(encoded)
         outputs = torch.addmm(self.biases[-1], activation, self.weights[-1].T)
         values, features = outputs.split([1, outputs.shape[1] - 1], 1)  # unlike slices, one copy in the backward pass
         return values, features, slopes
 
-    def _hidden(self, encoded: torch.Tensor) -> tuple[torch.Tensor, list[torch.Tensor]]:
-        """The last hidden layer's activation [N, W] and the slopes of all."""
+    def _hidden(self, encoded: Float[Tensor, "n c"]) -> tuple[Float[Tensor, "n w"], list[Float[Tensor, "n w"]]]:
+        """The last hidden layer's activation and the slopes of all."""
         activation, slopes = encoded, []
         *hidden, _ = zip(self.weights, self.biases, strict=True)
         for weight, bias in hidden:
@@ -175,8 +184,8 @@ class SdfNetwork(nn.Module):
             slopes.append(slope)
         return activation, slopes
 
-    def _differences(self, points: torch.Tensor, active_levels: int) -> torch.Tensor:
-        """grad f [N, 3] as (f(x + h e_i) - f(x - h e_i)) / (2 h), h the finest active voxel."""
+    def _differences(self, points: Float[Tensor, "n 3"], active_levels: int) -> Float[Tensor, "n 3"]:
+        """grad f as (f(x + h e_i) - f(x - h e_i)) / (2 h), h the finest active voxel."""
         step = self.grid.voxel_size(active_levels)
         offsets = step * torch.eye(3, device=points.device, dtype=points.dtype)
         places = points + torch.stack([offsets, -offsets])[:, :, None]  # [2, 3, N, 3]
@@ -199,12 +208,12 @@ class RadianceNetwork(nn.Module):
 
     def forward(
         self,
-        points: torch.Tensor,
-        normals: torch.Tensor,
-        view_dirs: torch.Tensor,
-        features: torch.Tensor,
-    ) -> torch.Tensor:
-        """sRGB colour [N, 3] in [0, 1]; normals are unit, view_dirs [N, 3] unit from camera to point."""
+        points: Float[Tensor, "n 3"],
+        normals: Float[Tensor, "n 3"],
+        view_dirs: Float[Tensor, "n 3"],
+        features: Float[Tensor, "n g"],
+    ) -> Float[Tensor, "n 3"]:
+        """sRGB colour in [0, 1]; normals are unit, view_dirs unit from camera to point."""
         inputs = [features, points, normals, view_dirs]
         if self.reflected:
             facing = (normals * view_dirs).sum(1, keepdim=True)
@@ -222,8 +231,10 @@ class BackgroundNetwork(nn.Module):
         self.table = nn.Parameter(self.grid.initial_table(generator))
         self.layers = mlp([self.grid.channels + 3, shape.radiance_width, 4], generator)
 
-    def forward(self, points: torch.Tensor, view_dirs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Density [N] per unit of CONTRACTED length and colour [N, 3] at points [N, 3] outside the unit sphere."""
+    def forward(
+        self, points: Float[Tensor, "n 3"], view_dirs: Float[Tensor, "n 3"]
+    ) -> tuple[Float[Tensor, " n"], Float[Tensor, "n 3"]]:
+        """Density per unit of CONTRACTED length and colour at points outside the unit sphere."""
         encoded = encode_features(contract(points) * 0.5, self.table, self.grid, self.grid.levels)
         outputs = self.layers(torch.cat([encoded, view_dirs], 1))
         return nn.functional.softplus(outputs[:, 0]) * 10, torch.sigmoid(outputs[:, 1:])
@@ -260,7 +271,7 @@ class Fields(nn.Module):
         return [table for table in tables if table is not None]
 
 
-def contract(points: torch.Tensor) -> torch.Tensor:
+def contract(points: Float[Tensor, "*any 3"]) -> Float[Tensor, "*any 3"]:
     """Map all of space into the ball of radius 2, the unit ball onto itself (Mip-NeRF 360, eq. 10)."""
     radius = torch.linalg.vector_norm(points, dim=-1, keepdim=True).clamp(min=1e-6)
     return torch.where(radius <= 1, points, (2 - 1 / radius) * points / radius)

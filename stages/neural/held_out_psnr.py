@@ -7,25 +7,30 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from math import ceil, sqrt
+from typing import TYPE_CHECKING
 
 import torch
+from torch import Tensor
 
 from stages.neural.training_photos import Photos, RayBatch
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool
 
 PIXELS = 20_000  # of a photo at most; its PSNR barely moves with more
 _RAYS = 4096  # rendered at a time
 _SMALLEST_ERROR = 1e-10  # a photo met exactly has 100 dB
 
 
-def left_out(num_photos: int, every: int) -> torch.Tensor:
-    """Which photos [I] bool are left out: i % every == every // 2, none where `every` is 0."""
+def left_out(num_photos: int, every: int) -> Bool[Tensor, " {num_photos}"]:
+    """Which photos are left out: i % every == every // 2, none where `every` is 0."""
     if every == 0:
         return torch.zeros(num_photos, dtype=torch.bool)
     return torch.arange(num_photos) % every == every // 2
 
 
 @torch.no_grad()
-def photo_psnr(photos: Photos, image: int, render: Callable[[RayBatch], torch.Tensor]) -> float | None:
+def photo_psnr(photos: Photos, image: int, render: Callable[[RayBatch], Tensor]) -> float | None:
     """PSNR in dB of one photo: -10 log10 of the mean squared error over pixels and channels.
 
     Counted are pixels on a regular grid whose rays cross the region of interest, on the mask where there is one.
@@ -52,7 +57,7 @@ def photo_psnr(photos: Photos, image: int, render: Callable[[RayBatch], torch.Te
     return -10 * float(torch.tensor(max(total / count, _SMALLEST_ERROR)).log10()) if count else None
 
 
-def held_out_psnr(photos: Photos, render: Callable[[RayBatch], torch.Tensor]) -> float | None:
+def held_out_psnr(photos: Photos, render: Callable[[RayBatch], Tensor]) -> float | None:
     """Mean PSNR in dB of the photos that are not for training, None where there are none. See `photo_psnr`."""
     held_out = torch.nonzero(~photos.training).squeeze(1).tolist()
     values = [value for image in held_out if (value := photo_psnr(photos, image, render)) is not None]

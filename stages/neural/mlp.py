@@ -1,15 +1,16 @@
-"""Multi-layer perceptrons from a seeded generator, and the encoding of directions that they take.
-
-Shapes: N rows.
-"""
+"""Multi-layer perceptrons from a seeded generator, and the encoding of directions that they take."""
 
 from __future__ import annotations
 
 import itertools
 import math
+from typing import TYPE_CHECKING
 
 import torch
-from torch import nn
+from torch import Tensor, nn
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
 
 
 class Mlp(nn.Sequential):
@@ -23,7 +24,7 @@ class Mlp(nn.Sequential):
 
     mixed = False
 
-    def forward(self, inputs: torch.Tensor) -> torch.Tensor:
+    def forward(self, inputs: Float[Tensor, "n i"]) -> Float[Tensor, "n o"]:
         if not self.mixed:
             return super().forward(inputs)
         with torch.autocast(inputs.device.type, torch.bfloat16):
@@ -43,13 +44,13 @@ def mlp(widths: list[int], generator: torch.Generator) -> Mlp:
     return Mlp(*layers)
 
 
-def kaiming_uniform(rows: int, columns: int, generator: torch.Generator) -> torch.Tensor:
-    """Kaiming-uniform weights [rows, columns] for a ReLU layer."""
+def kaiming_uniform(rows: int, columns: int, generator: torch.Generator) -> Float[Tensor, "{rows} {columns}"]:
+    """Kaiming-uniform weights for a ReLU layer."""
     return (torch.rand(rows, columns, generator=generator) * 2 - 1) * math.sqrt(6 / columns)
 
 
-def spherical_harmonics(directions: torch.Tensor) -> torch.Tensor:
-    """Real spherical harmonics of degree 1 to 3 [N, 15] of unit directions [N, 3], without their constants."""
+def spherical_harmonics(directions: Float[Tensor, "n 3"]) -> Float[Tensor, "n 15"]:
+    """Real spherical harmonics of degree 1 to 3 of unit directions, without their constants."""
     x, y, z = directions.unbind(1)
     xx, yy, zz = x * x, y * y, z * z
     return torch.stack(

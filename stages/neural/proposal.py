@@ -6,13 +6,18 @@ Shapes: R rays, P proposal intervals and K samples a ray, N points. Distances ar
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from stages.neural.appearance import positional_encoding
 from stages.neural.mlp import mlp
 from stages.neural.rendering import weights_from_optical_depth
 from stages.neural.sampling import EVEN_SHARE, invert_cdf, stratified
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
 
 # Frequencies of the position's encoding; the finest has a period of 1/16 scene unit, about two of 64 intervals.
 _FREQUENCIES = 6
@@ -30,16 +35,16 @@ class ProposalNetwork(nn.Module):
         super().__init__()
         self.layers = mlp([3 + 6 * _FREQUENCIES, *[width] * layers, 1], generator)
 
-    def forward(self, points: torch.Tensor) -> torch.Tensor:
-        """Density [N] per scene unit at points [N, 3]."""
+    def forward(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
+        """Density per scene unit at points."""
         outputs = self.layers(positional_encoding(points, _FREQUENCIES)).squeeze(1)
         return _DENSITY_GAIN * nn.functional.softplus(outputs + _DENSITY_BIAS)
 
 
 def stratified_edges(
-    entry: torch.Tensor, leave: torch.Tensor, num_intervals: int, generator: torch.Generator | None
-) -> torch.Tensor:
-    """Ascending edges [R, P + 1] of intervals from entry to leave [R], inner edges within half an interval of even."""
+    entry: Float[Tensor, " r"], leave: Float[Tensor, " r"], num_intervals: int, generator: torch.Generator | None
+) -> Float[Tensor, "r {num_intervals}+1"]:
+    """Ascending edges of intervals from entry to leave, inner edges within half an interval of even."""
     inner = stratified(len(entry), num_intervals - 1, generator, entry.device)
     share = nn.functional.pad((inner * (num_intervals - 1) + 0.5) / num_intervals, (1, 0))
     share = nn.functional.pad(share, (0, 1), value=1.0)
@@ -47,9 +52,9 @@ def stratified_edges(
 
 
 def draw_from_weights(
-    edges: torch.Tensor, weights: torch.Tensor, num_samples: int, generator: torch.Generator | None
-) -> torch.Tensor:
-    """Sorted distances [R, K] drawn by inverse CDF from a histogram: weights [R, P], sum > 0, between edges [R, P + 1].
+    edges: Float[Tensor, "r e"], weights: Float[Tensor, "r e-1"], num_samples: int, generator: torch.Generator | None
+) -> Float[Tensor, "r {num_samples}"]:
+    """Sorted distances drawn by inverse CDF from a histogram: weights, sum > 0, between edges.
 
     One stratified draw per sample; the strata's centres without a generator.
     """
@@ -58,15 +63,15 @@ def draw_from_weights(
 
 def proposal_distances(
     network: ProposalNetwork,
-    origins: torch.Tensor,
-    directions: torch.Tensor,
-    entry: torch.Tensor,
-    leave: torch.Tensor,
+    origins: Float[Tensor, "r 3"],
+    directions: Float[Tensor, "r 3"],
+    entry: Float[Tensor, " r"],
+    leave: Float[Tensor, " r"],
     num_proposal: int,
     num_samples: int,
     generator: torch.Generator | None,
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Sorted sample distances [R, K], and the edges [R, P + 1] and weights [R, P] of the histogram behind them.
+) -> tuple[Float[Tensor, "r {num_samples}"], Float[Tensor, "r {num_proposal}+1"], Float[Tensor, "r {num_proposal}"]]:
+    """Sorted sample distances, and the edges and weights of the histogram behind them.
 
     The histogram holds the network's rendering weights, one density at the middle of each interval. Samples follow it,
     but for the share `EVEN_SHARE`, which is spread evenly. The samples are detached; the weights carry the gradient
@@ -84,8 +89,8 @@ def proposal_distances(
     return distances, edges, weights
 
 
-def sample_edges(distances: torch.Tensor) -> torch.Tensor:
-    """Edges [R, K + 1] of the samples' own stretches, half way between sorted distances [R, K], from first to last.
+def sample_edges(distances: Float[Tensor, "r k"]) -> Float[Tensor, "r k+1"]:
+    """Edges of the samples' own stretches, half way between sorted distances, from first to last.
 
     The same stretches as in `stages.neural.rendering.sample_optical_depths`.
     """
@@ -94,14 +99,16 @@ def sample_edges(distances: torch.Tensor) -> torch.Tensor:
 
 
 def interlevel_loss(
-    edges: torch.Tensor, weights: torch.Tensor, proposal_edges: torch.Tensor, proposal_weights: torch.Tensor
-) -> torch.Tensor:
-    """L_prop = sum_k max(0, w_k - bound_k)^2 / w_k per ray [R] (mip-NeRF 360, eq. 13).
+    edges: Float[Tensor, "r e"],
+    weights: Float[Tensor, "r e-1"],
+    proposal_edges: Float[Tensor, "r p"],
+    proposal_weights: Float[Tensor, "r p-1"],
+) -> Float[Tensor, " r"]:
+    """L_prop = sum_k max(0, w_k - bound_k)^2 / w_k per ray (mip-NeRF 360, eq. 13).
 
-    bound_k is the sum of the proposal weights [R, P] whose intervals (edges [R, P + 1]) overlap sample k's stretch of
-    the ray, between edges [R, K + 1]: the most that a consistent histogram can hold there. Zero where it holds at least
-    the rendering weight w [R, K] everywhere. The samples' side is detached: the proposal learns from the rendering, not
-    the rendering from the proposal.
+    bound_k is the sum of the proposal weights whose intervals overlap sample k's stretch of the ray, between its edges:
+    the most that a consistent histogram can hold there. Zero where it holds at least the rendering weight w everywhere.
+    The samples' side is detached: the proposal learns from the rendering, not the rendering from the proposal.
     """
     edges, weights = edges.detach(), weights.detach()
     num_proposal = proposal_weights.shape[1]

@@ -1,89 +1,37 @@
-"""Rays to colours: samples, surface, reflection, background, in that order.
+"""Rays to colours: samples, surface, background, and what the terms make of them, in that order.
 
 Shapes: R rays, K samples a ray, N = R K points, Q rays that hit something, P bins of the proposal network.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from functools import cached_property
-
 import torch
 
-from configs.params import TrainParams
-from stages.neural import reflection, schedules
+from configs.training import TrainParams
+from stages.neural import schedules
 from stages.neural.acceleration import fixed_shapes
 from stages.neural.fields import BackgroundNetwork, Fields
 from stages.neural.proposal import proposal_distances
+from stages.neural.rendered import Rendered
 from stages.neural.rendering import composite, rendering_weights, weights_from_optical_depth
 from stages.neural.sampling import SdfCache, importance_distances, stratified
 from stages.neural.schedules import Moment
+from stages.neural.terms import Terms
 from stages.neural.training_photos import RayBatch
 
 # Samples that weigh less than this get no colour: together they change a pixel by less than one grey level.
 _COLOR_THRESHOLD = 2e-4
 # Rays that let less than this through show nothing of the background: two grey levels at most.
 _BACKGROUND_THRESHOLD = 0.01
-# Rays more opaque than this count as having met a surface.
-OPAQUE = 0.5
-# Reflected rays that meet something with less than this probability are not followed: under one grey level.
-_REFLECTION_THRESHOLD = 2e-3
 # The background's last sample is this near to infinity, as a part of the contracted shell: 200 radii away.
 _BACKGROUND_REACH = 0.995
-
-
-@dataclass(frozen=True)
-class Rendered:
-    """What a batch of rays shows.
-
-    Attributes:
-        batch: the rays.
-        colors: [R, 3] sRGB with reflections and the background behind, before exposure.
-        opacity: [R] of the surface alone.
-        weights, distances: [R, K] rendering weights of the samples and where they lie on the ray.
-        points: [N, 3] the samples.
-        gradients: [N, 3] of the SDF at the samples.
-        features: [N, G] geometry features at the samples.
-        reflected: [R] part of the colour that came from reflections of the object itself.
-        proposal: edges [R, P + 1] and weights [R, P] of the proposal network, or None where a grid guides the samples.
-        extra_sdf, extra_gradients: f [E] and its gradients [E, 3] at the extra points that were asked for.
-    """
-
-    batch: RayBatch
-    colors: torch.Tensor
-    opacity: torch.Tensor
-    weights: torch.Tensor
-    distances: torch.Tensor
-    points: torch.Tensor
-    gradients: torch.Tensor
-    features: torch.Tensor
-    reflected: torch.Tensor
-    proposal: tuple[torch.Tensor, torch.Tensor] | None
-    extra_sdf: torch.Tensor
-    extra_gradients: torch.Tensor
-
-    def mean(self, values: torch.Tensor) -> torch.Tensor:
-        """Mean [R, D] of values [N, D] over each ray's surface; means something only where the ray is opaque."""
-        summed = composite(self.weights, values.view(*self.weights.shape, values.shape[-1]))
-        return summed / self.opacity.clamp(min=1e-3)[:, None]
-
-    @cached_property
-    def surface(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Mean surface point x_0 and unit normal n_0 of each ray [R, 3], without gradient.
-
-        They mean something only where the ray is opaque.
-        """
-        with torch.no_grad():
-            depth = (self.weights * self.distances).sum(1) / self.opacity.clamp(min=1e-3)
-            points = self.batch.origins + depth[:, None] * self.batch.directions
-            return points, torch.nn.functional.normalize(self.mean(self.gradients), dim=1)
 
 
 class Renderer:
     """Renders rays through the fields; holds no state of its own."""
 
-    def __init__(self, fields: Fields, cache: SdfCache, params: TrainParams) -> None:
-        self.fields, self.cache, self.params = fields, cache, params
+    def __init__(self, fields: Fields, cache: SdfCache, params: TrainParams, terms: Terms) -> None:
+        self.fields, self.cache, self.params, self.terms = fields, cache, params, terms
 
     def moment(self, progress: float) -> Moment:
         """What the schedules say at progress in [0, 1].
@@ -91,14 +39,14 @@ class Renderer:
         A scheduled scale ends at half a voxel of the finest level, or at `scale_end`; a learned one starts at
         `scale_start` and stays above a tenth of that voxel.
         """
-        params, grid = self.params, self.fields.shape.sdf_grid
-        levels = schedules.active_levels(progress, params.levels, params.start_levels, params.coarse_until)
+        density, schedule, grid = self.params.density, self.params.schedule, self.fields.shape.sdf_grid
+        levels = schedules.active_levels(progress, grid.levels, schedule.start_levels, schedule.coarse_until)
         scale: torch.Tensor | float
         if self.fields.log_scale is not None:
             scale = torch.exp(self.fields.log_scale) + 0.1 * grid.voxel_size()
         else:
-            end = max(params.scale_end, 0.5 * grid.voxel_size())
-            scale = schedules.exponential(progress / params.sharpen_until, params.scale_start, end)
+            end = max(density.scale_end, 0.5 * grid.voxel_size())
+            scale = schedules.exponential(progress / density.sharpen_until, density.scale_start, end)
         return Moment(progress, scale, levels, grid.voxel_size(levels))
 
     def render(
@@ -114,7 +62,7 @@ class Renderer:
         num_points = len(points)
         sdf, features, gradients = self.fields.sdf(torch.cat([points, extra]), moment.levels)
         weights, transmittance = rendering_weights(
-            sdf[:num_points].view(num_rays, num_samples), distances, moment.scale, self.params.density
+            sdf[:num_points].view(num_rays, num_samples), distances, moment.scale, self.params.density.form
         )
 
         colors = self._colors(batch, weights, points, gradients, features)
@@ -124,13 +72,13 @@ class Renderer:
             batch, colors, 1 - transmittance, weights, distances, points, gradients[:num_points], features[:num_points],
             torch.zeros(num_rays, device=points.device), proposal, sdf[num_points:], gradients[num_points:],
         )  # fmt: skip
-        return self._with_reflections(rendered, moment, generator)
+        return self.terms.recolored(rendered, moment, generator)
 
     def _sample(
         self, batch: RayBatch, moment: Moment, generator: torch.Generator | None
     ) -> tuple[torch.Tensor, tuple[torch.Tensor, torch.Tensor] | None]:
         """Distances [R, K] of the samples, and the proposal network's histogram where it made them."""
-        params = self.params
+        params = self.params.sampling
         if self.fields.proposal is None:
             return importance_distances(
                 self.cache, batch.origins, batch.directions, batch.entry, batch.leave,
@@ -168,47 +116,6 @@ class Renderer:
         nothing = torch.zeros(num_rays, 3, device=points.device)
         return nothing.index_add(0, ray, weights.view(-1)[seen, None] * colors)
 
-    def _with_reflections(self, rendered: Rendered, moment: Moment, generator: torch.Generator | None) -> Rendered:
-        """C' = (1 - rho S) C + rho S g of the rays that met a surface (paper, Self-Reflection Compensation).
-
-        In the paper's form S carries a gradient to f along the reflected ray, though not to where the ray lies. In the
-        stable form S, x_r and n_r carry none, and rays whose reflection meets nothing stay as they are.
-        """
-        network, params = self.fields.reflection, self.params
-        if network is None or (params.reflection == "stable" and moment.progress < params.reflection_from):
-            return rendered
-        hit = torch.nonzero(rendered.opacity.detach() > OPAQUE).squeeze(1)
-        surface, normals = (part[hit] for part in rendered.surface)
-        if params.reflection == "paper":
-            dirs = reflection.reflect(rendered.batch.directions[hit], normals)
-            along = reflection.uniform_points(
-                surface, dirs, params.reflection_reach, params.reflection_samples, generator
-            )
-            sdf, _, gradients = self.fields.sdf(along.view(-1, 3), moment.levels)
-            sdf = sdf.view(along.shape[:2])
-            probability = reflection.reflection_probability_literal(sdf, params.reflection_temperature)
-            points, gradients = (reflection.nearest_to_surface(sdf, each.view_as(along)) for each in (along, gradients))
-            reflectivity = torch.ones_like(probability)
-        else:
-            dirs = reflection.reflect(rendered.batch.directions[hit], normals)
-            probability, points = reflection.trace_reflections(
-                self.cache, surface, dirs, moment.width, moment.voxel,
-                params.reflection_reach, params.reflection_samples,
-            )  # fmt: skip
-            met = torch.nonzero(probability > _REFLECTION_THRESHOLD).squeeze(1)
-            hit, normals, dirs, probability, points = (x[met] for x in (hit, normals, dirs, probability, points))
-            with torch.no_grad():
-                _, _, gradients = self.fields.sdf(points, moment.levels)
-            facing = (normals * rendered.batch.directions[hit]).sum(1)
-            reflectivity = network.reflectivity(rendered.mean(rendered.features)[hit], facing)
-        seen = network(points, torch.nn.functional.normalize(gradients, dim=1), dirs)
-        composed = reflection.compose(rendered.colors[hit], seen, probability, reflectivity)
-        return replace(
-            rendered,
-            colors=rendered.colors.index_copy(0, hit, composed),
-            reflected=rendered.reflected.index_copy(0, hit, (reflectivity * probability).detach()),
-        )
-
     def _background(
         self,
         background: BackgroundNetwork,
@@ -238,7 +145,7 @@ class Renderer:
         Samples are even in the inverse of their distance from the scene's centre, from the unit sphere outwards
         (NeRF++), so that half of them look at what lies within twice the region's radius.
         """
-        count = self.params.background_samples
+        count = self.params.sampling.background_samples
         inverse = 1 - _BACKGROUND_REACH * stratified(len(origins), count + 1, generator, origins.device)
         middle = -(origins * directions).sum(1, keepdim=True)
         closest_squared = (origins**2).sum(1, keepdim=True) - middle**2

@@ -5,16 +5,25 @@ Shapes: R rays, K samples a ray, sorted from near to far.
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import torch
+from torch import Tensor
 
 from stages.neural.acceleration import takes_kernel
 from stages.neural.density import FLAT, logistic_section_optical_depth, section_optical_depth
 
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
 
 def rendering_weights(
-    sdf: torch.Tensor, distances: torch.Tensor, scale: torch.Tensor | float, density: str = "laplace"
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Rendering weights [R, K] of samples with f [R, K] at distances [R, K], and the transmittance [R] behind them.
+    sdf: Float[Tensor, "r k"],
+    distances: Float[Tensor, "r k"],
+    scale: Float[Tensor, ""] | float,
+    density: str = "laplace",
+) -> tuple[Float[Tensor, "r k"], Float[Tensor, " r"]]:
+    """Rendering weights of samples with f at distances, and the transmittance behind them.
 
     `weights_from_optical_depth` of `sample_optical_depths`; on the CPU in one pass each way where the scale is a number
     and the density that of "laplace".
@@ -25,11 +34,14 @@ def rendering_weights(
 
 
 def sample_optical_depths(
-    sdf: torch.Tensor, distances: torch.Tensor, scale: torch.Tensor | float, density: str = "laplace"
-) -> torch.Tensor:
-    """Optical depth [R, K] of each sample's own stretch of the ray, half way to its neighbours.
+    sdf: Float[Tensor, "r k"],
+    distances: Float[Tensor, "r k"],
+    scale: Float[Tensor, ""] | float,
+    density: str = "laplace",
+) -> Float[Tensor, "r k"]:
+    """Optical depth of each sample's own stretch of the ray, half way to its neighbours.
 
-    f [R, K] is taken as piecewise linear between the samples at distances [R, K], and integrated exactly. So sparse
+    f is taken as piecewise linear between the samples at their distances, and integrated exactly. So sparse
     samples cannot invent a crossing that f does not have, and a crossing between two samples is shared by both.
     The density is that of "laplace", or the logistic one of "neus".
     """
@@ -44,8 +56,8 @@ def sample_optical_depths(
     return torch.nn.functional.pad(near_half, (0, 1)) + torch.nn.functional.pad(far_half, (1, 0))
 
 
-def weights_from_optical_depth(tau: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Rendering weights [R, K] and the transmittance [R] left behind the last sample.
+def weights_from_optical_depth(tau: Float[Tensor, "r k"]) -> tuple[Float[Tensor, "r k"], Float[Tensor, " r"]]:
+    """Rendering weights and the transmittance left behind the last sample.
 
     w_k = T_k (1 - exp(-tau_k)), T_k = exp(-sum_{j<k} tau_j); the weights and what is left sum to 1.
     """
@@ -54,8 +66,8 @@ def weights_from_optical_depth(tau: torch.Tensor) -> tuple[torch.Tensor, torch.T
     return transmittance[:, :-1] - transmittance[:, 1:], transmittance[:, -1]
 
 
-def composite(weights: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
-    """Sum over samples of weights [R, K] times values [R, K, D] -> [R, D]."""
+def composite(weights: Float[Tensor, "r k"], values: Float[Tensor, "r k d"]) -> Float[Tensor, "r d"]:
+    """Sum over samples of weights times values."""
     return (weights.unsqueeze(-1) * values).sum(1)
 
 

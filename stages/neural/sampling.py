@@ -6,12 +6,17 @@ Shapes: R rays with origins and unit directions [R, 3], K samples a ray. Distanc
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import torch
+from torch import Tensor
 
 from stages.neural.acceleration import fixed_shapes, takes_kernel
 from stages.neural.density import FLAT, section_optical_depth
 from stages.neural.rendering import weights_from_optical_depth
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float, Int
 
 # Part of the samples spread evenly over the ray, so that a surface the cache has missed can still be found.
 EVEN_SHARE = 0.15
@@ -23,9 +28,9 @@ _NEAREST_SHARE = 0.25
 
 
 def intersect_unit_sphere(
-    origins: torch.Tensor, directions: torch.Tensor, near: float = 0.02
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Entry and exit distances [R] of rays through the unit sphere, and whether they hit it [R] bool.
+    origins: Float[Tensor, "r 3"], directions: Float[Tensor, "r 3"], near: float = 0.02
+) -> tuple[Float[Tensor, " r"], Float[Tensor, " r"], Bool[Tensor, " r"]]:
+    """Entry and exit distances of rays through the unit sphere, and whether they hit it.
 
     Entry is at least `near` (a camera may stand inside the sphere).
     """
@@ -37,8 +42,10 @@ def intersect_unit_sphere(
     return entry, leave, (half_squared > 1e-4) & (leave > entry + 1e-3)
 
 
-def stratified(num_rows: int, num_strata: int, generator: torch.Generator | None, device: torch.device) -> torch.Tensor:
-    """[num_rows, num_strata] ascending places in [0, 1): one draw in each of even strata; their centres without a
+def stratified(
+    num_rows: int, num_strata: int, generator: torch.Generator | None, device: torch.device
+) -> Float[Tensor, "{num_rows} {num_strata}"]:
+    """Ascending places in [0, 1): one draw in each of even strata; their centres without a
     generator."""
     if generator is None:
         offset = torch.full((num_rows, num_strata), 0.5, device=device)
@@ -47,8 +54,8 @@ def stratified(num_rows: int, num_strata: int, generator: torch.Generator | None
     return (torch.arange(num_strata, device=device) + offset) / num_strata
 
 
-def free_outside(sdf: torch.Tensor, radius: torch.Tensor) -> torch.Tensor:
-    """max(f, |x| - 1) [...] for f and |x| [...]: the solid cut off at the unit sphere.
+def free_outside(sdf: Float[Tensor, "*any"], radius: Float[Tensor, "*any"]) -> Float[Tensor, "*any"]:
+    """max(f, |x| - 1) for f and |x|: the solid cut off at the unit sphere.
 
     What the SDF says outside the sphere is never rendered, and past the grid's cube the cache repeats its border. All
     that is solid lies in the sphere, so that |x| - 1 bounds the distance to it from below.
@@ -72,16 +79,14 @@ class SdfCache:
         """Side of a cell in scene units."""
         return 2.0 / (self.resolution - 1)
 
-    def points(self, rows: torch.Tensor) -> torch.Tensor:
-        """Positions [M, 3] of flat grid indices [M]."""
+    def points(self, rows: Int[Tensor, " m"]) -> Float[Tensor, "m 3"]:
+        """Positions of flat grid indices."""
         side = self.resolution
         z, y, x = rows // (side * side), rows // side % side, rows % side
         return torch.stack([x, y, z], 1).float() * self.cell - 1
 
     @torch.no_grad()
-    def refresh(
-        self, sdf: Callable[[torch.Tensor], torch.Tensor], band: float | None = None, at_a_time: int = 1 << 13
-    ) -> int:
+    def refresh(self, sdf: Callable[[Tensor], Tensor], band: float | None = None, at_a_time: int = 1 << 13) -> int:
         """Evaluate sdf([M, 3]) -> [M] on the grid: everywhere, or where |cached f| < band. Returns M.
 
         On CUDA the band is as wide as a fixed part of the grid.
@@ -97,8 +102,8 @@ class SdfCache:
             flat[chunk] = sdf(self.points(chunk))
         return len(rows)
 
-    def lookup(self, points: torch.Tensor) -> torch.Tensor:
-        """Trilinear f [...] at points [..., 3], without gradient; positions outside the cube read its border."""
+    def lookup(self, points: Float[Tensor, "*any 3"]) -> Float[Tensor, "*any"]:
+        """Trilinear f at points, without gradient; positions outside the cube read its border."""
         if not takes_kernel(points):
             return self.lookup_reference(points)
         from stages.neural import kernels
@@ -107,7 +112,7 @@ class SdfCache:
         kernels.lookup(self.values[0, 0].numpy(), points.detach().reshape(-1, 3).numpy(), found.view(-1).numpy())
         return found
 
-    def lookup_reference(self, points: torch.Tensor) -> torch.Tensor:
+    def lookup_reference(self, points: Float[Tensor, "*any 3"]) -> Float[Tensor, "*any"]:
         """`lookup` in plain torch: the reference of the kernel, and the path on CUDA."""
         values = torch.nn.functional.grid_sample(
             self.values, points.reshape(1, 1, 1, -1, 3), align_corners=True, padding_mode="border"
@@ -118,16 +123,16 @@ class SdfCache:
 @torch.no_grad()
 def importance_distances(
     cache: SdfCache,
-    origins: torch.Tensor,
-    directions: torch.Tensor,
-    entry: torch.Tensor,
-    leave: torch.Tensor,
+    origins: Float[Tensor, "r 3"],
+    directions: Float[Tensor, "r 3"],
+    entry: Float[Tensor, " r"],
+    leave: Float[Tensor, " r"],
     num_samples: int,
     scale: float,
     generator: torch.Generator | None,
     num_bins: int = 64,
-) -> torch.Tensor:
-    """Sorted sample distances [R, K], drawn by inverse CDF from the cache's rendering weights.
+) -> Float[Tensor, "r {num_samples}"]:
+    """Sorted sample distances, drawn by inverse CDF from the cache's rendering weights.
 
     The weights are those of a Laplace density of the given scale, widened to what the cache resolves; a share
     `EVEN_SHARE` is spread evenly. One stratified draw per sample; the strata's centres without a generator.
@@ -149,15 +154,15 @@ def importance_distances(
 @torch.no_grad()
 def importance_distances_reference(
     cache: SdfCache,
-    origins: torch.Tensor,
-    directions: torch.Tensor,
-    entry: torch.Tensor,
-    leave: torch.Tensor,
-    places: torch.Tensor,
+    origins: Float[Tensor, "r 3"],
+    directions: Float[Tensor, "r 3"],
+    entry: Float[Tensor, " r"],
+    leave: Float[Tensor, " r"],
+    places: Float[Tensor, "r k"],
     scale: float,
     num_bins: int,
-) -> torch.Tensor:
-    """Distances [R, K] at places [R, K] in [0, 1) of the weights' CDF, in plain torch.
+) -> Float[Tensor, "r k"]:
+    """Distances at places in [0, 1) of the weights' CDF, in plain torch.
 
     The reference of the kernel behind `importance_distances`, and the path on CUDA.
     """
@@ -171,9 +176,11 @@ def importance_distances_reference(
     return invert_cdf(distances, weights, places)
 
 
-def invert_cdf(edges: torch.Tensor, weights: torch.Tensor, places: torch.Tensor) -> torch.Tensor:
-    """Positions [R, K] at places [R, K] in [0, 1) of the CDF of a histogram: weights [R, P], sum > 0, between edges
-    [R, P + 1]; evenly spread within an interval."""
+def invert_cdf(
+    edges: Float[Tensor, "r e"], weights: Float[Tensor, "r e-1"], places: Float[Tensor, "r k"]
+) -> Float[Tensor, "r k"]:
+    """Positions at places in [0, 1) of the CDF of a histogram: weights, sum > 0, between edges; evenly spread within an
+    interval."""
     cdf = torch.nn.functional.pad(torch.cumsum(weights, 1), (1, 0))
     cdf = cdf / cdf[:, -1:]
     index = torch.searchsorted(cdf, places.contiguous(), right=True).clamp(1, weights.shape[1])

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from configs.params import TrainParams
+from configs.training import LossParams
 from stages.geometry.cameras import PosedScene
 from stages.neural import losses
 from stages.neural.sampling import intersect_unit_sphere
@@ -68,7 +68,7 @@ class Sightings:
         return torch.cat([points, points + offset, points - offset, points - free]), self.weights[chosen]
 
 
-def sighting_loss(sdf: torch.Tensor, weights: torch.Tensor, params: TrainParams) -> torch.Tensor:
+def sighting_loss(sdf: torch.Tensor, weights: torch.Tensor, params: LossParams) -> torch.Tensor:
     """Mean error of f [4 S] at the places of `Sightings.draw`: 0 at the points, solid behind them, free before."""
     on_point, behind, front, free = sdf.view(4, len(weights))
     margin = 0.25 * params.sparse_step

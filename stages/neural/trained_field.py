@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from stages.neural.encodings import Encoding, Frequencies, HashGrid
+from stages.neural.encoding_shapes import Encoding, Frequencies, HashGrid
 from stages.neural.fields import Fields, FieldShape, points_at_a_time
 
 

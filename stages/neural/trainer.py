@@ -10,17 +10,19 @@ from typing import Any
 import numpy as np
 import torch
 
-from configs.params import TrainParams
+from configs.training import TrainParams
 from stages.neural import losses, schedules
 from stages.neural.acceleration import is_mixed, short_products
-from stages.neural.encodings import Frequencies, HashGrid
+from stages.neural.encoding_shapes import Frequencies, HashGrid
 from stages.neural.fields import Fields, FieldShape, points_at_a_time
 from stages.neural.proposal import interlevel_loss, sample_edges, updates_now
-from stages.neural.renderer import Rendered, Renderer
+from stages.neural.rendered import Rendered
+from stages.neural.renderer import Renderer
 from stages.neural.sampling import SdfCache
 from stages.neural.schedules import Moment
 from stages.neural.sightings import Sightings, sighting_loss
 from stages.neural.terms import Terms
+from stages.neural.terms.planar import feature_mlp_error, has_feature_mlp
 from stages.neural.training_photos import Photos, RayBatch
 
 # The regression to a hull before training: long enough for an error of about a cell of its grid.
@@ -29,24 +31,25 @@ HULL_STEPS, HULL_POINTS = 200, 2048
 
 def field_shape(params: TrainParams, num_images: int, background: bool) -> FieldShape:
     """The networks' shape for these settings."""
-    hash_grid = HashGrid(params.levels, params.level_features, params.log2_rows, params.coarsest, params.finest)
-    background_grid = HashGrid(6, 4, params.background_log2_rows, 16, 256)
+    field = params.field
+    hash_grid = HashGrid(field.levels, field.level_features, field.log2_rows, field.coarsest, field.finest)
+    background_grid = HashGrid(6, 4, field.background_log2_rows, 16, 256)
     return FieldShape(
-        sdf_grid=hash_grid if params.encoding == "hash" else Frequencies(params.levels),
-        sdf_layers=params.sdf_layers,
-        sdf_width=params.sdf_width,
-        radiance_layers=params.radiance_layers,
-        radiance_width=params.radiance_width,
-        reflected=params.radiance_inputs == "reflected",
+        sdf_grid=hash_grid if field.encoding == "hash" else Frequencies(field.levels),
+        sdf_layers=field.sdf_layers,
+        sdf_width=field.sdf_width,
+        radiance_layers=field.radiance_layers,
+        radiance_width=field.radiance_width,
+        reflected=field.radiance_inputs == "reflected",
         features=15,
-        sphere_radius=params.sphere_radius,
+        sphere_radius=field.sphere_radius,
         background_grid=background_grid if background else None,
         num_images=num_images,
-        numerical=params.gradients == "numerical",
-        learned_scale=params.scale_start if params.scale == "learned" else None,
-        reflection=params.reflection != "off",
-        appearance=params.planar_features == "mlp" and (params.planar != "off" or params.eikonal != "plain"),
-        proposal=params.sampler == "proposal",
+        numerical=field.gradients == "numerical",
+        learned_scale=params.density.scale_start if params.density.scale == "learned" else None,
+        reflection=params.terms.reflection.form != "off",
+        appearance=has_feature_mlp(params.terms),
+        proposal=params.sampling.sampler == "proposal",
     )
 
 
@@ -56,7 +59,7 @@ class Trainer:
     def __init__(self, photos: Photos, sightings: Sightings, params: TrainParams, device: torch.device | str) -> None:
         self.photos, self.sightings, self.params = photos, sightings, params
         self.device = torch.device(device)
-        background = params.background and photos.masks is None
+        background = params.field.background and photos.masks is None
         self.fields = Fields(field_shape(params, len(photos), background), params.seed).to(device)
         self.mixed = is_mixed(params.precision, self.device)
         if self.mixed:
@@ -66,18 +69,18 @@ class Trainer:
         networks = [p for p in self.fields.parameters() if id(p) not in table_ids]
         self.optimizer = torch.optim.Adam(
             [
-                {"params": tables, "base_lr": params.lr_table},
-                {"params": networks, "base_lr": params.lr_network},
+                {"params": tables, "base_lr": params.schedule.lr_table},
+                {"params": networks, "base_lr": params.schedule.lr_network},
             ],
-            lr=params.lr_table,
-            betas=(0.9, params.adam_beta2),
+            lr=params.schedule.lr_table,
+            betas=(0.9, params.schedule.adam_beta2),
             eps=1e-15,
             fused=True,
         )
-        self.cache = SdfCache(params.cache_resolution, device)
+        self.cache = SdfCache(params.sampling.cache_resolution, device)
         self.generator = torch.Generator(device=device).manual_seed(params.seed)
-        self.renderer = Renderer(self.fields, self.cache, params)
-        self.terms = Terms(self.fields, photos, self.cache, params, self.generator)
+        self.terms = Terms(self.fields, self.cache, params, photos, self.generator)
+        self.renderer = Renderer(self.fields, self.cache, params, self.terms)
         self.step_index = 0
         self.cache_step = -(10**9)
 
@@ -117,12 +120,12 @@ class Trainer:
     # ------------------------------------------------------------------ one step
     def step(self, progress: float) -> dict[str, torch.Tensor]:
         """One optimiser step at progress in [0, 1]; returns its terms and checks, batch means as tensors (no sync)."""
-        params = self.params
+        sampling, schedule, weights = self.params.sampling, self.params.schedule, self.params.losses
         moment = self.moment(progress)
         self._refresh_cache(moment)
-        batch = self.photos.draw(params.rays, self.generator)
-        places, sparse_weights = self.sightings.draw(params.sparse_batch, params.sparse_step, self.generator)
-        anywhere = torch.rand(params.free_points, 3, generator=self.generator, device=self.device) * 2 - 1
+        batch = self.photos.draw(sampling.rays, self.generator)
+        places, sparse_weights = self.sightings.draw(weights.sparse_batch, weights.sparse_step, self.generator)
+        anywhere = torch.rand(sampling.free_points, 3, generator=self.generator, device=self.device) * 2 - 1
         rendered = self.renderer.render(batch, moment, torch.cat([places, anywhere]), self.generator)
         exposed = rendered.colors * torch.exp(self.fields.log_gains[batch.images])
         nothing = torch.zeros((), device=self.device)
@@ -132,38 +135,33 @@ class Trainer:
         if batch.masks is not None:  # outside the masks nothing is known of the colour
             ray_error = ray_error * batch.masks
             mask_loss = losses.mask_error(rendered.opacity, batch.masks).mean()
-        trust = self.terms.trust(rendered, exposed, moment)
+        trust = self.terms.color_weight(rendered, exposed, moment)
         rgb_loss = (ray_error * trust).mean()
-        omega = self.terms.relaxation(rendered, ray_error, trust, moment)
+        omega = self.terms.eikonal_weight(rendered, ray_error, trust, moment)
         eikonal_loss = torch.cat(
             [omega * losses.eikonal_error(rendered.gradients), losses.eikonal_error(rendered.extra_gradients)]
         ).mean()
-        planar_loss = self.terms.planar_loss(rendered, moment)
-        appearance_loss = self.terms.appearance_loss(rendered)
-        sparse_loss = sighting_loss(rendered.extra_sdf[: len(places)], sparse_weights, params)
+        of_terms = self.terms.losses(rendered, moment)
+        appearance_loss = feature_mlp_error(self.fields, rendered, self.params.terms)
+        sparse_loss = sighting_loss(rendered.extra_sdf[: len(places)], sparse_weights, weights)
         exposure_loss = losses.exposure_error(self.fields.log_gains).mean()
         proposal_loss = self._proposal_loss(rendered)
-        consistency_loss = self.terms.consistency_loss(rendered, moment)
 
-        eikonal_weight = params.weight_eikonal * schedules.exponential(
-            progress, params.eikonal_start, params.eikonal_end
-        )
         loss = (
             rgb_loss
-            + eikonal_weight * eikonal_loss
-            + params.weight_planar * planar_loss
-            + params.weight_consistency * consistency_loss
-            + params.weight_sparse * schedules.fade_out(progress, params.sparse_until) * sparse_loss
-            + params.weight_mask * mask_loss
-            + params.weight_exposure * exposure_loss
+            + weights.eikonal * eikonal_loss
+            + sum(weight * term_loss for weight, term_loss in of_terms.values())
+            + weights.sparse * schedules.fade_out(progress, weights.sparse_until) * sparse_loss
+            + weights.mask * mask_loss
+            + weights.exposure * exposure_loss
             + appearance_loss
             + proposal_loss
         )
         self._forget_gradients()
         with short_products(self.mixed, self.device):
             loss.backward()
-        decay = schedules.warm_up_then_decay if params.lr_decay == "cosine" else schedules.warm_up_then_exponential
-        factor = decay(progress, params.lr_warm_up, params.lr_final)
+        decay = schedules.warm_up_then_decay if schedule.lr_decay == "cosine" else schedules.warm_up_then_exponential
+        factor = decay(progress, schedule.lr_warm_up, schedule.lr_final)
         for group in self.optimizer.param_groups:
             group["lr"] = group["base_lr"] * factor
         self.optimizer.step()
@@ -178,8 +176,7 @@ class Trainer:
                 "loss": loss.detach(),
                 "rgb": rgb_loss.detach(),
                 "eikonal": eikonal_loss.detach(),
-                "planar": planar_loss.detach(),
-                "consistency": consistency_loss.detach(),
+                **{name: term_loss.detach() for name, (_, term_loss) in of_terms.items()},
                 "sparse": sparse_loss.detach(),
                 "mask": mask_loss.detach(),
                 "appearance": appearance_loss.detach(),
@@ -201,7 +198,7 @@ class Trainer:
 
     def _proposal_loss(self, rendered: Rendered) -> torch.Tensor:
         """What trains the proposal network, in the steps that train it; zero where a grid guides the samples."""
-        if rendered.proposal is None or not updates_now(self.step_index, self.params.proposal_updates):
+        if rendered.proposal is None or not updates_now(self.step_index, self.params.sampling.proposal_updates):
             return torch.zeros((), device=self.device)
         edges = sample_edges(rendered.distances)
         return interlevel_loss(edges, rendered.weights, *rendered.proposal).mean()
@@ -215,7 +212,7 @@ class Trainer:
     @torch.no_grad()
     def _refresh_cache(self, moment: Moment) -> None:
         """Bring the sampler's grid up to date: all of it at first and now and then, else near the surface."""
-        every = self.params.cache_every
+        every = self.params.sampling.cache_every
         if self.step_index - self.cache_step < every:
             return
         refreshes = self.step_index // every

@@ -7,13 +7,18 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from stages.geometry.cameras import PinholeCameras
 from stages.neural.acceleration import first_rows, fixed_shapes
 from stages.neural.sampling import intersect_unit_sphere
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float, Int, UInt8
 
 # More rays are drawn than asked for, since some of a box's rays miss the sphere: a box is 4 / pi its ellipse.
 _OVERDRAW = 1.5
@@ -24,40 +29,40 @@ class RayBatch:
     """Rays that cross the region of interest.
 
     Attributes:
-        drawn: [R] int64, which of the rays asked for these are (those that miss the sphere are dropped).
-        images: [R] int64 photo indices.
-        origins, directions: [R, 3], scene frame, directions unit.
-        entry, leave: [R] distances at which the ray crosses the unit sphere.
-        colors: [R, 3] observed sRGB in [0, 1].
-        masks: [R] in [0, 1], or None when there are no masks.
+        drawn: which of the rays asked for these are (those that miss the sphere are dropped).
+        images: photo indices.
+        origins, directions: scene frame, directions unit.
+        entry, leave: distances at which the ray crosses the unit sphere.
+        colors: observed sRGB in [0, 1].
+        masks: in [0, 1], or None when there are no masks.
     """
 
-    drawn: torch.Tensor
-    images: torch.Tensor
-    origins: torch.Tensor
-    directions: torch.Tensor
-    entry: torch.Tensor
-    leave: torch.Tensor
-    colors: torch.Tensor
-    masks: torch.Tensor | None
+    drawn: Int[Tensor, " r"]
+    images: Int[Tensor, " r"]
+    origins: Float[Tensor, "r 3"]
+    directions: Float[Tensor, "r 3"]
+    entry: Float[Tensor, " r"]
+    leave: Float[Tensor, " r"]
+    colors: Float[Tensor, "r 3"]
+    masks: Float[Tensor, " r"] | None
 
 
 class Photos:
     """All pixels as uint8, all cameras as tensors.
 
     Attributes:
-        training: [I] bool, the photos that rays are drawn from; the others are for judging what was learned.
+        training: the photos that rays are drawn from; the others are for judging what was learned.
     """
 
     def __init__(
         self,
         cameras: PinholeCameras,
-        images: Iterable[np.ndarray],
-        masks: Iterable[np.ndarray] | None,
+        images: Iterable[UInt8[np.ndarray, "_ _ 3"]],
+        masks: Iterable[UInt8[np.ndarray, "_ _"]] | None,
         device: torch.device | str,
-        training: torch.Tensor | None = None,
+        training: Bool[Tensor, " i"] | None = None,
     ) -> None:
-        """images: I arrays [H, W, 3] uint8; masks: I arrays [H, W] uint8 or None; training: None for all photos.
+        """images: of a shape [H, W, 3]; masks: [H, W]; training: None for all photos.
 
         Images and masks are taken one at a time, so that they need not all be held twice. Raises ValueError on sizes.
         """
@@ -80,8 +85,8 @@ class Photos:
     def __len__(self) -> int:
         return len(self.first)
 
-    def mask(self, index: int) -> np.ndarray:
-        """The mask [H, W] uint8 of a photo, where there are masks."""
+    def mask(self, index: int) -> UInt8[np.ndarray, "_ _"]:
+        """The mask of a photo, where there are masks."""
         assert self.masks is not None
         width, height = self.sizes[index].tolist()
         first = int(self.first[index])
@@ -99,8 +104,8 @@ class Photos:
         pixels = (low + place * (high - low)).floor()
         return self.rays(images, pixels, limit=num_rays)
 
-    def observe(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """What every photo shows at scene points [P, 3]: colours [P, I, 3] in [0, 1] and whether it may show it [P, I].
+    def observe(self, points: Float[Tensor, "p 3"]) -> tuple[Float[Tensor, "p i 3"], Bool[Tensor, "p i"]]:
+        """What every photo shows at scene points: colours in [0, 1] and whether it may show it.
 
         The nearest pixel. A photo cannot show a point that is out of frame, behind the camera or, where there are
         masks, off the photo's mask; the colour means nothing then.
@@ -115,8 +120,8 @@ class Photos:
             inside &= self.masks[rows] > 127
         return self.pixels[rows].float() / 255, inside
 
-    def rays(self, images: torch.Tensor, pixels: torch.Tensor, limit: int | None = None) -> RayBatch:
-        """Rays through the centres of integer pixels [R, 2] (x, y) of photos [R]; those that miss are dropped.
+    def rays(self, images: Int[Tensor, " r"], pixels: Float[Tensor, "r 2"], limit: int | None = None) -> RayBatch:
+        """Rays through the centres of integer pixels (x, y) of photos; those that miss are dropped.
 
         With a limit the first that hit, as `draw` wants them.
         """
@@ -145,7 +150,7 @@ class Photos:
 
 def _flat(
     cameras: PinholeCameras, images: Iterable[np.ndarray], channels: tuple[int, ...], device: torch.device
-) -> torch.Tensor:
+) -> Tensor:
     """All images [H, W, *channels] uint8 as one tensor of pixels [T, *channels].
 
     Raises ValueError where one has not its camera's size.
@@ -161,8 +166,8 @@ def _flat(
     return pixels
 
 
-def _sphere_boxes(cameras: PinholeCameras) -> np.ndarray:
-    """[I, 4] x0, y0, x1, y1: the part of each photo that can show the unit sphere, in pixels."""
+def _sphere_boxes(cameras: PinholeCameras) -> Float[np.ndarray, "i 4"]:
+    """x0, y0, x1, y1: the part of each photo that can show the unit sphere, in pixels."""
     longitude, latitude = np.meshgrid(np.linspace(0, 2 * np.pi, 64), np.linspace(-np.pi / 2, np.pi / 2, 33))
     # Slightly larger than the sphere, so that the polyhedron's faces do not cut it.
     ball = 1.01 * np.stack(

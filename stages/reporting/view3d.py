@@ -14,8 +14,8 @@ import numpy as np
 from stages.artifacts import AtlasMesh, VertexQuality
 from stages.geometry.cameras import PosedScene
 from stages.geometry.orientation import y_up_rotation
+from stages.reporting.next_views import NextView
 from stages.reporting.pictures import jpeg_uri, shrink
-from stages.texture.next_views import NextView
 
 # Meshes with more faces than this would make the page too heavy: it then has pictures only.
 MAX_FACES = 400_000

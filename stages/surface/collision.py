@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from stages.surface.simplify import decimate
+from stages.surface.decimation import decimate
 from stages.surface.triangle_mesh import edge_use, label_pieces
 
 # The pieces are found on a mesh of so many faces: they are as good as with ten times as many, at a tenth of the time.

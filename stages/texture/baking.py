@@ -1,6 +1,6 @@
 """Photos to texture: visibility, gains, a robust mean in two bands, and what no photo saw.
 
-1. Each photo gets a depth map of the mesh, a trust map that fades near depth edges, and two bands (`views`).
+1. Each photo gets a depth map of the mesh, a trust map that fades near depth edges, and two bands (`photo_views`).
 2. A sample of texels, seen by several photos, gives the gains (`gains`) and tells blurred photos (`sharpness`).
 3. Each texel collects its best views (`observing`): low band = robust mean of many, high band = robust mean of those
    that resolve the most. Weights change smoothly over the surface and fade out before a view leaves the set, so
@@ -35,6 +35,8 @@ LoadPhoto = Callable[[int], tuple[np.ndarray, np.ndarray | None]]
 # (points [P, 3], normals [P, 3], unit view directions [P, 3] from camera to point) -> [P, 3] sRGB in [0, 1].
 ColorField = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 Listener = Callable[[float, float, str], None]
+# (photo index, the photo made ready, its gains [3]).
+Visitor = Callable[[int, View, np.ndarray], None]
 
 # Texels that take part in comparing photos.
 SAMPLES = 20_000
@@ -87,6 +89,7 @@ def bake_texture(
     robust_sigma: float = 6.0,
     workers: int = 1,
     listener: Listener | None = None,
+    visit: Visitor | None = None,
 ) -> Baked:
     """Bake photos into the texture of an atlas.
 
@@ -103,6 +106,7 @@ def bake_texture(
         robust_sigma: colours further than this many robust standard deviations are rejected.
         workers: threads.
         listener: told (done, total, note).
+        visit: shown each photo once, in order, so that what else is asked of photos need not make them ready again.
 
     Raises:
         ValueError: the atlas covers no texel, or a photo is not of its camera's size.
@@ -124,9 +128,12 @@ def bake_texture(
         blend = partial(blend_texels, detail=detail, robust_sigma=robust_sigma, diffuse=diffuse)
         for number, band in enumerate(bands):
             begun = num_views * (1 + number)
+            prepared = _prefetch(pool, prepare, num_views, workers)
+            if visit is not None and number == 0:
+                prepared = _visited(prepared, visit, gains)
             _blend(
                 pool, *surface_points(atlas, texels.face_ids[band], texels.corner[band]), gains, sharpness,
-                _prefetch(pool, prepare, num_views, workers), views, blend, colors[band], seen_by[band],
+                prepared, views, blend, colors[band], seen_by[band],
                 partial(_tell_blending, tell, begun, total),
             )  # fmt: skip
         prepare.kept.clear()
@@ -195,6 +202,12 @@ def _prefetch(pool: ThreadPoolExecutor, prepare: Callable[[int], View], count: i
             waiting.append(pool.submit(prepare, submitted))
             submitted += 1
         yield waiting.pop(0).result()
+
+
+def _visited(prepared: Iterator[View], visit: Visitor, gains: np.ndarray) -> Iterator[View]:
+    for index, view in enumerate(prepared):
+        visit(index, view, gains[index])
+        yield view
 
 
 def _compare(

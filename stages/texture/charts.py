@@ -112,14 +112,14 @@ def unwrap_projected(vertices: np.ndarray, faces: np.ndarray, texture_size: int,
     axis = _axis_of_faces(units, adjacency)
     flat = _project(points[faces], axis)
     charts = _cut_overlaps(flat, axis, adjacency, points[faces])
-    local = _split_along_seams(faces, charts)
+    source, new_faces = _split_along_seams(faces, charts)
     # Charts are disjoint in split vertices, so each vertex has one chart and one axis.
-    texels = np.empty((len(local.source), 2))
-    texels[local.faces] = flat
-    chart_of_vertex = np.empty(len(local.source), dtype=np.int64)
-    chart_of_vertex[local.faces] = charts[:, None]
+    texels = np.empty((len(source), 2))
+    texels[new_faces] = flat
+    chart_of_vertex = np.empty(len(source), dtype=np.int64)
+    chart_of_vertex[new_faces] = charts[:, None]
     texels = _pack(texels, chart_of_vertex, texture_size, padding)
-    return UvLayout(local.source, local.faces, texels, charts)
+    return UvLayout(source, new_faces, texels, charts)
 
 
 def _axis_of_faces(units: np.ndarray, adjacency: np.ndarray) -> np.ndarray:
@@ -197,8 +197,8 @@ def _move_overlaps(layout: UvLayout, pairs: np.ndarray, texture_size: int, paddi
     adjacency = face_adjacency(layout.faces)
     together = layer[adjacency[:, 0]] == layer[adjacency[:, 1]]
     charts = label_pieces(len(layout.faces), adjacency, together)
-    split = _split_along_seams(layout.faces, charts)
-    texels = layout.texels[split.source]
+    source, new_faces = _split_along_seams(layout.faces, charts)
+    texels = layout.texels[source]
 
     taken: np.ndarray = np.zeros((texture_size, texture_size), dtype=np.uint8)
     for triangle in np.floor(corners[layer == 0]).astype(np.int32):
@@ -209,7 +209,7 @@ def _move_overlaps(layout: UvLayout, pairs: np.ndarray, texture_size: int, paddi
     taken[:border] = taken[:, :border] = 1
     taken[texture_size - border :] = taken[:, texture_size - border :] = 1
     for chart in np.unique(charts[layer > 0]):
-        members = np.unique(split.faces[charts == chart])
+        members = np.unique(new_faces[charts == chart])
         low = np.floor(texels[members].min(0)).astype(np.int64)
         width, height = np.ceil(texels[members].max(0)).astype(np.int64) - low + 1
         corner = _free_box(taken, int(width), int(height))
@@ -221,7 +221,7 @@ def _move_overlaps(layout: UvLayout, pairs: np.ndarray, texture_size: int, paddi
         texels[members] += np.array([x, y]) - low
         around = padding + 1
         taken[max(y - around, 0) : y + height + around, max(x - around, 0) : x + width + around] = 1
-    return UvLayout(layout.source[split.source], split.faces, texels, charts)
+    return UvLayout(layout.source[source], new_faces, texels, charts)
 
 
 def _free_box(taken: np.ndarray, width: int, height: int) -> tuple[int, int] | None:
@@ -289,17 +289,11 @@ def _interiors_meet(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return meet
 
 
-@dataclass(frozen=True)
-class _Split:
-    source: np.ndarray
-    faces: np.ndarray
-
-
-def _split_along_seams(faces: np.ndarray, charts: np.ndarray) -> _Split:
-    """One vertex for each (vertex, chart) that occurs."""
+def _split_along_seams(faces: np.ndarray, charts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """One vertex for each (vertex, chart) that occurs: the vertex [W] it copies, and faces [F, 3] of the new ones."""
     pairs = np.stack([np.repeat(charts, 3), faces.ravel()], axis=1)
     unique, index = np.unique(pairs, axis=0, return_inverse=True)
-    return _Split(unique[:, 1].astype(np.int64), index.reshape(-1, 3).astype(np.int32))
+    return unique[:, 1].astype(np.int64), index.reshape(-1, 3).astype(np.int32)
 
 
 def _pack(points: np.ndarray, chart: np.ndarray, texture_size: int, padding: int) -> np.ndarray:

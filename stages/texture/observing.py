@@ -18,7 +18,7 @@ STEPS_SIGNED = 32.0
 # Robust spread (colour levels) never counts as less than this: photo noise.
 NOISE_FLOOR = 3.0
 # What photos count in the mean of either band is a power of their weight. Low: many photos, for sheen moves from one
-# to the next and none of them is right. High: rather those that resolve the most. Measured: docs/benchmarks.md.
+# to the next and none of them is right. High: rather those that resolve the most. See docs/benchmarks/textures.md.
 LOW_POWER, HIGH_POWER = 0.5, 1.0
 
 

@@ -28,7 +28,7 @@ _BAND_PASSES = 3
 # Photos with more pixels on a texel's side than this are smoothed first, or their finest detail would alias.
 FINER = 1.25
 # What a prepared photo takes.
-BYTES_PER_PIXEL = 23
+BYTES_PER_PIXEL = 26
 
 
 @dataclass(frozen=True)
@@ -43,6 +43,7 @@ class View:
         confidence: [H, W] float32 in [0, 1]; 0 outside the mask.
         low: [H, W, 3] float32, the photo low-passed along surfaces only, 0..255.
         photo: [H, W, 3] uint8.
+        original: the photo before it was smoothed for texels that cannot hold its detail.
     """
 
     matrix: np.ndarray
@@ -52,6 +53,7 @@ class View:
     confidence: np.ndarray
     low: np.ndarray
     photo: np.ndarray
+    original: np.ndarray
 
 
 def prepare_view(
@@ -93,6 +95,7 @@ def prepare_view(
     from_edge = cv2.distanceTransform(interior, cv2.DIST_L2, 3)
     confidence = np.clip((from_edge - UNSAFE_PIXELS) / FADE_PIXELS, FAINT, 1.0)
     confidence[~on_object] = 0
+    original = photo = np.ascontiguousarray(photo)
     pixels_on_texel = texel_side * focal * float(np.median(inverse_depth[on_object])) if on_object.any() else 0.0
     if pixels_on_texel > FINER:
         # A texel's square has the variance r^2 / 12 pixels^2, of which sampling brings 1 / 12.
@@ -105,7 +108,8 @@ def prepare_view(
         inverse_depth=inverse_depth,
         confidence=confidence.astype(np.float32),
         low=low_pass(photo, linked_left, linked_up, BAND_SIGMA),
-        photo=np.ascontiguousarray(photo),
+        photo=photo,
+        original=original,
     )
 
 

@@ -8,9 +8,9 @@ import numpy as np
 
 from stages.artifacts import AtlasMesh
 from stages.drawing.rasterizing import Texels, surface_points
-from stages.files.tangents import to_tangent_space, vertex_tangents
 from stages.surface.triangle_mesh import MAX_RAYS, raycaster, vertex_normals
 from stages.texture.padding import pad_charts
+from stages.texture.tangents import to_tangent_space, vertex_tangents
 
 # The full mesh is looked for within this part of the longest edge of the face: decimation moves a surface by far less.
 REACH = 0.5

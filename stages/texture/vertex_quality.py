@@ -6,80 +6,72 @@ Shapes: V vertices, N photos.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 from numba import njit
 
 from stages.artifacts import AtlasMesh, VertexQuality
-from stages.drawing.rasterizing import Texels, depth_map
-from stages.geometry.cameras import PinholeCameras
+from stages.drawing.rasterizing import Texels
 from stages.surface.triangle_mesh import face_areas
 from stages.texture.baking import Provenance
 from stages.texture.observing import sample_points
+from stages.texture.photo_views import View
 
 # Keeps the colour covariance invertible where photos are nearly grey: one 8-bit level, squared.
 _COLOR_VARIANCE_FLOOR = 1.0
 
 
-def measure_quality(
-    atlas: AtlasMesh,
-    texels: Texels,
-    cameras: PinholeCameras,
-    load_photo: Callable[[int], tuple[np.ndarray, np.ndarray | None]],
-    provenance: np.ndarray,
-    gains: np.ndarray,
-    listener: Callable[[float, float], None] | None = None,
-) -> VertexQuality:
-    """Measures of each vertex over the photos that see it, with the visibility of the texture itself.
+class VertexWitness:
+    """What photos, shown one by one, say of each vertex, with the visibility of the texture itself.
 
     Args:
         atlas: the final mesh, scene frame.
-        texels: its atlas rasterised, see `rasterizing.rasterize_atlas`.
-        cameras: N photos that the texture is made from.
-        load_photo: camera -> photo [H, W, 3] uint8 and mask [H, W] bool or None.
-        provenance: [S, S] uint8 of `baking.Provenance`.
-        gains: [N, 3] factors that make the photos agree.
-        listener: told (photos done, photos).
+        num_photos: N.
     """
-    count, num_photos = len(atlas.vertices), len(cameras)
-    seen = np.zeros((num_photos, count), dtype=np.bool_)
-    colors = np.zeros((num_photos, count, 3), dtype=np.uint8)
-    facing = np.zeros(count, dtype=np.float32)
-    photo_density = np.zeros(count, dtype=np.float32)
-    moments = np.zeros((4, 4))  # of (1, r, g, b)
-    weights, sampled = np.zeros(count, dtype=np.float32), np.zeros((count, 3), dtype=np.float32)
-    for index in range(num_photos):
-        photo, mask = load_photo(index)
-        _, inverse_depth = depth_map(cameras, index, atlas.vertices, atlas.faces)
-        on_object = inverse_depth > 0 if mask is None else (inverse_depth > 0) & mask
-        K, center = cameras.intrinsics[index], cameras.centers[index]
-        matrix, focal = K @ cameras.cam_from_scene[index], float(np.sqrt(K[0, 0] * K[1, 1]))
+
+    def __init__(self, atlas: AtlasMesh, num_photos: int) -> None:
+        count = len(atlas.vertices)
+        self.atlas = atlas
+        self.seen = np.zeros((num_photos, count), dtype=np.bool_)
+        self.colors = np.zeros((num_photos, count, 3), dtype=np.uint8)
+        self.facing = np.zeros(count, dtype=np.float32)
+        self.photo_density = np.zeros(count, dtype=np.float32)
+        self.moments = np.zeros((4, 4))  # of (1, r, g, b)
+        self._weights, self._sampled = np.zeros(count, dtype=np.float32), np.zeros((count, 3), dtype=np.float32)
+
+    def look(self, index: int, view: View, gains: np.ndarray) -> None:
+        """Take photo `index` into account; `gains` [3] make it agree with the others."""
+        vertices, normals = self.atlas.vertices, self.atlas.normals
         sample_points(
-            atlas.vertices, atlas.normals, matrix, center, focal,
-            inverse_depth, on_object.astype(np.float32), np.ascontiguousarray(photo), weights, sampled,
+            vertices, normals, view.matrix, view.center, view.focal,
+            view.inverse_depth, view.confidence, view.original, self._weights, self._sampled,
         )  # fmt: skip
-        hit = np.flatnonzero(weights > 0)
-        seen[index, hit] = True
-        even = np.clip(sampled[hit] * gains[index], 0, 255)
-        colors[index, hit] = np.round(even)
+        hit = np.flatnonzero(self._weights > 0)
+        self.seen[index, hit] = True
+        even = np.clip(self._sampled[hit] * gains, 0, 255)
+        self.colors[index, hit] = np.round(even)
         ones = np.concatenate([np.ones((len(even), 1)), even], 1)
-        moments += ones.T @ ones
-        to_camera = center - atlas.vertices[hit]
-        cos = (atlas.normals[hit] * to_camera).sum(1) / np.linalg.norm(to_camera, axis=1)
-        depth = atlas.vertices[hit] @ matrix[2, :3] + matrix[2, 3]
-        facing[hit] = np.maximum(facing[hit], cos)
-        photo_density[hit] = np.maximum(photo_density[hit], focal * cos / depth)
-        if listener:
-            listener(index + 1, num_photos)
-    return VertexQuality(
-        seen_by=seen.sum(0).astype(np.uint16),
-        facing=facing,
-        ambiguity=mean_disagreement(colors, seen, color_precision(moments)),
-        photo_density=photo_density,
-        texel_density=texel_density(atlas),
-        invented=invented_share(atlas, texels, provenance),
-    )
+        self.moments += ones.T @ ones
+        to_camera = view.center - vertices[hit]
+        cos = (normals[hit] * to_camera).sum(1) / np.linalg.norm(to_camera, axis=1)
+        depth = vertices[hit] @ view.matrix[2, :3] + view.matrix[2, 3]
+        self.facing[hit] = np.maximum(self.facing[hit], cos)
+        self.photo_density[hit] = np.maximum(self.photo_density[hit], view.focal * cos / depth)
+
+    def quality(self, texels: Texels, provenance: np.ndarray) -> VertexQuality:
+        """Measures of each vertex over the photos that were shown.
+
+        Args:
+            texels: the atlas rasterised, see `rasterizing.rasterize_atlas`.
+            provenance: [S, S] uint8 of `baking.Provenance`.
+        """
+        return VertexQuality(
+            seen_by=self.seen.sum(0).astype(np.uint16),
+            facing=self.facing,
+            ambiguity=mean_disagreement(self.colors, self.seen, color_precision(self.moments)),
+            photo_density=self.photo_density,
+            texel_density=texel_density(self.atlas),
+            invented=invented_share(self.atlas, texels, provenance),
+        )
 
 
 def color_precision(moments: np.ndarray) -> np.ndarray:

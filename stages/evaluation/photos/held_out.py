@@ -75,12 +75,11 @@ def _whole(workspace: Path) -> Workspace:
     """A workspace whose stages that drawings are made from are all there, and of one run."""
     opened = Workspace.open(workspace)
     hint = f"Make it: `hineus run --workspace {workspace}`."
-    names = [stage.name for stage in DRAWN_FROM]
     for stage in DRAWN_FROM:
         if opened.published(stage.name) is None:
             raise WorkspaceError(f"{workspace} has no result of the stage {stage.name}.", hint)
-        made_from = (artifact.partition("/")[0] for artifact in replaced_inputs(stage, opened))
-        if before := next((name for name in made_from if name in names), None):
+        made_from = {artifact.partition("/")[0] for artifact in replaced_inputs(stage, opened)}
+        if before := next((each.name for each in DRAWN_FROM if each.name in made_from), None):
             raise WorkspaceError(
                 f"The stage {stage.name} of {workspace} is of another {before} than the one there.", hint
             )

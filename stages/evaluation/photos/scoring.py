@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from configs.params import TrainParams
+from configs.renames import section_with_new_names
+from configs.training import TrainParams
 from stages import artifacts
 from stages.drawing.view_scores import draw_view, silhouette
 from stages.engine.workspace import Workspace
@@ -77,7 +78,8 @@ def field_drawer(workspace: Workspace, device: str) -> FieldDrawer:
     manifest = workspace.published("train")
     assert manifest is not None  # callers have made sure
     field = load_field(artifacts.field_path(workspace.stage_folder("train")), device)
-    return FieldDrawer(field.fields, TrainParams(**manifest.identity.params), device)
+    params = TrainParams.model_validate(section_with_new_names("train", manifest.identity.params))
+    return FieldDrawer(field.fields, params, device)
 
 
 def mean_scores(photos: list[dict[str, Any]]) -> dict[str, Any]:

@@ -18,7 +18,8 @@ from glob import escape
 from pathlib import Path
 from typing import Any
 
-from configs.load import describe_settings
+from configs.dotted import flatten
+from configs.params import Config
 from stages import artifacts
 from stages.engine.runner import Listener
 from stages.engine.stage import Stage
@@ -184,14 +185,8 @@ def _costs(done: Reconstruction) -> dict[str, Any]:
 
 def _differing(settings: dict[str, Any]) -> dict[str, Any]:
     """The settings that are not the defaults; they are all that a run is made again from."""
-    found = {}
-    for setting in describe_settings():
-        section, _, key = setting.key.rpartition(".")
-        value = settings[section][key]
-        default = list(setting.default) if isinstance(setting.default, tuple) else setting.default
-        if value != default:
-            found[setting.key] = value
-    return found
+    defaults = flatten(Config().model_dump(mode="json"))
+    return {key: value for key, value in flatten(settings).items() if value != defaults[key]}
 
 
 def _fingerprints(workspace: Workspace, stages: Iterable[str]) -> dict[str, str]:

@@ -9,21 +9,24 @@ begins off the surface, and asks whether the reflected ray runs INTO something.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
-from torch import nn
 
 from stages.neural.density import laplace_density, section_optical_depth
-from stages.neural.mlp import mlp, spherical_harmonics
+from stages.neural.rendered import OPAQUE, Rendered
 from stages.neural.rendering import weights_from_optical_depth
 from stages.neural.sampling import SdfCache, free_outside, stratified
+from stages.neural.schedules import Moment
+from stages.neural.terms.term import Term
 
 # A ray on which f falls slower than this per unit of length runs along a surface, not into it: within 3 degrees. Else
 # rounding and the grid's facets alone would make a flat mirror reflect itself at grazing angles.
 _APPROACH = 0.05
 # A ray that collects less opacity than this hits nothing, and has no mean hit.
 _MISS = 1e-3
-# Reflectivity before training: compensation has to earn its place.
-_INITIAL_REFLECTIVITY = 0.02
+# Reflected rays that meet something with less than this probability are not followed: under one grey level.
+_REFLECTION_THRESHOLD = 2e-3
 
 
 def reflect(directions: torch.Tensor, normals: torch.Tensor) -> torch.Tensor:
@@ -113,7 +116,7 @@ def trace_reflections(
     return probability, points + distance[:, None] * directions
 
 
-# ---------------------------------------------------------------------- both
+# ---------------------------------------------------------------------- both forms
 def compose(
     color: torch.Tensor, reflected_color: torch.Tensor, probability: torch.Tensor, reflectivity: torch.Tensor | float
 ) -> torch.Tensor:
@@ -125,26 +128,45 @@ def compose(
     return (1 - share) * color + share * reflected_color
 
 
-class ReflectionNetwork(nn.Module):
-    """g(x_r, n_r, v_r), the colour that the second surface sends to the first, and the first one's reflectivity rho."""
+# ---------------------------------------------------------------------- in a step
+class Reflection(Term):
+    """Colours of rays, with what the surface mirrors of the object."""
 
-    def __init__(self, features: int, width: int, generator: torch.Generator, layers: int = 2) -> None:
-        super().__init__()
-        self.color_layers = mlp([3 + 3 + 15, *[width] * layers, 3], generator)
-        self.reflectivity_layer = mlp([features + 1, 1], generator)
-        head = self.reflectivity_layer[0]
-        assert isinstance(head, nn.Linear)
-        head.weight.data *= 0.1
-        head.bias.data.fill_(torch.logit(torch.tensor(_INITIAL_REFLECTIVITY)).item())
+    def recolored(self, rendered: Rendered, moment: Moment, generator: torch.Generator | None) -> Rendered:
+        """C' = (1 - rho S) C + rho S g of the rays that met a surface (paper, Self-Reflection Compensation).
 
-    def forward(self, points: torch.Tensor, normals: torch.Tensor, directions: torch.Tensor) -> torch.Tensor:
-        """sRGB colour g [Q, 3] in [0, 1] of x_r [Q, 3] with unit n_r, seen along the reflected directions v_r."""
-        inputs = [points, normals, spherical_harmonics(directions)]
-        return torch.sigmoid(self.color_layers(torch.cat(inputs, 1)))
-
-    def reflectivity(self, features: torch.Tensor, facing: torch.Tensor) -> torch.Tensor:
-        """rho [Q] in (0, 1) at x_0, from its geometry features [Q, G] and facing ratio n.v [Q]; 0.02 before training.
-
-        Not in the paper, where whatever faces another part of the object is a perfect mirror.
+        In the paper's form S carries a gradient to f along the reflected ray, though not to where the ray lies. In the
+        stable form S, x_r and n_r carry none, and rays whose reflection meets nothing stay as they are.
         """
-        return torch.sigmoid(self.reflectivity_layer(torch.cat([features, facing[:, None]], 1))).squeeze(1)
+        network, params = self.fields.reflection, self.params.terms.reflection
+        if network is None or (params.form == "stable" and moment.progress < params.start):
+            return rendered
+        hit = torch.nonzero(rendered.opacity.detach() > OPAQUE).squeeze(1)
+        surface, normals = (part[hit] for part in rendered.surface)
+        if params.form == "paper":
+            dirs = reflect(rendered.batch.directions[hit], normals)
+            along = uniform_points(surface, dirs, params.reach, params.samples, generator)
+            sdf, _, gradients = self.fields.sdf(along.view(-1, 3), moment.levels)
+            sdf = sdf.view(along.shape[:2])
+            probability = reflection_probability_literal(sdf, params.temperature)
+            points, gradients = (nearest_to_surface(sdf, each.view_as(along)) for each in (along, gradients))
+            reflectivity = torch.ones_like(probability)
+        else:
+            dirs = reflect(rendered.batch.directions[hit], normals)
+            probability, points = trace_reflections(
+                self.cache, surface, dirs, moment.width, moment.voxel,
+                params.reach, params.samples,
+            )  # fmt: skip
+            met = torch.nonzero(probability > _REFLECTION_THRESHOLD).squeeze(1)
+            hit, normals, dirs, probability, points = (x[met] for x in (hit, normals, dirs, probability, points))
+            with torch.no_grad():
+                _, _, gradients = self.fields.sdf(points, moment.levels)
+            facing = (normals * rendered.batch.directions[hit]).sum(1)
+            reflectivity = network.reflectivity(rendered.mean(rendered.features)[hit], facing)
+        seen = network(points, torch.nn.functional.normalize(gradients, dim=1), dirs)
+        composed = compose(rendered.colors[hit], seen, probability, reflectivity)
+        return replace(
+            rendered,
+            colors=rendered.colors.index_copy(0, hit, composed),
+            reflected=rendered.reflected.index_copy(0, hit, (reflectivity * probability).detach()),
+        )

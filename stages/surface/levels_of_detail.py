@@ -7,12 +7,11 @@ from collections.abc import Iterator
 import numpy as np
 
 from stages.artifacts import AtlasMesh
+from stages.surface.decimation import decimate_textured
 from stages.surface.triangle_mesh import raycaster, vertex_normals
 
 # Faces of a level for one of the level before.
 RATIO = 0.5
-# pymeshlab's own default is 1; a chart's coordinates that weigh more hold the texture better and the shape no worse.
-UV_WEIGHT = 3.0
 # A normal that leans further than this (cosine) from the level's own was found on another side of a thin part.
 MIN_AGREEMENT = 0.2
 
@@ -20,30 +19,16 @@ MIN_AGREEMENT = 0.2
 def levels_of_detail(atlas: AtlasMesh, count: int) -> Iterator[AtlasMesh]:
     """`count` meshes, each with half the faces of the one before, the first with half of `atlas`.
 
-    Quadrics over position and UV (Garland and Heckbert 1998, in pymeshlab) keep seams and what lies where in the
-    texture. Normals are those of `atlas` at the nearest point, as its normal map is relative to them. Seams set a
-    limit: with a handful of faces a chart the texture slides.
+    Normals are those of `atlas` at the nearest point, as its normal map is relative to them. Seams set a limit: with a
+    handful of faces a chart the texture slides.
 
     Args:
         atlas: of one or more faces.
         count: >= 0.
     """
-    import pymeshlab
-
-    meshes = pymeshlab.MeshSet()
-    vertices, uvs = atlas.vertices.astype(np.float64), atlas.uvs.astype(np.float64)
-    meshes.add_mesh(pymeshlab.Mesh(vertices, atlas.faces, v_tex_coords_matrix=uvs))
-    meshes.compute_texcoord_transfer_vertex_to_wedge()
-    meshes.meshing_remove_duplicate_vertices()
-    for level in range(1, count + 1):
-        meshes.meshing_decimation_quadric_edge_collapse_with_texture(
-            targetfacenum=max(int(len(atlas.faces) * RATIO**level), 4),
-            extratcoordw=UV_WEIGHT,
-            preserveboundary=True,
-            preservenormal=True,
-        )
-        light = meshes.current_mesh()
-        yield _split(light.vertex_matrix(), light.face_matrix(), light.wedge_tex_coord_matrix(), atlas)
+    targets = [max(int(len(atlas.faces) * RATIO**level), 4) for level in range(1, count + 1)]
+    for light in decimate_textured(atlas.vertices, atlas.faces, atlas.uvs, targets):
+        yield _split(*light, atlas)
 
 
 def _split(vertices: np.ndarray, faces: np.ndarray, corner_uvs: np.ndarray, atlas: AtlasMesh) -> AtlasMesh:

@@ -1,0 +1,190 @@
+"""The settings of the training, in groups; each of the paper's terms has one of its own."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from configs.section import Section
+
+
+class FieldParams(Section):
+    """The networks: what is trained."""
+
+    encoding: Literal["hash", "frequency"] = Field("hash", description="encoding of positions for the SDF")
+    levels: int = Field(8, ge=1, le=24, description="levels of the SDF's hash encoding, or its frequencies")
+    level_features: int = Field(4, ge=1, le=8, description="features per level; CPU kernels exist for 4")
+    log2_rows: int = Field(17, ge=8, le=24, description="a level has at most two to this power rows")
+    coarsest: int = Field(16, ge=2, description="cells along a side of the coarsest level")
+    finest: int = Field(512, ge=4, le=8192, description="cells along a side of the finest level")
+    sdf_layers: int = Field(1, ge=1, le=16, description="hidden layers of the SDF's MLP")
+    sdf_width: int = Field(64, ge=4, description="width of the SDF's hidden layers")
+    radiance_layers: int = Field(2, ge=1, le=16, description="hidden layers of the radiance MLP")
+    radiance_width: int = Field(64, ge=4, description="width of the radiance MLP's hidden layers, and of the others")
+    radiance_inputs: Literal["view", "reflected"] = Field(
+        "reflected",
+        description="what the radiance MLP knows of the view: its direction, or the reflected one and n.v too",
+    )
+    gradients: Literal["analytic", "numerical"] = Field(
+        "analytic", description="SDF gradients by differentiation, or central differences one active voxel to each side"
+    )
+    sphere_radius: float = Field(0.5, gt=0, lt=1, description="the SDF is this sphere before training, scene units")
+    init: Literal["auto", "sphere", "room", "hull"] = Field(
+        "auto",
+        description="the SDF before training: that sphere, a room around the cameras, or the visual hull of masks (one "
+        "for each photo); auto: a room where most cameras stand in that sphere, else it",
+    )
+    background: bool = Field(True, description="model what lies outside the region (never where masks exist)")
+    background_log2_rows: int = Field(15, ge=8, le=24, description="rows per level of the background's encoding")
+
+
+class DensityParams(Section):
+    """How opaque the signed distance is."""
+
+    form: Literal["laplace", "neus"] = Field(
+        "laplace", description="optical depth from the SDF: Laplace CDF (VolSDF), or the logistic alpha of NeuS"
+    )
+    scale: Literal["scheduled", "learned"] = Field("scheduled", description="how the density's scale b gets its value")
+    scale_start: float = Field(0.05, gt=0, description="scale b at the start, scene units")
+    scale_end: float = Field(
+        0.002, gt=0, description="scheduled scale b at the end, scene units; never under half a voxel"
+    )
+    sharpen_until: float = Field(0.9, gt=0, le=1, description="progress at which the scheduled scale is at its end")
+
+
+class SamplingParams(Section):
+    """Where a step looks."""
+
+    rays: int = Field(512, ge=1, description="rays per step")
+    samples: int = Field(16, ge=2, description="samples per ray inside the region of interest")
+    free_points: int = Field(256, ge=0, description="points per step anywhere in the region, for the Eikonal term")
+    background_samples: int = Field(16, ge=1, description="samples per ray outside the region")
+    sampler: Literal["grid", "proposal"] = Field(
+        "grid", description="where samples go: near the surface of a cached grid, or as a proposal network says"
+    )
+    cache_resolution: int = Field(96, ge=8, le=512, description="side of the SDF grid that guides sampling")
+    cache_every: int = Field(64, ge=1, description="steps between refreshes of that grid")
+    proposal_samples: int = Field(64, ge=2, description="samples per ray of the proposal network")
+    proposal_updates: int = Field(
+        128, ge=0, description="steps at the start that each train the proposal network; later every fifth does"
+    )
+
+
+class ScheduleParams(Section):
+    """Coarse to fine, and learning rates."""
+
+    start_levels: int = Field(4, ge=1, description="levels of the encoding in use at the start")
+    coarse_until: float = Field(0.4, ge=0, le=1, description="progress at which all levels are in use")
+    lr_table: float = Field(1e-2, gt=0, description="peak learning rate of the hash tables")
+    lr_network: float = Field(3e-3, gt=0, description="peak learning rate of the networks")
+    lr_warm_up: float = Field(0.02, ge=0, lt=1, description="progress at which the peak rate is reached")
+    lr_decay: Literal["cosine", "exponential"] = Field("cosine", description="how the rate falls after that")
+    lr_final: float = Field(0.03, gt=0, le=1, description="rate at the end as a part of the peak")
+    adam_beta2: float = Field(0.99, gt=0, lt=1, description="Adam's decay of the squared gradients")
+
+
+class LossParams(Section):
+    """What a step lowers besides the colour error, each by its weight."""
+
+    eikonal: float = Field(0.1, ge=0, description="weight of the Eikonal term")
+    mask: float = Field(0.1, ge=0, description="weight of the mask term, where masks exist")
+    exposure: float = Field(0.1, ge=0, description="weight that holds the photos' gains at 1")
+    sparse: float = Field(1.0, ge=0, description="weight of the SfM points' terms, faded out")
+    sparse_until: float = Field(0.8, ge=0, le=1, description="progress at which the SfM points' term is gone")
+    sparse_tolerance: float = Field(0.005, gt=0, description="SfM points off by this count linearly, scene units")
+    sparse_step: float = Field(
+        0.01, ge=0, description="the SDF must have changed sign this far before and behind SfM points, scene units"
+    )
+    sparse_batch: int = Field(256, ge=0, description="sightings of SfM points per step")
+
+
+class AmbiguityParams(Section):
+    """The paper's ambiguity weight: trust photos less where the others that see a place disagree with them."""
+
+    form: Literal["off", "paper", "stable"] = Field("off", description="off, as the paper writes it, or stable")
+    start: float = Field(0.2, ge=0, le=1, description="progress at which the stable form begins")
+    visibility: Literal["network", "paper", "stable", "mesh"] = Field(
+        "stable",
+        description="how it finds out which photos see a place: the paper's product over the SDF network or (`paper`) "
+        "over its cached grid, the smallest SDF on the path, or rays cast at a mesh",
+    )
+    sharpness: float = Field(100.0, gt=0, description="sigmoid sharpness beta of the visibility, per scene unit")
+    samples: int = Field(64, ge=2, description="samples on a path; the CPU's stable form traces instead")
+
+
+class ReflectionParams(Section):
+    """The paper's self-reflection: explain what a surface mirrors of the object itself by a second surface."""
+
+    form: Literal["off", "paper", "stable"] = Field("off", description="off, as the paper writes it, or stable")
+    start: float = Field(0.3, ge=0, le=1, description="progress at which the stable form begins")
+    reach: float = Field(0.1, gt=0, description="length t_max of reflected rays, scene units")
+    samples: int = Field(16, ge=2, description="samples on a reflected ray")
+    temperature: float = Field(
+        10.0, gt=0, description="the paper's form: inverse scale of its Laplace CDF, per scene unit"
+    )
+
+
+class PlanarParams(Section):
+    """The paper's planar term: hold the SDF to be linear around surface points of even appearance."""
+
+    form: Literal["off", "paper", "stable"] = Field("off", description="off, as the paper writes it, or stable")
+    weight: float = Field(1.0, ge=0, description="weight of the planar term")
+    features: Literal["radiance", "mlp"] = Field(
+        "radiance", description="appearance features: those the radiance MLP gets, or those of an MLP of its own"
+    )
+    scale_start: float = Field(0.1, gt=0, le=1, description="lambda_pla is scaled by this at the start and by 1 later")
+    scale_until: float = Field(1.0, gt=0, le=1, description="progress from which lambda_pla is not scaled down")
+    radius: float = Field(
+        0.05, gt=0, description="reach of the planar term at the start, scene units; three voxels at the end"
+    )
+    rays: int = Field(256, ge=1, description="rays per step that the planar term looks at")
+    neighbors: int = Field(4, ge=1, description="places around each of their surface points")
+
+
+class EikonalParams(Section):
+    """The paper's relaxed Eikonal term: hold the SDF's gradient to length 1 less where the photos are not met yet."""
+
+    form: Literal["plain", "paper", "stable"] = Field(
+        "plain", description="evenly held everywhere, relaxed as the paper writes it, or stable"
+    )
+    gamma: float = Field(5.0, ge=0, description="how fast colour error relaxes the Eikonal term")
+    clip: float = Field(0.2, gt=0, description="colour error from which it relaxes no further")
+
+
+class TermParams(Section):
+    """The paper's terms, each off by default."""
+
+    ambiguity: AmbiguityParams = AmbiguityParams()
+    reflection: ReflectionParams = ReflectionParams()
+    planar: PlanarParams = PlanarParams()
+    eikonal: EikonalParams = EikonalParams()
+
+
+class TrainParams(Section):
+    """Posed images to a neural signed distance field."""
+
+    steps: int = Field(8000, ge=1, description="optimiser steps (ignored where `minutes` is set)")
+    minutes: float | None = Field(None, gt=0, description="wall-clock budget in minutes instead of steps")
+    seed: int = Field(0, ge=0, description="random seed")
+    hold_out: int = Field(
+        0,
+        ge=0,
+        description="hold every n-th photo out of training and texture, and report the PSNR on those; 0: none",
+    )
+    preview_every: float = Field(0.25, gt=0, le=1, description="progress between preview renders")
+    precision: Literal["auto", "float32", "mixed"] = Field(
+        "auto",
+        description="matrix products of the networks: float32, or bfloat16 for colours and, on CUDA, TF32 for the "
+        "distance; auto: mixed on CUDA only, from Ampere on",
+    )
+    backbone: Literal["hineus", "neus2", "hfneus", "neuralangelo"] = Field(
+        "hineus", description="set density, gradients, encoding and schedules as that method does; what is named wins"
+    )
+
+    field: FieldParams = FieldParams()
+    density: DensityParams = DensityParams()
+    sampling: SamplingParams = SamplingParams()
+    schedule: ScheduleParams = ScheduleParams()
+    losses: LossParams = LossParams()
+    terms: TermParams = TermParams()

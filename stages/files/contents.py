@@ -1,0 +1,42 @@
+"""What every textured file holds: one mesh, its arrays checked, and the images of one material."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+ROUGHNESS = 0.9
+
+
+@dataclass(frozen=True)
+class Textures:
+    """The images of one material, each as the bytes of a PNG, row 0 at v = 1.
+
+    Attributes:
+        base_color: sRGB.
+        normal: tangent-space normals, +Y up, or None.
+        occlusion: grey, 255 where all is open to light, or None.
+    """
+
+    base_color: bytes
+    normal: bytes | None = None
+    occlusion: bytes | None = None
+
+
+def checked_mesh(
+    vertices: np.ndarray, normals: np.ndarray, uvs: np.ndarray, faces: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """The arrays as float32 and uint32; wrong ones are refused."""
+    num = len(vertices)
+    if normals.shape != (num, 3) or uvs.shape != (num, 2):
+        raise ValueError(f"expected normals [{num}, 3] and uvs [{num}, 2], got {normals.shape} and {uvs.shape}")
+    if not len(faces) or faces.min() < 0 or faces.max() >= num:
+        raise ValueError(f"expected at least one face with vertices in [0, {num}), got {faces.shape[0]} faces")
+    arrays = [np.ascontiguousarray(array, dtype=np.float32) for array in (vertices, normals, uvs)]
+    if not all(np.isfinite(array).all() for array in arrays):
+        raise ValueError("expected finite vertices, normals and uvs")
+    lengths = np.linalg.norm(arrays[1], axis=1)
+    if np.abs(lengths - 1).max() > 1e-3:
+        raise ValueError(f"expected unit normals, got lengths in [{lengths.min():.3g}, {lengths.max():.3g}]")
+    return arrays[0], arrays[1], arrays[2], np.ascontiguousarray(faces, dtype=np.uint32)

@@ -1,0 +1,156 @@
+"""GLB, binary glTF 2.0: a textured mesh, or bare shapes. Arrays in, bytes out."""
+
+from __future__ import annotations
+
+import json
+import struct
+from typing import Any
+
+import numpy as np
+
+from stages.files.contents import ROUGHNESS, Textures, checked_mesh
+from stages.texture.tangents import vertex_tangents
+
+_FLOAT, _UINT = 5126, 5125
+_ARRAY_BUFFER, _ELEMENT_ARRAY_BUFFER = 34962, 34963
+# Linear, with mip-maps where it shrinks, clamped at the edges.
+_SAMPLER = {"magFilter": 9729, "minFilter": 9987, "wrapS": 33071, "wrapT": 33071}
+
+
+def glb_bytes(
+    vertices: np.ndarray,
+    normals: np.ndarray,
+    uvs: np.ndarray,
+    faces: np.ndarray,
+    textures: Textures,
+    name: str = "model",
+    generator: str = "hineus",
+    extras: dict[str, Any] | None = None,
+) -> bytes:
+    """A binary glTF 2.0 file with one mesh and one PBR material (metallic 0, roughness `ROUGHNESS`).
+
+    Written by hand so that every field is chosen here (buffer targets, sampler, extras, the PNG's own
+    bytes): the format is two chunks, JSON and a binary blob (glTF 2.0 specification, section 4). With a normal map
+    goes the frame it was baked for, as TANGENT.
+
+    Args:
+        vertices: [V, 3] in a right-handed, Y-up frame.
+        normals: [V, 3] unit.
+        uvs: [V, 2], origin at the bottom-left (turned to glTF's top-left here).
+        faces: [F, 3], counter-clockwise seen from outside.
+        textures: of the material.
+        extras: JSON-able, kept in the asset's extras.
+
+    Raises:
+        ValueError: an index is out of range, a normal is not unit or a number is not finite.
+    """
+    vertices, normals, uvs, faces = checked_mesh(vertices, normals, uvs, faces)
+    flipped = uvs.copy()
+    flipped[:, 1] = 1 - flipped[:, 1]
+    bounds = {"min": vertices.min(0).tolist(), "max": vertices.max(0).tolist()}
+    buffer = _GlbBuffer()
+    attributes = {
+        "POSITION": buffer.add_numbers(vertices, "VEC3", **bounds),
+        "NORMAL": buffer.add_numbers(normals, "VEC3"),
+        "TEXCOORD_0": buffer.add_numbers(flipped, "VEC2"),
+    }
+    if textures.normal is not None:
+        attributes["TANGENT"] = buffer.add_numbers(vertex_tangents(vertices, normals, uvs, faces), "VEC4")
+    indices = buffer.add_numbers(faces.ravel(), "SCALAR", _ELEMENT_ARRAY_BUFFER)
+    material: dict[str, Any] = {
+        "name": name,
+        "pbrMetallicRoughness": {
+            "baseColorTexture": {"index": buffer.add_image(textures.base_color, "base_color")},
+            "metallicFactor": 0.0,
+            "roughnessFactor": ROUGHNESS,
+        },
+    }
+    if textures.normal is not None:
+        material["normalTexture"] = {"index": buffer.add_image(textures.normal, "normal")}
+    if textures.occlusion is not None:
+        material["occlusionTexture"] = {"index": buffer.add_image(textures.occlusion, "occlusion")}
+    primitive = {"attributes": attributes, "indices": indices, "material": 0}
+    return buffer.file(
+        [{"name": name, "primitives": [primitive]}],
+        generator,
+        extras,
+        materials=[material],
+        textures=[{"source": k, "sampler": 0} for k in range(len(buffer.images))],
+        samplers=[_SAMPLER],
+        images=buffer.images,
+    )
+
+
+def shapes_glb_bytes(
+    shapes: dict[str, tuple[np.ndarray, np.ndarray]],
+    generator: str = "hineus",
+    extras: dict[str, Any] | None = None,
+) -> bytes:
+    """A binary glTF 2.0 file of bare shapes: a node and a mesh for each name, without normals and material.
+
+    Args:
+        shapes: name -> vertices [V, 3] in a right-handed, Y-up frame, and faces [F, 3], counter-clockwise from outside.
+        extras: JSON-able, kept in the asset's extras.
+    """
+    buffer = _GlbBuffer()
+    meshes = []
+    for name, (vertices, faces) in shapes.items():
+        points = np.ascontiguousarray(vertices, dtype=np.float32)
+        bounds = {"min": points.min(0).tolist(), "max": points.max(0).tolist()}
+        position = buffer.add_numbers(points, "VEC3", **bounds)
+        indices = buffer.add_numbers(faces.ravel().astype(np.uint32), "SCALAR", _ELEMENT_ARRAY_BUFFER)
+        meshes.append({"name": name, "primitives": [{"attributes": {"POSITION": position}, "indices": indices}]})
+    return buffer.file(meshes, generator, extras)
+
+
+class _GlbBuffer:
+    """The binary chunk as it grows, and the JSON that says what lies where in it."""
+
+    def __init__(self) -> None:
+        self.data = bytearray()
+        self.views: list[dict[str, Any]] = []
+        self.accessors: list[dict[str, Any]] = []
+        self.images: list[dict[str, Any]] = []
+
+    def add_numbers(self, array: np.ndarray, kind: str, target: int = _ARRAY_BUFFER, **bounds: list[float]) -> int:
+        """Index of the new accessor of `array`, float32 or uint32, of elements `kind`."""
+        self._add(array.tobytes(), {"target": target})
+        component = _UINT if array.dtype == np.uint32 else _FLOAT
+        accessor = {"bufferView": len(self.views) - 1, "componentType": component, "count": len(array), "type": kind}
+        self.accessors.append({**accessor, **bounds})
+        return len(self.accessors) - 1
+
+    def add_image(self, png: bytes, name: str) -> int:
+        """Index of the new image, which is also its texture's."""
+        self._add(png, {})
+        self.images.append({"bufferView": len(self.views) - 1, "mimeType": "image/png", "name": name})
+        return len(self.images) - 1
+
+    def _add(self, blob: bytes, how: dict[str, int]) -> None:
+        self.views.append({"buffer": 0, "byteOffset": len(self.data), "byteLength": len(blob), **how})
+        self.data += blob + b"\0" * (-len(blob) % 4)
+
+    def file(
+        self,
+        meshes: list[dict[str, Any]],
+        generator: str,
+        extras: dict[str, Any] | None,
+        **tables: list[Any],
+    ) -> bytes:
+        """The file: a JSON chunk, with a node for each mesh, and a binary one, each of a multiple of four bytes."""
+        tree = {
+            "asset": {"version": "2.0", "generator": generator, **({"extras": extras} if extras else {})},
+            "scene": 0,
+            "scenes": [{"nodes": list(range(len(meshes)))}],
+            "nodes": [{"mesh": k, "name": mesh["name"]} for k, mesh in enumerate(meshes)],
+            "meshes": meshes,
+            **tables,
+            "accessors": self.accessors,
+            "bufferViews": self.views,
+            "buffers": [{"byteLength": len(self.data)}],
+        }
+        text = json.dumps(tree, separators=(",", ":"), allow_nan=False).encode()
+        text += b" " * (-len(text) % 4)
+        head = struct.pack("<4sII", b"glTF", 2, 12 + 8 + len(text) + 8 + len(self.data))
+        chunks = struct.pack("<I4s", len(text), b"JSON"), text, struct.pack("<I4s", len(self.data), b"BIN\0"), self.data
+        return b"".join([head, *chunks])

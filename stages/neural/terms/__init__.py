@@ -1,0 +1,68 @@
+"""The paper's terms: one file each, with its equations, its paper form, its stable form and when it counts.
+
+To add one: its file here, its settings in `configs/training.py`, its name in `KINDS`. `docs/math.md` says how the forms
+differ and why.
+
+Shapes: R rays, K samples a ray, N = R K points.
+"""
+
+from __future__ import annotations
+
+import torch
+
+from configs.training import TrainParams
+from stages.neural.fields import Fields
+from stages.neural.rendered import Rendered
+from stages.neural.sampling import SdfCache
+from stages.neural.schedules import Moment
+from stages.neural.terms.ambiguity import Ambiguity
+from stages.neural.terms.eikonal import Eikonal
+from stages.neural.terms.planar import Planar
+from stages.neural.terms.reflection import Reflection
+from stages.neural.terms.term import Term
+from stages.neural.training_photos import Photos
+
+KINDS: tuple[type[Term], ...] = (Ambiguity, Reflection, Planar, Eikonal)
+
+
+class Terms:
+    """All terms on a batch; see `Term` for what each may do."""
+
+    def __init__(
+        self,
+        fields: Fields,
+        cache: SdfCache,
+        params: TrainParams,
+        photos: Photos | None = None,
+        generator: torch.Generator | None = None,
+    ) -> None:
+        self.all = tuple(kind(fields, cache, params, photos, generator) for kind in KINDS)
+
+    def recolored(self, rendered: Rendered, moment: Moment, generator: torch.Generator | None) -> Rendered:
+        """The rays with the colours that they have by all terms."""
+        for term in self.all:
+            rendered = term.recolored(rendered, moment, generator)
+        return rendered
+
+    def color_weight(self, rendered: Rendered, exposed: torch.Tensor, moment: Moment) -> torch.Tensor:
+        """Weight [R] of each ray's colour error."""
+        weight = torch.ones_like(rendered.batch.leave)
+        for term in self.all:
+            if (factor := term.color_weight(rendered, exposed, moment)) is not None:
+                weight = weight * factor
+        return weight
+
+    def eikonal_weight(
+        self, rendered: Rendered, ray_error: torch.Tensor, trust: torch.Tensor, moment: Moment
+    ) -> torch.Tensor:
+        """Weight [N] of the Eikonal error at the samples."""
+        weight = torch.ones_like(rendered.weights).view(-1)
+        for term in self.all:
+            if (factor := term.eikonal_weight(rendered, ray_error, trust, moment)) is not None:
+                weight = weight * factor
+        return weight
+
+    def losses(self, rendered: Rendered, moment: Moment) -> dict[str, tuple[float, torch.Tensor]]:
+        """Weight and loss of each term that has one, by name."""
+        found = ((term, term.loss(rendered, moment)) for term in self.all)
+        return {term.name: (term.weight, loss) for term, loss in found if loss is not None}

@@ -1,0 +1,141 @@
+"""Which faces of a raw mesh are kept: by place, by piece, by what cameras see, and by masks.
+
+Selections are boolean arrays over faces [F] or vertices [V].
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+
+import numpy as np
+
+from stages.geometry.cameras import PinholeCameras
+from stages.surface.triangle_mesh import MAX_RAYS, face_adjacency, face_areas, label_pieces, raycaster, vertex_normals
+
+# A face seen flatter than this (cosine) counts as unseen: no photo says anything of it.
+MIN_COSINE = 0.05
+
+
+def inside_ball(vertices: np.ndarray, faces: np.ndarray, radius: float) -> np.ndarray:
+    """Faces [F] bool with all corners within `radius` of the origin."""
+    return (np.linalg.norm(vertices, axis=1) <= radius)[faces].all(1)
+
+
+def large_pieces(faces: np.ndarray, min_part: float) -> tuple[np.ndarray, int]:
+    """Faces [F] bool of pieces with at least `min_part` of the largest piece's faces, and how many pieces go."""
+    labels = label_pieces(len(faces), face_adjacency(faces))
+    sizes = np.bincount(labels)
+    keep = sizes >= min_part * sizes.max(initial=0)
+    return keep[labels], int(np.count_nonzero(~keep))
+
+
+def whole_pieces(faces: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+    """Faces [F] bool of the pieces of which any face is chosen [F]: a closed mesh stays closed."""
+    pieces = label_pieces(len(faces), face_adjacency(faces))
+    return np.bincount(pieces, chosen)[pieces] > 0
+
+
+def count_views(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    cameras: PinholeCameras,
+    enough: int,
+    progress: Callable[[int, int], None] | None = None,
+) -> np.ndarray:
+    """In how many cameras' images each vertex [V] shows, counted up to `enough`.
+
+    A vertex shows if it projects into the image, faces the camera and the way there is free. One ray per vertex and
+    camera, so no face is too small to be found; each vertex tries the cameras it faces best first, and stops early.
+    """
+    import open3d as o3d
+
+    scene = raycaster(vertices, faces)
+    normals = vertex_normals(vertices, faces)
+    edges = vertices[faces] - vertices[np.roll(faces, 1, axis=1)]
+    # The ray starts this far off the surface, or the faces around the vertex would hide it.
+    offset = 0.5 * float(np.median(np.linalg.norm(edges, axis=2)))
+    starts = (vertices + offset * normals).astype(np.float32)
+
+    cosines = np.full((len(vertices), len(cameras)), -1.0, dtype=np.float32)
+    for i, center in enumerate(cameras.centers):
+        to_camera = center - vertices
+        cosine = np.einsum("vi,vi->v", to_camera, normals) / np.linalg.norm(to_camera, axis=1)
+        cosines[:, i] = np.where(cameras.in_frame(i, vertices), cosine, -1)
+
+    views = np.zeros(len(vertices), dtype=np.int64)
+    open_vertices = np.arange(len(vertices))
+    for rank in range(len(cameras)):
+        # The best camera left: most vertices need one or two, so that sorting all of them would be a waste.
+        camera = cosines[open_vertices].argmax(1)
+        facing = cosines[open_vertices, camera] > MIN_COSINE
+        open_vertices, camera = open_vertices[facing], camera[facing]
+        cosines[open_vertices, camera] = -1
+        for begin in range(0, len(open_vertices), MAX_RAYS):
+            part = slice(begin, begin + MAX_RAYS)
+            index = open_vertices[part]
+            # Not normalised: the camera is at distance 1, whatever lies before it hides the vertex.
+            direction = cameras.centers[camera[part]] - starts[index]
+            rays = np.concatenate([starts[index], direction], axis=1).astype(np.float32)
+            hidden = scene.test_occlusions(o3d.core.Tensor(rays), tnear=0.0, tfar=0.999).numpy()
+            views[index[~hidden]] += 1
+        open_vertices = open_vertices[views[open_vertices] < enough]
+        if progress is not None:
+            progress(rank + 1, len(cameras))
+        if not len(open_vertices):
+            break
+    return views
+
+
+def spread(faces: np.ndarray, num_vertices: int, chosen: np.ndarray, rings: int) -> np.ndarray:
+    """The chosen faces [F] bool and those within `rings` steps over shared vertices."""
+    for _ in range(rings):
+        near = np.zeros(num_vertices, dtype=bool)
+        near[faces[chosen]] = True
+        chosen = near[faces].any(1)
+    return chosen
+
+
+def smooth_selection(faces: np.ndarray, num_vertices: int, chosen: np.ndarray, rings: int) -> np.ndarray:
+    """A selection of faces [F] bool without notches narrower than `rings` faces: spread, then shrunk back."""
+    grown = spread(faces, num_vertices, chosen, rings)
+    return chosen | ~spread(faces, num_vertices, ~grown, rings)
+
+
+def fill_small_gaps(vertices: np.ndarray, faces: np.ndarray, chosen: np.ndarray, max_area: float) -> np.ndarray:
+    """The chosen faces [F] bool, and the regions of others that touch them and are no larger than `max_area`."""
+    adjacency = face_adjacency(faces)
+    same = ~chosen[adjacency].any(1)
+    labels = label_pieces(len(faces), adjacency, same)
+    region_area = np.bincount(labels, face_areas(vertices, faces))
+    touches = np.zeros(len(region_area), dtype=bool)
+    border = chosen[adjacency[:, 0]] != chosen[adjacency[:, 1]]
+    touches[labels[adjacency[border]].ravel()] = True
+    return chosen | (touches & (region_area <= max_area))[labels]
+
+
+def outside_hull(
+    vertices: np.ndarray,
+    cameras: PinholeCameras,
+    masks: Iterable[tuple[int, np.ndarray]],
+    max_part: float,
+    min_views: int = 2,
+) -> np.ndarray:
+    """Vertices [V] bool outside the visual hull of silhouettes.
+
+    Args:
+        vertices: [V, 3].
+        masks: camera index and [H, W] bool mask, true on the object (widened by the caller's tolerance).
+        max_part: a vertex is outside if it lies off the mask in more than this part of the images it falls into,
+        min_views: and in at least this many of them: one bad mask must not cut the object.
+    """
+    seen = np.zeros(len(vertices), dtype=np.int64)
+    off = np.zeros(len(vertices), dtype=np.int64)
+    for index, mask in masks:
+        pixels, depth = cameras.project(index, vertices)
+        height, width = mask.shape
+        with np.errstate(invalid="ignore"):
+            column, row = np.floor(pixels).astype(np.int64).T
+        inside = (depth > 0) & (column >= 0) & (row >= 0) & (column < width) & (row < height)
+        seen += inside
+        off[inside] += ~mask[row[inside], column[inside]]
+    return (off > max_part * seen) & (off >= np.minimum(min_views, np.maximum(seen, 1)))
