@@ -14,7 +14,8 @@ from stages.engine.runner import Listener
 from stages.engine.stage import Stage
 from stages.errors import InputError
 from stages.evaluation.protocols.known_object import score_mesh
-from stages.reconstruct import Reconstruction, Request, reconstruct
+from stages.reconstruct import Reconstruction, reconstruct
+from stages.request import Request
 from stages.scenes.demo_photos import PHOTOS, make_demo_photos, photos_are_complete
 
 log = logging.getLogger(__name__)
