@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import typer
 
 from stages.errors import ConfigError
-from stages.reconstruct import HOLD_OUT, Request
+from stages.request import HOLD_OUT, Request
 
 _TIME = re.compile(r"^(?:(?P<h>[\d.]+)h)?(?:(?P<m>[\d.]+)m(?:in)?)?(?:(?P<s>[\d.]+)s)?$")
 

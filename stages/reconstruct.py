@@ -21,41 +21,9 @@ from stages.engine.workspace import Workspace
 from stages.errors import ConfigError, InputError, SystemRequirementError
 from stages.posing.reading import locate_poses, masks_beside
 from stages.preflight import Preflight, in_short, preflight
+from stages.request import Request
 
 log = logging.getLogger(__name__)
-
-HOLD_OUT = "train.hold_out"  # the setting that keeps every n-th photo back
-
-
-@dataclass(frozen=True)
-class Request:
-    """What the user asked for; None is "not said".
-
-    Attributes:
-        photos: folder of photos, or a video; a workspace that was run before knows its own.
-        workspace: folder; default `<photos' name>_hineus` here.
-        masks: folder of masks; kept from the last run while the photos are the same, unless `no_masks`.
-        poses: file or folder of known poses; kept like the masks, unless `no_poses`.
-        preset, config, sets: layers of settings. With neither preset nor config, a workspace keeps its own.
-        from_stage, until, force: see `run_pipeline`.
-        device: "auto", "cpu" or "cuda".
-        workers: CPU threads; default all that this process may use.
-    """
-
-    photos: Path | None = None
-    workspace: Path | None = None
-    masks: Path | None = None
-    no_masks: bool = False
-    poses: Path | None = None
-    no_poses: bool = False
-    preset: str | None = None
-    config: Path | None = None
-    sets: Sequence[str] = ()
-    from_stage: str | None = None
-    until: str | None = None
-    force: Sequence[str] = ()
-    device: str = "auto"
-    workers: int | None = None
 
 
 @dataclass(frozen=True)
@@ -83,11 +51,11 @@ class Reconstruction:
 
     @property
     def glb(self) -> Path | None:
-        return _existing(artifacts.glb_path(self.workspace.stage_folder("export")))
+        return _existing(artifacts.asset_path(self.workspace.stage_folder("export"), "glb"))
 
     @property
     def report(self) -> Path | None:
-        return _existing(artifacts.report_path(self.workspace.stage_folder("report")))
+        return _existing(artifacts.PAGE.load(self.workspace.stage_folder("report")))
 
 
 def reconstruct(request: Request, pipeline: Sequence[Stage], listener: Listener | None = None) -> Reconstruction:

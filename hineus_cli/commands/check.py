@@ -21,6 +21,7 @@ from hineus_cli.options import (
 )
 from hineus_cli.session import print_json
 from stages.errors import InputError, SystemRequirementError
+from stages.request import Request
 
 
 def check(
@@ -37,7 +38,7 @@ def check(
     as_json: Json = False,
 ) -> None:
     """A quick look before a run: are these photos good, and what will they take? Exits with 0 unless it is no-go."""
-    from stages.reconstruct import Request, check_photos
+    from stages.reconstruct import check_photos
 
     request = Request(
         photos=photos,

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from hineus_cli.options import Json, Until, Verbose, with_options_of_a_run
 from hineus_cli.session import Session, print_json
 from stages.engine.stage import Stage
-from stages.reconstruct import Reconstruction, Request, choose_folder, reconstruct
+from stages.request import Request
+
+if TYPE_CHECKING:
+    from stages.reconstruct import Reconstruction
 
 
 @with_options_of_a_run
@@ -50,6 +53,8 @@ def stage_command(stage: Stage) -> Callable[..., None]:
 
 
 def _run(session: Session, request: Request, verbose: bool) -> None:
+    from stages.reconstruct import choose_folder, reconstruct
+
     session.log_path = choose_folder(request).absolute() / "hineus.log"
     with session.running(verbose) as progress:
         result = reconstruct(request, session.pipeline, progress)

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from configs.dotted import flatten
 from stages.errors import InputError
 
 CHUNK_BYTES = 1 << 20
@@ -68,7 +69,7 @@ class Identity:
         changes = []
         if before.version != self.version:
             changes.append(f"stage version {before.version} -> {self.version}")
-        changes += _setting_changes(flatten(before.params, self.stage), flatten(self.params, self.stage))
+        changes += _setting_changes(*(flatten(each.params, f"{self.stage}.") for each in (before, self)))
         for name in sorted({*before.sources, *self.sources}):
             changes += _source_changes(name, before.sources.get(name), self.sources.get(name))
         for name in sorted({*before.inputs, *self.inputs}):
@@ -124,18 +125,6 @@ def _source_changes(name: str, before: FileDigests | None, now: FileDigests | No
 
 def _shown(value: Any) -> str:
     return value if isinstance(value, str) else json.dumps(value)
-
-
-def flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested mappings as one level with dotted keys."""
-    flat: dict[str, Any] = {}
-    for key, value in values.items():
-        dotted = f"{prefix}.{key}" if prefix else str(key)
-        if isinstance(value, Mapping) and value:
-            flat.update(flatten(value, dotted))
-        else:
-            flat[dotted] = value
-    return flat
 
 
 def digest(value: Any) -> str:

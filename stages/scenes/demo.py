@@ -14,7 +14,8 @@ from stages.engine.runner import Listener
 from stages.engine.stage import Stage
 from stages.errors import InputError
 from stages.evaluation.protocols.known_object import score_mesh
-from stages.reconstruct import Reconstruction, Request, reconstruct
+from stages.reconstruct import Reconstruction, reconstruct
+from stages.request import Request
 from stages.scenes.demo_photos import PHOTOS, make_demo_photos, photos_are_complete
 
 log = logging.getLogger(__name__)
@@ -81,13 +82,13 @@ def run_demo(
         workers=workers,
     )
     result = reconstruct(request, pipeline, listener)
-    ply = artifacts.ply_path(result.workspace.stage_folder("export"))
+    ply = artifacts.asset_path(result.workspace.stage_folder("export"), "ply")
     if not ply.exists():
         raise InputError(
             f"Preset {preset} writes no PLY file, which the score needs.",
             "Try `hineus demo --preset demo`.",
         )
-    score = score_mesh(ply, artifacts.model_path(result.workspace.stage_folder("sfm")), folder)
+    score = score_mesh(ply, artifacts.MODEL.load(result.workspace.stage_folder("sfm")), folder)
     artifacts.write_json(folder / SCORE, score)
     return Demo(result, score, time.monotonic() - started)
 

@@ -32,7 +32,8 @@ from stages.evaluation.suites.scene import SuiteScene, Wanted
 from stages.evaluation.suites.scores import posed_mesh, result_mesh, score_result
 from stages.export_poses import export_poses
 from stages.posing.exporting import write_colmap
-from stages.reconstruct import Reconstruction, Request, default_preset, reconstruct
+from stages.reconstruct import Reconstruction, default_preset, reconstruct
+from stages.request import Request
 
 log = logging.getLogger(__name__)
 
