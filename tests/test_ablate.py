@@ -324,6 +324,7 @@ def test_the_mesh_is_scored_in_the_world_frame(here, monkeypatch):
     assert seen["model"] == here / "shared" / "sfm" / "model"
 
 
+@pytest.mark.slow
 def test_a_scene_without_sparse_points_trains(tmp_path):
     from rigs import scene_without_points
     from sphere_scene import ring_of_cameras, write_undistorted

@@ -99,6 +99,7 @@ def test_no_texel_is_claimed_twice(layout):
     assert (count == 1).mean() > 0.3
 
 
+@pytest.mark.slow
 def test_charts_keep_their_distance(layout):
     from scipy.ndimage import distance_transform_edt
 

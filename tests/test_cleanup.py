@@ -362,6 +362,7 @@ def test_stage_removes_the_ground_on_request(stage, keep_closed):
     assert numbers["watertight"] == keep_closed
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("cut", "params"),
     [
