@@ -2,7 +2,8 @@
 
 The one camera convention of the project: OpenCV axes (x right, y down, z forward), pixel centres at .5 (the
 top-left corner of the image is (0, 0)), matrices named target_from_source. Three frames: "poses", in which the
-cameras were found or given; "world", that of the results; "scene", normalised: the region of interest is the unit sphere.
+cameras were found or given; "world", that of the results; "scene", normalised: the region of interest is the unit
+sphere.
 """
 
 from __future__ import annotations
