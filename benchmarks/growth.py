@@ -139,7 +139,7 @@ def big_training() -> tuple[float, int]:
         tuple(f"{i:03}.png" for i in range(BIG_PHOTOS)),
         np.tile(BIG_SIZE, (BIG_PHOTOS, 1)),
         heap.intrinsics[chosen] * np.array([larger, larger, 1.0])[:, None],
-        heap.cam_from_scene[chosen],
+        heap.extrinsics[chosen],
     )
     noise = np.random.default_rng(0)
     images = (noise.integers(0, 255, (BIG_SIZE[1], BIG_SIZE[0], 3), dtype=np.uint8) for _ in range(BIG_PHOTOS))

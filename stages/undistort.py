@@ -29,7 +29,7 @@ from stages.artifacts import (
 from stages.engine.stage import Stage, StageContext
 from stages.errors import ReconstructionError
 from stages.geometry.cameras import PinholeCameras, PosedScene
-from stages.geometry.normalisation import into_scene, scene_frame
+from stages.geometry.normalisation import into_frame, scene_frame
 from stages.geometry.overview import overview_svg
 from stages.geometry.place import GivenRegion
 from stages.geometry.plane import Plane, find_ground
@@ -68,7 +68,7 @@ def run(context: StageContext[UndistortParams]) -> dict[str, Any]:
     region, ground, up = _find_region(cameras, points, masks, stated, given, context.params.roi_scale)
     poses_from_scene = scene_frame(region.center, region.radius, up.direction)
     scene = PosedScene(
-        cameras=into_scene(cameras, poses_from_scene),
+        cameras=into_frame(cameras, poses_from_scene),
         poses_from_scene=poses_from_scene,
         points=poses_from_scene.inverse().apply(points).astype(np.float32),
         point_errors=errors,

@@ -30,7 +30,7 @@ def capture(poses: list[np.ndarray], size: tuple[int, int] = (640, 480), focal: 
         names=tuple(f"{i:03d}.png" for i in range(len(poses))),
         sizes=np.array([size] * len(poses)),
         intrinsics=np.stack([K] * len(poses)),
-        cam_from_scene=np.stack(poses),
+        extrinsics=np.stack(poses),
     )
 
 
@@ -83,7 +83,7 @@ def three_rings(
         names=tuple(f"{i:02d}.png" for i in range(count)),
         sizes=np.full((count, 2), size),
         intrinsics=np.repeat(K[None], count, 0),
-        cam_from_scene=np.array(extrinsics),
+        extrinsics=np.array(extrinsics),
     )
 
 

@@ -36,7 +36,7 @@ def write_mask(path: Path, index: int) -> None:
 
 def pose(index: int) -> np.ndarray:
     """[4, 4] camera from world."""
-    return np.vstack([cameras().cam_from_scene[index], [0, 0, 0, 1]])
+    return np.vstack([cameras().extrinsics[index], [0, 0, 0, 1]])
 
 
 def world_from_gl(index: int) -> np.ndarray:

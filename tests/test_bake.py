@@ -115,12 +115,12 @@ def ring(count=8, elevations=(0.5,), distance=2.6, side=160) -> PinholeCameras:
         tuple(f"{i}.png" for i in range(len(views))),
         np.concatenate([v.sizes for v in views]),
         np.concatenate([v.intrinsics for v in views]),
-        np.concatenate([v.cam_from_scene for v in views]),
+        np.concatenate([v.extrinsics for v in views]),
     )
 
 
 def first(cameras: PinholeCameras) -> PinholeCameras:
-    return PinholeCameras(cameras.names[:1], cameras.sizes[:1], cameras.intrinsics[:1], cameras.cam_from_scene[:1])
+    return PinholeCameras(cameras.names[:1], cameras.sizes[:1], cameras.intrinsics[:1], cameras.extrinsics[:1])
 
 
 def constant_field(points, normals, view_dirs):
@@ -303,7 +303,7 @@ def test_an_occluder_leaves_no_trace_behind_it():
     views = [look_at(np.array(e), np.zeros(3), Z, 160, 160, 40) for e in eyes]
     cameras = PinholeCameras(
         tuple(map(str, range(len(views)))),
-        *(np.concatenate([getattr(v, key) for v in views]) for key in ("sizes", "intrinsics", "cam_from_scene")),
+        *(np.concatenate([getattr(v, key) for v in views]) for key in ("sizes", "intrinsics", "extrinsics")),
     )
     photos = [photograph(mesh, cameras, i, paint) for i in range(len(cameras))]
     result = bake(mesh, cameras, photos)

@@ -54,7 +54,7 @@ def context(tmp_path, monkeypatch) -> StageContext:
         ("one.png", "sub/two.png"),
         np.concatenate([view.sizes for view in views]),
         np.concatenate([view.intrinsics for view in views]),
-        np.concatenate([view.cam_from_scene for view in views]),
+        np.concatenate([view.extrinsics for view in views]),
     )
     artifacts.SCENE.save(folders["undistort"], scene_without_points(cameras))
     for name in cameras.names:

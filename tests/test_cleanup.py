@@ -95,7 +95,7 @@ def test_views_are_counted_up_to_enough():
 def test_what_lies_outside_the_image_is_not_seen():
     vertices, faces = ball()
     cameras = three_rings(count=1, elevations=(0,))
-    narrow = PinholeCameras(cameras.names, np.array([[SIZE // 2, SIZE]]), cameras.intrinsics, cameras.cam_from_scene)
+    narrow = PinholeCameras(cameras.names, np.array([[SIZE // 2, SIZE]]), cameras.intrinsics, cameras.extrinsics)
     seen = selection.count_views(vertices, faces, narrow, enough=1) > 0
     pixels, _ = cameras.project(0, vertices)
     assert seen.any()

@@ -11,7 +11,7 @@ from stages.errors import InputError
 from stages.evaluation.protocols.known_object import KnownObject, score_surface, seen_surface
 from stages.evaluation.surfaces import sample_faces
 from stages.geometry.cameras import PinholeCameras
-from stages.geometry.normalisation import into_scene
+from stages.geometry.normalisation import into_frame
 from stages.geometry.similarity import Similarity, align_points
 
 trimesh = pytest.importorskip("trimesh")
@@ -34,7 +34,7 @@ def _known_sphere(centers):
         names=tuple(f"photos/{i:03d}.jpg" for i in range(len(centers))),
         sizes=np.array([(120, 90)] * len(centers)),
         intrinsics=np.array([[[120.0, 0, 60], [0, 120, 45], [0, 0, 1]]] * len(centers)),
-        cam_from_scene=np.stack([_look_at_origin(center)[:3] for center in centers]),
+        extrinsics=np.stack([_look_at_origin(center)[:3] for center in centers]),
     )
     return KnownObject(np.asarray(sphere.vertices), np.asarray(sphere.faces), cameras)
 
@@ -64,7 +64,7 @@ def test_a_swollen_sphere_is_off_by_the_swelling(known):
 
 
 def test_the_score_is_relative_to_the_extent(known):
-    large = KnownObject(10 * known.vertices, known.faces, into_scene(known.cameras, SHRUNK))
+    large = KnownObject(10 * known.vertices, known.faces, into_frame(known.cameras, SHRUNK))
     score = score_surface(10.4 * known.vertices, known.faces, large, samples=60_000)
     assert score.accuracy == pytest.approx(2.0, abs=0.05)
 
@@ -147,7 +147,7 @@ def test_score_mesh_reads_files_and_undoes_the_models_frame(tmp_path, known):
     trimesh.Trimesh(known.vertices, known.faces, process=False).export(tmp_path / "gt_mesh.ply")
     moved = model_from_world.apply(1.04 * known.vertices)
     trimesh.Trimesh(moved, known.faces, process=False).export(tmp_path / "model.ply")
-    poses = np.concatenate([known.cameras.cam_from_scene, [[[0, 0, 0, 1.0]]] * len(known.cameras)], 1)
+    poses = np.concatenate([known.cameras.extrinsics, [[[0, 0, 0, 1.0]]] * len(known.cameras)], 1)
     opengl = np.diag([1.0, -1, -1, 1])
     frames = [
         {"file_path": name, "transform_matrix": (np.linalg.inv(pose) @ opengl).tolist()}

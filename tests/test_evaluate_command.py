@@ -52,7 +52,7 @@ def cameras_around(count: int = 6, size: int = 64, distance: float = 4.0) -> Pin
     found = [look_at(eye, np.zeros(3), np.array([0.0, 0, 1]), size, size, 40) for eye in eyes]
     return PinholeCameras(
         tuple(f"{i + 1:06}.png" for i in range(count)),
-        *(np.concatenate([getattr(one, name) for one in found]) for name in ("sizes", "intrinsics", "cam_from_scene")),
+        *(np.concatenate([getattr(one, name) for one in found]) for name in ("sizes", "intrinsics", "extrinsics")),
     )
 
 
@@ -63,7 +63,7 @@ def write_transforms(path: Path, cameras: PinholeCameras, matrix: np.ndarray | N
     frames = []
     for i, name in enumerate(cameras.names):
         pose = np.eye(4)
-        pose[:3, :3] = turn @ cameras.cam_from_scene[i, :, :3].T @ np.diag([1, -1, -1])
+        pose[:3, :3] = turn @ cameras.extrinsics[i, :, :3].T @ np.diag([1, -1, -1])
         pose[:3, 3] = matrix[:3, :3] @ cameras.centers[i] + matrix[:3, 3]
         frames.append({"file_path": name, "transform_matrix": pose.tolist()})
     K, (width, height) = cameras.intrinsics[0], cameras.sizes[0].tolist()
@@ -269,7 +269,7 @@ def test_glossy_from_its_published_layout(tmp_path):
         stored = np.where(np.isfinite(depth), depth / 15 * 65535, 65535).round().astype(np.uint16)
         cv2.imwrite(str(data / f"{i}-depth.png"), stored)
         cv2.imwrite(str(data / f"{i}.png"), np.zeros((64, 64, 3), np.uint8))
-        (data / f"{i}-camera.pkl").write_bytes(pickle.dumps([cameras.cam_from_scene[i], cameras.intrinsics[i]]))
+        (data / f"{i}-camera.pkl").write_bytes(pickle.dumps([cameras.extrinsics[i], cameras.intrinsics[i]]))
     ours = write_mesh(tmp_path / "ours.ply", ball(0.7))
     found = numbers("glossy", ours, "--data", data)
     assert found["chamfer"] < 2e-4  # depth is stored in steps of 0.0002

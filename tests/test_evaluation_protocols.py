@@ -112,7 +112,7 @@ def ring(count: int = 6, size: int = 96) -> PinholeCameras:
     found = [look_at(eye, np.zeros(3), np.array([0.0, 0, 1]), size, size) for eye in eyes]
     return PinholeCameras(
         tuple(f"{i}.png" for i in range(count)),
-        *(np.concatenate([getattr(one, name) for one in found]) for name in ("sizes", "intrinsics", "cam_from_scene")),
+        *(np.concatenate([getattr(one, name) for one in found]) for name in ("sizes", "intrinsics", "extrinsics")),
     )
 
 
@@ -154,7 +154,7 @@ def test_glossy_points_are_those_of_a_loop_over_pixels():
     maps = [np.where(depth < 14.5, depth, 0) for depth in depths(ball(0.8), cameras)]
     expected = []
     for i, depth in enumerate(maps):
-        pose = np.vstack([cameras.cam_from_scene[i], [0, 0, 0, 1]])
+        pose = np.vstack([cameras.extrinsics[i], [0, 0, 0, 1]])
         for y in range(24):
             for x in range(24):
                 if depth[y, x] > 0:

@@ -162,7 +162,7 @@ def views(*eyes) -> PinholeCameras:
     found = [look_at(np.array(eye, float), np.zeros(3), np.array([0.0, 0, 1]), 64, 64, 60) for eye in eyes]
     return PinholeCameras(
         tuple(f"{i}.png" for i in range(len(found))),
-        *(np.concatenate([getattr(one, name) for one in found]) for name in ("sizes", "intrinsics", "cam_from_scene")),
+        *(np.concatenate([getattr(one, name) for one in found]) for name in ("sizes", "intrinsics", "extrinsics")),
     )
 
 

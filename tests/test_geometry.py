@@ -17,7 +17,7 @@ def one_camera(seed: int = 0) -> PinholeCameras:
         names=("a.png",),
         sizes=np.array([[640, 480]]),
         intrinsics=np.array([[[500.0, 0.0, 310.0], [0.0, 510.0, 250.0], [0.0, 0.0, 1.0]]]),
-        cam_from_scene=np.concatenate([rotation, [[0.1], [-0.2], [3.0]]], 1)[None],
+        extrinsics=np.concatenate([rotation, [[0.1], [-0.2], [3.0]]], 1)[None],
     )
 
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from rigs import UP, capture, ring
 
 from stages.geometry.cameras import PosedScene
-from stages.geometry.normalisation import into_scene, rotation_onto, scene_frame
+from stages.geometry.normalisation import into_frame, rotation_onto, scene_frame
 from stages.geometry.place import EARTH_RADIUS, FLATTENING, Place, east_north_up, given_region
 from stages.geometry.plane import Plane, fit_plane
 from stages.geometry.region import meeting_point
@@ -58,7 +58,7 @@ def test_aligning_points_finds_what_moved_them(moved, seed):
 def test_photos_do_not_change_with_the_frame_and_depths_with_its_scale_only(center, radius, up, seed):
     cameras = capture(ring(np.zeros(3)))
     frame = scene_frame(center, radius, up)
-    moved = into_scene(cameras, frame)
+    moved = into_frame(cameras, frame)
     seen = cloud(seed)
     for i in (0, 5):
         pixels, depth = cameras.project(i, seen)

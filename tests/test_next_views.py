@@ -30,7 +30,7 @@ def scene_from(places: dict[str, np.ndarray], **more) -> PosedScene:
     views = [look_at(eye, np.zeros(3), UP, 40, 40) for eye in places.values()]
     cameras = PinholeCameras(
         tuple(places), *(np.concatenate([getattr(view, part) for view in views])
-        for part in ("sizes", "intrinsics", "cam_from_scene")),
+        for part in ("sizes", "intrinsics", "extrinsics")),
     )  # fmt: skip
     return scene_without_points(cameras, **more)
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from rigs import EAST, NORTH, capture, look_at, ring
 
 from stages.geometry.cameras import PinholeCameras
-from stages.geometry.normalisation import into_scene, rotation_onto, scene_frame
+from stages.geometry.normalisation import into_frame, rotation_onto, scene_frame
 from stages.geometry.region import (
     SEEN_WHOLE_MARGIN,
     find_region,
@@ -220,7 +220,7 @@ def test_rotation_onto_is_proper_and_hits_its_target(source: np.ndarray, target:
 def test_into_scene_keeps_pixels_and_scales_depth():
     cameras = capture(ring(TARGET, UP))
     frame = scene_frame(TARGET, 2.5, UP)
-    in_scene = into_scene(cameras, frame)
+    in_scene = into_frame(cameras, frame)
     points = np.random.default_rng(0).uniform(-0.5, 0.5, (50, 3))
     for i in range(len(cameras)):
         pixels, depth = in_scene.project(i, points)

@@ -8,7 +8,7 @@ import pytest
 from rigs import UP, capture, flight, look_at, ring
 
 from stages.geometry.markers import detect_markers, measure_markers
-from stages.geometry.normalisation import into_scene, rotation_onto
+from stages.geometry.normalisation import into_frame, rotation_onto
 from stages.geometry.place import Place, east_north_up, given_region, locate
 from stages.geometry.similarity import Similarity
 from stages.geometry.up import angle_deg
@@ -29,7 +29,7 @@ def gps_of(metres: np.ndarray, noise: float = 0.0, seed: int = 0) -> np.ndarray:
 
 def model_of(cameras):
     """The same cameras in the model's frame."""
-    return into_scene(cameras, TRUE)
+    return into_frame(cameras, TRUE)
 
 
 # ---------------------------------------------------------------- GPS

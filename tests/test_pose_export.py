@@ -102,7 +102,7 @@ def test_both_exports_say_the_same_and_that_of_the_scene(tmp_path: Path):
         np.testing.assert_allclose(one.cam_from_world, other.cam_from_world, atol=1e-9)
         np.testing.assert_allclose(one.params, other.params)
         at_center = one.cam_from_world[:, :3] @ world.apply(np.zeros(3)) + one.cam_from_world[:, 3]
-        expected = scene.cameras.cam_from_scene[i, :, 3] * world.scale
+        expected = scene.cameras.extrinsics[i, :, 3] * world.scale
         np.testing.assert_allclose(at_center, expected, atol=1e-9)
 
 

@@ -502,7 +502,7 @@ def test_the_region_is_that_of_the_file_where_there_are_no_masks():
         names=("a", "b"),
         sizes=np.array([[WIDTH, HEIGHT]] * 2),
         intrinsics=np.array([[[FOCAL, 0, 160], [0, FOCAL, 120], [0, 0, 1]]] * 2),
-        cam_from_scene=np.stack([np.c_[np.eye(3), [x, 0, 0]] for x in (0.0, 1.0)]),
+        extrinsics=np.stack([np.c_[np.eye(3), [x, 0, 0]] for x in (0.0, 1.0)]),
     )
     nothing = np.zeros((0, 3))
     with pytest.raises(ValueError, match="got 0 sparse points"):
@@ -520,7 +520,7 @@ def test_of_hull_and_stated_region_the_smaller_is_taken(radius: float, source: s
         names=tuple(NAMES),
         sizes=np.array([[WIDTH, HEIGHT]] * NUM),
         intrinsics=np.array([[[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]]] * NUM),
-        cam_from_scene=np.stack([cam_from_world(i) for i in range(NUM)]),
+        extrinsics=np.stack([cam_from_world(i) for i in range(NUM)]),
     )
     x, y = np.meshgrid(np.arange(WIDTH) - WIDTH / 2, np.arange(HEIGHT) - HEIGHT / 2)
     masks = [np.hypot(x, y) < 50] * NUM  # a ball of about 0.46
@@ -585,6 +585,6 @@ def real_set(root: Path):
         names=tuple(camera.name for camera in poses.cameras),
         sizes=np.array([camera.size for camera in poses.cameras]),
         intrinsics=np.array(intrinsics),
-        cam_from_scene=np.stack([camera.cam_from_world for camera in poses.cameras]),
+        extrinsics=np.stack([camera.cam_from_world for camera in poses.cameras]),
     )
     return cameras, masks, poses.region

@@ -30,7 +30,7 @@ def cameras(count: int) -> dict:
         "names": ("a.png",) * count,
         "sizes": np.full((count, 2), 8),
         "intrinsics": np.tile(np.eye(3), (count, 1, 1)),
-        "cam_from_scene": np.tile(np.eye(3, 4), (count, 1, 1)),
+        "extrinsics": np.tile(np.eye(3, 4), (count, 1, 1)),
     }
 
 

@@ -303,10 +303,10 @@ def test_training_can_start_from_the_hull():
 @pytest.mark.parametrize(("distance", "room"), [(0.3, True), (2.5, False)])
 def test_cameras_inside_the_sphere_start_in_a_free_room(distance, room):
     cameras = ring_of_cameras()
-    pose = cameras.cam_from_scene.copy()
+    pose = cameras.extrinsics.copy()
     pose[:, :, 3] *= distance / np.linalg.norm(cameras.centers, axis=1)[:, None]
     trainer = make_trainer()
-    train._start_from_shape(trainer, replace(cameras, cam_from_scene=pose))
+    train._start_from_shape(trainer, replace(cameras, extrinsics=pose))
     middle = torch.nn.functional.normalize(torch.randn(100, 3, generator=torch.Generator().manual_seed(0)), dim=1)
     with torch.no_grad():
         levels = trainer.moment(0.0).levels

@@ -52,7 +52,7 @@ def board() -> tuple[AtlasMesh, np.ndarray, PinholeCameras]:
         ("one.png", "two.png"),
         np.concatenate([view.sizes for view in views]),
         np.concatenate([view.intrinsics for view in views]),
-        np.concatenate([view.cam_from_scene for view in views]),
+        np.concatenate([view.extrinsics for view in views]),
     )
     return atlas, texture, cameras
 

@@ -24,7 +24,7 @@ class _CameraRecord(Record):
     name: str
     size: tuple[int, int]
     intrinsics: Array
-    cam_from_scene: Array
+    extrinsics: Array
 
 
 class _CamerasRecord(Record):
@@ -46,9 +46,9 @@ class _SceneRecord(Record):
 
 
 def _save_cameras(folder: Path, cameras: PinholeCameras) -> None:
-    rows = zip(cameras.names, cameras.sizes.tolist(), cameras.intrinsics, cameras.cam_from_scene, strict=True)
+    rows = zip(cameras.names, cameras.sizes.tolist(), cameras.intrinsics, cameras.extrinsics, strict=True)
     records = (
-        _CameraRecord(name=name, size=tuple(size), intrinsics=intrinsics, cam_from_scene=pose)
+        _CameraRecord(name=name, size=tuple(size), intrinsics=intrinsics, extrinsics=pose)
         for name, size, intrinsics, pose in rows
     )
     write_record(folder / _CAMERAS, _CamerasRecord(cameras=tuple(records)))
@@ -60,7 +60,7 @@ def _load_cameras(folder: Path) -> PinholeCameras:
         names=tuple(record.name for record in records),
         sizes=np.array([record.size for record in records], dtype=np.int64),
         intrinsics=np.array([record.intrinsics for record in records]),
-        cam_from_scene=np.array([record.cam_from_scene for record in records]),
+        extrinsics=np.array([record.extrinsics for record in records]),
     )
 
 

@@ -26,7 +26,7 @@ def look_at(
         names=("view",),
         sizes=np.array([[width, height]]),
         intrinsics=np.array([[[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]], dtype=np.float64),
-        cam_from_scene=np.concatenate([rotation, -(rotation @ eye)[:, None]], 1)[None],
+        extrinsics=np.concatenate([rotation, -(rotation @ eye)[:, None]], 1)[None],
     )
 
 

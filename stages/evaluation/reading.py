@@ -13,7 +13,7 @@ from stages.engine.workspace import Workspace
 from stages.errors import InputError, WorkspaceError
 from stages.evaluation.surfaces import Surface
 from stages.geometry.cameras import PinholeCameras
-from stages.geometry.normalisation import into_scene
+from stages.geometry.normalisation import into_frame
 
 CLOUDS = (".pcd", ".xyz", ".pts")
 
@@ -158,7 +158,7 @@ def workspace_cameras(workspace: Path) -> Cameras:
             f"{workspace} has no undistorted photos.", f"Make them: `hineus undistort --workspace {workspace}`."
         )
     scene = artifacts.SCENE.load(opened.stage_folder("undistort"))
-    return Cameras(str(workspace), into_scene(scene.cameras, scene.poses_from_scene.inverse()))
+    return Cameras(str(workspace), into_frame(scene.cameras, scene.poses_from_scene.inverse()))
 
 
 def own_cameras(predicted: Path, given: Path | None) -> Cameras | None:

@@ -1,8 +1,9 @@
 """Pinhole cameras and posed scenes.
 
 The one camera convention of the project: OpenCV axes (x right, y down, z forward), pixel centres at .5 (the
-top-left corner of the image is (0, 0)), matrices named target_from_source. "scene" is the normalised frame: the
-region of interest is the unit sphere.
+top-left corner of the image is (0, 0)), matrices named target_from_source. Three frames: "poses", in which the
+cameras were found or given; "world", that of the results; "scene", normalised: the region of interest is the unit
+sphere.
 """
 
 from __future__ import annotations
@@ -23,19 +24,19 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class PinholeCameras:
-    """N pinhole cameras without distortion.
+    """N pinhole cameras without distortion, all in one frame: the scene's where nothing else is said.
 
     Attributes:
         names: N image names, relative posix paths.
         sizes: width and height in pixels.
         intrinsics: pixels.
-        cam_from_scene: rotation and translation.
+        extrinsics: rotation and translation from that frame into the camera.
     """
 
     names: tuple[str, ...]
     sizes: Integer[np.ndarray, "n 2"]
     intrinsics: Float64[np.ndarray, "n 3 3"]
-    cam_from_scene: Float64[np.ndarray, "n 3 4"]
+    extrinsics: Float64[np.ndarray, "n 3 4"]
 
     def __len__(self) -> int:
         return len(self.names)
@@ -44,24 +45,24 @@ class PinholeCameras:
         """These cameras alone, in this order."""
         chosen = np.asarray(indices, dtype=np.int64)
         names = tuple(self.names[i] for i in chosen)
-        return PinholeCameras(names, self.sizes[chosen], self.intrinsics[chosen], self.cam_from_scene[chosen])
+        return PinholeCameras(names, self.sizes[chosen], self.intrinsics[chosen], self.extrinsics[chosen])
 
     @property
     def centers(self) -> Float[np.ndarray, "n 3"]:
-        """Projection centres in the scene frame."""
-        rotation, translation = self.cam_from_scene[:, :, :3], self.cam_from_scene[:, :, 3]
+        """Projection centres in their frame."""
+        rotation, translation = self.extrinsics[:, :, :3], self.extrinsics[:, :, 3]
         return -np.einsum("nji,nj->ni", rotation, translation)
 
     @property
     def forward(self) -> Float[np.ndarray, "n 3"]:
-        """Unit viewing directions in the scene frame."""
-        return self.cam_from_scene[:, 2, :3]
+        """Unit viewing directions in their frame."""
+        return self.extrinsics[:, 2, :3]
 
     def project(
         self, index: int, points: Float[np.ndarray, "p 3"]
     ) -> tuple[Float[np.ndarray, "p 2"], Float[np.ndarray, " p"]]:
-        """Pixel coordinates and depths of scene points in one camera. Depth <= 0 is behind it."""
-        in_cam = points @ self.cam_from_scene[index, :, :3].T + self.cam_from_scene[index, :, 3]
+        """Pixel coordinates and depths of points in one camera. Depth <= 0 is behind it."""
+        in_cam = points @ self.extrinsics[index, :, :3].T + self.extrinsics[index, :, 3]
         depth = in_cam[:, 2]
         safe = np.where(np.abs(depth) < 1e-12, 1e-12, depth)
         pixels = in_cam[:, :2] / safe[:, None]
@@ -71,15 +72,15 @@ class PinholeCameras:
         ), depth
 
     def in_frame(self, index: int, points: Float[np.ndarray, "p 3"]) -> Bool[np.ndarray, " p"]:
-        """Which scene points lie before one camera and within its photo, hidden or not."""
+        """Which points lie before one camera and within its photo, hidden or not."""
         pixels, depth = self.project(index, points)
         return (depth > 0) & (pixels >= 0).all(1) & (pixels < self.sizes[index]).all(1)
 
     def rays(
         self, index: int, pixels: Float[np.ndarray, "p 2"]
     ) -> tuple[Float[np.ndarray, "p 3"], Float[np.ndarray, "p 3"]]:
-        """Origins and unit directions in the scene frame of rays through pixel positions."""
-        K, rotation = self.intrinsics[index], self.cam_from_scene[index, :, :3]
+        """Origins and unit directions of rays through pixel positions."""
+        K, rotation = self.intrinsics[index], self.extrinsics[index, :, :3]
         y = (pixels[:, 1] - K[1, 2]) / K[1, 1]
         x = (pixels[:, 0] - K[0, 2] - K[0, 1] * y) / K[0, 0]
         directions = np.stack([x, y, np.ones_like(x)], 1) @ rotation

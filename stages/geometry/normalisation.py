@@ -1,7 +1,4 @@
-"""The normalised frame: the region of interest is the unit sphere, +z is up.
-
-Cameras of the world frame are `PinholeCameras` whose "scene" is the world.
-"""
+"""The normalised frame, and the way of cameras into it: the region of interest is the unit sphere, +z is up."""
 
 from __future__ import annotations
 
@@ -28,16 +25,16 @@ def rotation_onto(source: Float[np.ndarray, " 3"], target: Float[np.ndarray, " 3
 
 
 def scene_frame(center: Float[np.ndarray, " 3"], radius: float, up: Float[np.ndarray, " 3"]) -> Similarity:
-    """world_from_scene: the unit sphere to the sphere (center, radius), scene +z to `up`."""
+    """poses_from_scene: the unit sphere to the sphere (center, radius), scene +z to `up`."""
     if not radius > 0:
         raise ValueError(f"got radius {radius}, expected a positive one")
     return Similarity(float(radius), rotation_onto(np.array([0.0, 0.0, 1.0]), up / np.linalg.norm(up)), center)
 
 
-def into_scene(cameras: PinholeCameras, world_from_scene: Similarity) -> PinholeCameras:
-    """Cameras of the world frame, moved to the scene frame. The camera frames shrink with the scene."""
-    rotation, translation = cameras.cam_from_scene[:, :, :3], cameras.cam_from_scene[:, :, 3]
-    in_scene = np.empty_like(cameras.cam_from_scene)
-    in_scene[:, :, :3] = rotation @ world_from_scene.rotation
-    in_scene[:, :, 3] = (rotation @ world_from_scene.translation + translation) / world_from_scene.scale
-    return PinholeCameras(cameras.names, cameras.sizes, cameras.intrinsics, in_scene)
+def into_frame(cameras: PinholeCameras, old_from_new: Similarity) -> PinholeCameras:
+    """The same cameras in another frame, as from the poses' to the scene's. The camera frames shrink with it."""
+    rotation, translation = cameras.extrinsics[:, :, :3], cameras.extrinsics[:, :, 3]
+    extrinsics = np.empty_like(cameras.extrinsics)
+    extrinsics[:, :, :3] = rotation @ old_from_new.rotation
+    extrinsics[:, :, 3] = (rotation @ old_from_new.translation + translation) / old_from_new.scale
+    return PinholeCameras(cameras.names, cameras.sizes, cameras.intrinsics, extrinsics)

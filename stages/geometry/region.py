@@ -128,7 +128,7 @@ def seen_whole_radii(cameras: PinholeCameras, center: Float[np.ndarray, " 3"]) -
     """
     radii = np.empty(len(cameras))
     for i in range(len(cameras)):
-        in_cam = cameras.cam_from_scene[i, :, :3] @ center + cameras.cam_from_scene[i, :, 3]
+        in_cam = cameras.extrinsics[i, :, :3] @ center + cameras.extrinsics[i, :, 3]
         K, (width, height) = cameras.intrinsics[i], cameras.sizes[i]
         left, right = -K[0, 2] / K[0, 0], (width - K[0, 2]) / K[0, 0]
         top, bottom = -K[1, 2] / K[1, 1], (height - K[1, 2]) / K[1, 1]

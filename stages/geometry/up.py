@@ -44,7 +44,7 @@ def estimate_up(cameras: PinholeCameras) -> Up:
     the pitch. Where the x axes do not span a plane (photos from one side) it is the mean of the cameras' up, or,
     where those cancel (a drone that looks down and flies to and fro), against the mean viewing direction.
     """
-    right, mean_up = cameras.cam_from_scene[:, 0, :3], -cameras.cam_from_scene[:, 1, :3].mean(0)
+    right, mean_up = cameras.extrinsics[:, 0, :3], -cameras.extrinsics[:, 1, :3].mean(0)
     if np.linalg.norm(mean_up) < MIN_MEAN_UP:
         mean_up = -cameras.forward.mean(0)
     mean_up /= max(np.linalg.norm(mean_up), TINY)

@@ -77,7 +77,7 @@ class Photos:
         self.sizes = torch.from_numpy(cameras.sizes).to(device)
         self.centers = torch.from_numpy(cameras.centers).float().to(device)
         inverse = np.linalg.inv(cameras.intrinsics)
-        scene_from_pixel = np.einsum("nji,njk->nik", cameras.cam_from_scene[:, :, :3], inverse)
+        scene_from_pixel = np.einsum("nji,njk->nik", cameras.extrinsics[:, :, :3], inverse)
         self.scene_from_pixel = torch.from_numpy(scene_from_pixel).float().to(device)
         self.pixel_from_scene = torch.linalg.inv(self.scene_from_pixel)
         self.boxes = torch.from_numpy(_sphere_boxes(cameras)).float().to(device)

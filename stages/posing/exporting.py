@@ -13,7 +13,7 @@ import numpy as np
 
 from stages import artifacts
 from stages.geometry.cameras import PosedScene
-from stages.geometry.normalisation import into_scene
+from stages.geometry.normalisation import into_frame
 from stages.geometry.place import Place
 
 SPARSE, TRANSFORMS, POINTS = "sparse", "transforms.json", "sparse_pc.ply"
@@ -48,10 +48,10 @@ def write_transforms(undistort: Path, sfm: Path, place: Path, out: Path) -> dict
     in_world = artifacts.PLACE.load(place)
     scene, model = _images_and_model(undistort, sfm, in_world, out)
     model.export_PLY(str(out / POINTS))
-    cameras = into_scene(scene.cameras, scene.world_from_scene(in_world).inverse())
+    cameras = into_frame(scene.cameras, scene.world_from_scene(in_world).inverse())
     frames = []
     for i, name in enumerate(cameras.names):
-        cam_from_world = np.vstack([cameras.cam_from_scene[i], [0, 0, 0, 1]])
+        cam_from_world = np.vstack([cameras.extrinsics[i], [0, 0, 0, 1]])
         K, (width, height) = cameras.intrinsics[i], cameras.sizes[i].tolist()
         frame = {
             "file_path": f"{artifacts.IMAGES}/{name}",
@@ -90,7 +90,7 @@ def undistorted_model(scene: PosedScene, in_world: Place, sfm: Path, images_fold
 
     source = pycolmap.Reconstruction(str(artifacts.MODEL.load(sfm)))
     photos = sorted((source.images[i] for i in source.reg_image_ids()), key=lambda image: image.name)
-    cameras = into_scene(scene.cameras, scene.world_from_scene(in_world).inverse())
+    cameras = into_frame(scene.cameras, scene.world_from_scene(in_world).inverse())
     model = pycolmap.Reconstruction()
     camera_ids: dict[tuple[Any, ...], int] = {}
     for i, (photo, name) in enumerate(zip(photos, cameras.names, strict=True)):
@@ -107,7 +107,7 @@ def undistorted_model(scene: PosedScene, in_world: Place, sfm: Path, images_fold
         seen = np.array([point.xy for point in photo.points2D]).reshape(-1, 2)
         rays = np.asarray(source.cameras[photo.camera_id].cam_from_img(seen)).reshape(-1, 2)
         pixels = np.nan_to_num(rays * params[:2] + params[2:], nan=-1.0)  # a lens may not reach the photo's corners
-        pose = cameras.cam_from_scene[i]
+        pose = cameras.extrinsics[i]
         model.add_image_with_trivial_frame(
             pycolmap.Image(name, pycolmap.Point2DList([pycolmap.Point2D(xy) for xy in pixels]), camera_ids[key], i + 1),
             pycolmap.Rigid3d(pycolmap.Rotation3d(pose[:, :3]), pose[:, 3]),

@@ -130,5 +130,5 @@ def posed_cameras(photos: Sequence[Any], names: Sequence[str], warps: Mapping[in
         names=tuple(names),
         sizes=np.array([warps[photo.camera_id].size for photo in photos], dtype=np.int64),
         intrinsics=np.stack([warps[photo.camera_id].intrinsics for photo in photos]),
-        cam_from_scene=np.stack([photo.cam_from_world().matrix() for photo in photos]),
+        extrinsics=np.stack([photo.cam_from_world().matrix() for photo in photos]),
     )

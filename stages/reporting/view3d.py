@@ -142,7 +142,7 @@ def _corner_rays(scene: PosedScene) -> np.ndarray:
     rays = np.stack(
         [(x - K[:, :1, 2]) / K[:, :1, 0], (y - K[:, 1:2, 2]) / K[:, 1:2, 1], np.ones_like(x)], 2
     )  # fmt: skip
-    return rays @ cameras.cam_from_scene[:, :, :3]
+    return rays @ cameras.extrinsics[:, :, :3]
 
 
 def _rays_to(view: NextView, up: np.ndarray, aspect: float, half: float) -> np.ndarray:

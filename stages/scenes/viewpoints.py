@@ -11,7 +11,7 @@ UP = np.array([0, 0, 1.0])
 
 def viewpoint(center: np.ndarray, target: np.ndarray, roll: float = 0.0, up: np.ndarray = UP) -> np.ndarray:
     """[4, 4] of a camera at `center` that looks at `target`, turned by `roll` radians about the way it looks."""
-    right, down, forward = look_at(center, target, up, 1, 1).cam_from_scene[0, :, :3]
+    right, down, forward = look_at(center, target, up, 1, 1).extrinsics[0, :, :3]
     right, down = np.cos(roll) * right + np.sin(roll) * down, np.cos(roll) * down - np.sin(roll) * right
     pose = np.eye(4)
     pose[:3, :3] = np.stack([right, down, forward])

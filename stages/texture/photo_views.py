@@ -102,7 +102,7 @@ def prepare_view(
         smooth = low_pass(photo, linked_left, linked_up, float(np.sqrt((pixels_on_texel**2 - 1) / 12)))
         photo = np.clip(smooth + 0.5, 0, 255).astype(np.uint8)
     return View(
-        matrix=K @ cameras.cam_from_scene[index],
+        matrix=K @ cameras.extrinsics[index],
         center=cameras.centers[index],
         focal=focal,
         inverse_depth=inverse_depth,

@@ -14,7 +14,7 @@ from stages.evaluation.photos.images import find_lpips
 from stages.evaluation.photos.regions import WHITE
 from stages.evaluation.photos.scoring import score_photos
 from stages.geometry.cameras import PinholeCameras
-from stages.geometry.normalisation import into_scene
+from stages.geometry.normalisation import into_frame
 from stages.ingest import find_masks, read_mask_file
 from stages.posing.known import image_size, match_photos
 from stages.posing.reading import read_poses
@@ -73,9 +73,9 @@ class TestPhotos:
             names=tuple(matched),
             sizes=np.array(sizes, dtype=np.int64),
             intrinsics=np.stack(intrinsics),
-            cam_from_scene=np.stack([known.cam_from_world for known in matched.values()]),
+            extrinsics=np.stack([known.cam_from_world for known in matched.values()]),
         )
-        self.cameras = into_scene(in_poses, scene.poses_from_scene)
+        self.cameras = into_frame(in_poses, scene.poses_from_scene)
 
     def load(self, index: int) -> tuple[np.ndarray, np.ndarray | None]:
         """Photo [H, W, 3] uint8 (on white, where that is the suite's background) and mask [H, W] bool or None."""

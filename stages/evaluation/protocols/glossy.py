@@ -53,7 +53,7 @@ def visible_points(cameras: PinholeCameras, depths: Iterable[np.ndarray]) -> np.
         rows, columns = np.nonzero(np.isfinite(depth) & (depth > 0))
         pixels = np.stack([columns, rows, np.ones(len(rows))], 1)
         in_cam = depth[rows, columns, None] * (pixels @ np.linalg.inv(cameras.intrinsics[i]).T)
-        rotation, translation = cameras.cam_from_scene[i, :, :3], cameras.cam_from_scene[i, :, 3]
+        rotation, translation = cameras.extrinsics[i, :, :3], cameras.extrinsics[i, :, 3]
         found.append((in_cam - translation) @ rotation)
     points = np.concatenate(found)
     return one_a_cube(points, VOXEL)

@@ -138,7 +138,7 @@ def pinhole_rays(cameras: PinholeCameras, index: int) -> Any:
     """Open3D's rays [H, W, 6] through the pixel centres of one camera."""
     import open3d as o3d
 
-    cam_from_world = np.vstack([cameras.cam_from_scene[index], [0, 0, 0, 1]])
+    cam_from_world = np.vstack([cameras.extrinsics[index], [0, 0, 0, 1]])
     return o3d.t.geometry.RaycastingScene.create_rays_pinhole(
         o3d.core.Tensor(cameras.intrinsics[index]), o3d.core.Tensor(cam_from_world), *cameras.sizes[index].tolist()
     )
