@@ -25,7 +25,6 @@ def _scene(place: Path, wanted: Wanted) -> SuiteScene:
     cameras = sorted(place.glob(f"*{nero.CAMERA}"), key=lambda path: (len(path.name), path.name))
     names = [f"{path.name.removesuffix(nero.CAMERA)}.png" for path in cameras]
     depth = all((place / name.replace(".png", nero.DEPTH)).is_file() for name in names)
-    views = every_nth(place, names, place, wanted.hold_out)
     split = next((p / SPLIT for p in (wanted.truth, place.parent) if p is not None and (p / SPLIT).is_file()), None)
     lacking = []
     if not depth:
@@ -37,8 +36,7 @@ def _scene(place: Path, wanted: Wanted) -> SuiteScene:
         photos=place,
         poses=place,
         masks=place if wanted.masks and depth else None,
-        left_out=views.names if views else (),
-        views=views,
+        views=every_nth(place, names, place, wanted.hold_out),
         truth=Truth("glossy", place, split=split) if depth else None,
         lacking=tuple(lacking),
     )

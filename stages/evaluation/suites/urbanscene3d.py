@@ -44,9 +44,7 @@ def _raw(place: Path, photos: Path, wanted: Wanted) -> SuiteScene:
     views = every_nth(photos, photo_names(photos), poses, wanted.hold_out) if poses else None
     if poses is None:
         lacking.append("no view synthesis: without poses nothing says where test photos were taken from")
-    return SuiteScene(
-        place.name, photos, poses, left_out=views.names if views else (), views=views, lacking=tuple(lacking)
-    )
+    return SuiteScene(place.name, photos, poses, views=views, lacking=tuple(lacking))
 
 
 def _photos(place: Path) -> Path | None:
