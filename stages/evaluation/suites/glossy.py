@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from stages.evaluation.suites.scene import SuiteScene, Truth, Wanted, every_nth
+from stages.evaluation.suites.scene import SuiteScene, Truth, Wanted, every_nth, places_in
 from stages.posing import nero
 
 SPLIT = "synthetic_split_128.pkl"
@@ -17,8 +17,7 @@ SPLIT = "synthetic_split_128.pkl"
 
 def find_scenes(folder: Path, wanted: Wanted) -> list[SuiteScene]:
     """Scenes in `folder`, or `folder` itself if it is one."""
-    places = [folder, *sorted(path for path in folder.iterdir() if path.is_dir())]
-    return [_scene(place, wanted) for place in places if nero.has_cameras(place)]
+    return [_scene(place, wanted) for place in places_in(folder) if nero.has_cameras(place)]
 
 
 def _scene(place: Path, wanted: Wanted) -> SuiteScene:

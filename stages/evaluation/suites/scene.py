@@ -86,8 +86,12 @@ def every_nth(folder: Path, names: list[str], poses: Path, every: int) -> TestVi
     return TestViews(folder, tuple(names[::every]), poses) if every else None
 
 
+def places_in(folder: Path) -> list[Path]:
+    """`folder` itself and the folders in it, by name: each may be a scene."""
+    return [folder, *sorted(path for path in folder.iterdir() if path.is_dir())]
+
+
 def folders_with(folder: Path, *needed: str) -> list[Path]:
     """`folder` itself where it has all of the files or folders `needed`, else those of its folders that have."""
-    places = [folder, *sorted(path for path in folder.iterdir() if path.is_dir())]
-    found = [place for place in places if all((place / name).exists() for name in needed)]
+    found = [place for place in places_in(folder) if all((place / name).exists() for name in needed)]
     return found[:1] if folder in found else found
