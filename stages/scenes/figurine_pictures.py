@@ -31,26 +31,20 @@ def _blur_environment(environment: np.ndarray, sigma: float) -> np.ndarray:
 
 def _look_up(environment: np.ndarray, directions: np.ndarray) -> np.ndarray:
     """Radiance [P, 3] seen in unit directions [P, 3], bilinear."""
-    import cv2
-
     height, width = environment.shape[:2]
     row = np.arccos(np.clip(directions[:, 2], -1, 1)) / np.pi * height - 0.5
     column = np.arctan2(directions[:, 1], directions[:, 0]) % (2 * np.pi) / (2 * np.pi) * width - 0.5
-    return _remap(environment, column, row, cv2.BORDER_REPLICATE)
+    return _remap(environment, column, row)
 
 
-def _remap(image: np.ndarray, x: np.ndarray, y: np.ndarray, border: int) -> np.ndarray:
+def _remap(image: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Bilinear samples [P, C] of an image at pixel positions; folded because cv2 limits a side to 32767."""
     import cv2
 
-    count, row_length = len(x), 4096
-    padded = -(-count // row_length) * row_length
-    maps = []
-    for values in (x, y):
-        full = np.zeros(padded, np.float32)
-        full[:count] = values
-        maps.append(full.reshape(-1, row_length))
-    return cv2.remap(image, maps[0], maps[1], cv2.INTER_LINEAR, borderMode=border).reshape(padded, -1)[:count]
+    row = 4096
+    folded = [np.pad(values.astype(np.float32), (0, -len(x) % row)).reshape(-1, row) for values in (x, y)]
+    samples = cv2.remap(image, *folded, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return samples.reshape(-1, image.shape[2])[: len(x)]
 
 
 def _light_samples(environment: np.ndarray, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
@@ -133,10 +127,7 @@ def light_scene(figurine: Figurine, seed: int, light_samples: int = 128, cloth_s
     coarse = raycaster(figurine.vertices, figurine.faces)
     light = _irradiance(coarse, figurine.vertices, figurine.normals, directions, weights)
 
-    faces, attributes = (
-        figurine.faces,
-        np.hstack([figurine.vertices, figurine.normals, figurine.design, light]),
-    )
+    faces, attributes = figurine.faces, np.hstack([figurine.vertices, figurine.normals, figurine.design, light])
     for _ in range(2):
         faces, attributes = _subdivide(faces, attributes)
     vertices, normals, design, light = np.split(attributes, [3, 6, 9], axis=1)
@@ -171,11 +162,9 @@ def light_scene(figurine: Figurine, seed: int, light_samples: int = 128, cloth_s
 # ---------------------------------------------------------------- pictures
 def _ground_radiance(scene: LitScene, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Radiance [P, 3] of the cloth, or of the floor beyond it."""
-    import cv2
-
     size = scene.cloth.shape[0]
     column, row = (x / CLOTH_SIDE + 0.5) * size - 0.5, (y / CLOTH_SIDE + 0.5) * size - 0.5
-    color = _remap(scene.cloth, column, row, cv2.BORDER_REPLICATE)
+    color = _remap(scene.cloth, column, row)
     beyond = (np.abs(x) > CLOTH_SIDE / 2) | (np.abs(y) > CLOTH_SIDE / 2)
     color[beyond] = scene.floor
     return color
