@@ -105,21 +105,10 @@ class LitScene:
     soft: np.ndarray
 
 
-def _subdivide(faces: np.ndarray, attributes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Split every triangle in four; attributes [V, C] of new vertices are the mean of their edge's ends."""
-    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
-    unique, inverse = np.unique(edges[:, 0].astype(np.int64) << 32 | edges[:, 1], return_inverse=True)
-    ends = np.stack([unique >> 32, unique & 0xFFFFFFFF], 1)
-    middle = (len(attributes) + inverse).reshape(3, -1).T.astype(np.int32)
-    a, b, c = faces.T
-    ab, bc, ca = middle.T
-    split = np.concatenate([np.stack(t, 1) for t in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))])
-    return split, np.concatenate([attributes, attributes[ends].mean(1)])
-
-
 def light_scene(figurine: Figurine, seed: int, light_samples: int = 128, cloth_size: int = 2048) -> LitScene:
     """Paint the bird, print the cloth, and bake all light that does not depend on the view."""
     import cv2
+    from trimesh.remesh import subdivide
 
     rng = np.random.default_rng(seed)
     environment = make_environment(rng)
@@ -128,8 +117,8 @@ def light_scene(figurine: Figurine, seed: int, light_samples: int = 128, cloth_s
     light = _irradiance(coarse, figurine.vertices, figurine.normals, directions, weights)
 
     faces, attributes = figurine.faces, np.hstack([figurine.vertices, figurine.normals, figurine.design, light])
-    for _ in range(2):
-        faces, attributes = _subdivide(faces, attributes)
+    for _ in range(2):  # what stands at a new vertex is the mean of its edge's ends
+        attributes, faces = subdivide(attributes, faces)
     vertices, normals, design, light = np.split(attributes, [3, 6, 9], axis=1)
     normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
     albedo, metalness, gloss = figurine_materials(design, rng)
