@@ -41,10 +41,10 @@ def _remap(image: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Bilinear samples [P, C] of an image at pixel positions; folded because cv2 limits a side to 32767."""
     import cv2
 
-    row = 4096
-    folded = [np.pad(values.astype(np.float32), (0, -len(x) % row)).reshape(-1, row) for values in (x, y)]
-    samples = cv2.remap(image, *folded, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return samples.reshape(-1, image.shape[2])[: len(x)]
+    count, row = len(x), 4096
+    x, y = (np.pad(values.astype(np.float32), (0, -count % row)).reshape(-1, row) for values in (x, y))
+    samples = cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return samples.reshape(-1, image.shape[2])[:count]
 
 
 def _light_samples(environment: np.ndarray, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
