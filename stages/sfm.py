@@ -20,7 +20,6 @@ from stages.artifacts import (
     REGISTRATION,
     GivenPoses,
     ImageSet,
-    KnownSphere,
     Registration,
     Unregistered,
 )
@@ -191,8 +190,7 @@ def _from_known_poses(context: StageContext[SfmParams]) -> dict[str, Any]:
     if error > DOUBTFUL_ERROR_PX:
         log.warning("the known poses fit the photos badly: a mean reprojection error of %.1f px", error)
     _write_model(context, model)
-    region = poses.region and KnownSphere.model_validate(poses.region)
-    context.write(GIVEN_POSES, GivenPoses(origin=poses.origin.name, region=region))
+    context.write(GIVEN_POSES, GivenPoses(origin=poses.origin.name, region=poses.region))
     registration = Registration(
         registered=tuple(sorted(cameras)),
         unregistered=unregistered,

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from stages.errors import InputError
-from stages.posing.known import KnownCamera, KnownPoses
+from stages.posing.known import KnownCamera, KnownPoses, reading
 
 # Where models lie in a project of COLMAP, in a data set and in a workspace of ours.
 PLACES = ("", "sparse/0", "sparse", "colmap/sparse/0", "sfm/model", "model", "0")
@@ -27,13 +26,8 @@ def read_colmap(folder: Path) -> KnownPoses:
     """
     import pycolmap
 
-    try:
+    with reading(f"The COLMAP model {folder}", "cameras, images and points3D, as .bin or as .txt"):
         model = pycolmap.Reconstruction(str(folder))
-    except Exception as error:  # pycolmap raises its own and Python's for damaged files
-        raise InputError(
-            f"The COLMAP model {folder} cannot be read ({error}).",
-            "It needs cameras, images and points3D, as .bin or as .txt.",
-        ) from error
     cameras = []
     for image_id in sorted(model.reg_image_ids()):
         image = model.images[image_id]

@@ -15,6 +15,7 @@ from stages import artifacts
 from stages.geometry.cameras import PosedScene
 from stages.geometry.normalisation import into_frame
 from stages.geometry.place import Place
+from stages.posing.undistortion import registered_photos
 
 SPARSE, TRANSFORMS, POINTS = "sparse", "transforms.json", "sparse_pc.ply"
 
@@ -37,14 +38,7 @@ def write_colmap(undistort: Path, sfm: Path, place: Path, out: Path) -> dict[str
 
 
 def write_transforms(undistort: Path, sfm: Path, place: Path, out: Path) -> dict[str, Any]:
-    """Write images/, masks/ (where there are any), transforms.json and a PLY of the sparse points.
-
-    Args:
-        undistort, sfm, place: folders of these stages. out: exists.
-
-    Returns:
-        Numbers of images, points and observations.
-    """
+    """Write images/, masks/ (where there are any), transforms.json, a PLY of the sparse points; as `write_colmap`."""
     in_world = artifacts.PLACE.load(place)
     scene, model = _images_and_model(undistort, sfm, in_world, out)
     model.export_PLY(str(out / POINTS))
@@ -77,7 +71,11 @@ def write_transforms(undistort: Path, sfm: Path, place: Path, out: Path) -> dict
 def _images_and_model(undistort: Path, sfm: Path, place: Place, out: Path) -> tuple[PosedScene, Any]:
     """Copy images and masks to `out`; the scene, and the pycolmap model of it."""
     scene = artifacts.SCENE.load(undistort)
-    _copy_images(scene, undistort, out)
+    for name in scene.cameras.names:
+        for path_in in (artifacts.image_path, artifacts.mask_path):
+            if path_in(undistort, name).exists():
+                path_in(out, name).parent.mkdir(parents=True, exist_ok=True)
+                shutil.copyfile(path_in(undistort, name), path_in(out, name))
     return scene, undistorted_model(scene, place, sfm, out / artifacts.IMAGES)
 
 
@@ -89,7 +87,7 @@ def undistorted_model(scene: PosedScene, in_world: Place, sfm: Path, images_fold
     import pycolmap
 
     source = pycolmap.Reconstruction(str(artifacts.MODEL.load(sfm)))
-    photos = sorted((source.images[i] for i in source.reg_image_ids()), key=lambda image: image.name)
+    photos = registered_photos(source)
     cameras = into_frame(scene.cameras, scene.world_from_scene(in_world).inverse())
     model = pycolmap.Reconstruction()
     camera_ids: dict[tuple[Any, ...], int] = {}
@@ -123,14 +121,6 @@ def undistorted_model(scene: PosedScene, in_world: Place, sfm: Path, images_fold
     model.extract_colors_for_all_images(str(images_folder))
     model.update_point_3d_errors()
     return model
-
-
-def _copy_images(scene: PosedScene, undistort: Path, out: Path) -> None:
-    for name in scene.cameras.names:
-        for place in (artifacts.image_path, artifacts.mask_path):
-            if place(undistort, name).exists():
-                place(out, name).parent.mkdir(parents=True, exist_ok=True)
-                shutil.copyfile(place(undistort, name), place(out, name))
 
 
 def _numbers(model: Any) -> dict[str, Any]:

@@ -6,12 +6,14 @@ Cameras are COLMAP's: OpenCV axes (x right, y down, z forward), pixel centres at
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 
 import numpy as np
 
+from stages.artifacts import KnownSphere
 from stages.errors import InputError
 
 # An image's suffix; "frame.0001" has none.
@@ -42,19 +44,6 @@ class KnownCamera:
 
 
 @dataclass(frozen=True)
-class StatedRegion:
-    """The sphere that holds the object as the poses' file says, in its world frame.
-
-    Attributes:
-        center: [3]. radius: world units. source: where it is said, in words.
-    """
-
-    center: np.ndarray
-    radius: float
-    source: str
-
-
-@dataclass(frozen=True)
 class KnownPoses:
     """What a file of poses says.
 
@@ -67,7 +56,7 @@ class KnownPoses:
 
     origin: Path
     cameras: tuple[KnownCamera, ...]
-    region: StatedRegion | None = None
+    region: KnownSphere | None = None
     masks: Mapping[str, Path] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -139,6 +128,36 @@ def _likeness(first: str, second: str) -> tuple[int, bool]:
 
 
 # ---------------------------------------------------------------- what readers share
+@contextmanager
+def reading(what: str, needs: str) -> Iterator[None]:
+    """Whatever goes wrong within means that `what` cannot be read: damaged pickles and models raise nearly anything.
+
+    Raises:
+        InputError: with what the file `needs`.
+    """
+    try:
+        yield
+    except Exception as error:
+        raise InputError(f"{what} cannot be read ({error}).", f"It needs {needs}.") from error
+
+
+def pinhole(name: str, image: Path, intrinsics: np.ndarray, cam_from_world: np.ndarray, origin: Path) -> KnownCamera:
+    """A camera without distortion or skew, of an `image` on the disk.
+
+    Args:
+        intrinsics: [3, 3] pixels.
+        cam_from_world: [3, 4], its rotation perhaps rounded.
+        origin: the file that says so.
+
+    Raises:
+        InputError: the image cannot be read, or the pose has no rotation.
+    """
+    params = tuple(float(intrinsics[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    rotation = nearest_rotation(cam_from_world[:, :3], name, origin)
+    pose = np.concatenate([rotation, cam_from_world[:, 3:]], 1)
+    return KnownCamera(name, image_size(image, origin), "PINHOLE", params, pose)
+
+
 def nearest_rotation(matrix: np.ndarray, name: str, origin: Path) -> np.ndarray:
     """The rotation [3, 3] that a nearly orthonormal `matrix` [3, 3] stands for.
 

@@ -10,8 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from stages.errors import InputError
-from stages.posing.known import KnownCamera, KnownPoses, nearest_rotation
+from stages.posing.known import KnownCamera, KnownPoses, nearest_rotation, reading
 from stages.posing.transforms import OPENCV_FROM_OPENGL
 
 METADATA, IMAGES = "metadata", "rgbs"
@@ -47,17 +46,10 @@ def read_meganerf(folder: Path) -> KnownPoses:
 def _load(file: Path) -> dict[str, np.ndarray]:
     import torch
 
-    try:
+    with reading(f"The camera {file}", "W, H, intrinsics and c2w, as Mega-NeRF writes them"):
         data = torch.load(file, map_location="cpu", weights_only=True)  # tensors and plain values only
         found = {key: np.asarray(data[key], dtype=np.float64) for key in ("W", "H", "intrinsics", "c2w")}
-    except Exception as error:  # a damaged file raises nearly anything
-        raise InputError(
-            f"The camera {file} cannot be read ({error}).", "It needs W, H, intrinsics and c2w."
-        ) from error
-    if found["c2w"].shape != (3, 4) or found["intrinsics"].shape != (4,):
-        raise InputError(
-            f"The camera {file} holds c2w {found['c2w'].shape} and intrinsics {found['intrinsics'].shape}, "
-            "expected (3, 4) and (4,).",
-            "It is not one of Mega-NeRF's.",
-        )
+        shapes = found["c2w"].shape, found["intrinsics"].shape
+        if shapes != ((3, 4), (4,)):
+            raise ValueError(f"it holds c2w {shapes[0]} and intrinsics {shapes[1]}, expected (3, 4) and (4,)")
     return found

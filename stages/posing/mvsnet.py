@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from stages.errors import InputError
-from stages.posing.known import KnownCamera, KnownPoses, image_size, nearest_rotation
+from stages.posing.known import KnownPoses, pinhole, reading
 
 CAMERA = "_cam.txt"
 CAMERAS = "cams"
@@ -45,30 +45,17 @@ def read_mvsnet(folder: Path) -> KnownPoses:
         if image is None:
             continue
         pose, intrinsics = _load(file)
-        rotation = nearest_rotation(pose[:3, :3], stem, file)
-        cameras.append(
-            KnownCamera(
-                name=image.name,
-                size=image_size(image, file),
-                model="PINHOLE",
-                params=tuple(float(intrinsics[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2))),
-                cam_from_world=np.concatenate([rotation, pose[:3, 3:]], 1),
-            )
-        )
+        cameras.append(pinhole(image.name, image, intrinsics, pose[:3], file))
     return KnownPoses(folder, tuple(cameras))
 
 
 def _load(file: Path) -> tuple[np.ndarray, np.ndarray]:
     """Pose [4, 4] and intrinsics [3, 3]."""
-    try:
+    with reading(f"The camera {file}", "`extrinsic` and 16 numbers, `intrinsic` and 9"):
         words = file.read_text(encoding="utf-8").split()
         start = words.index("extrinsic") + 1, words.index("intrinsic") + 1
         pose, intrinsics = (
             np.array(words[first : first + side * side], dtype=np.float64).reshape(side, side)
             for first, side in zip(start, (4, 3), strict=True)
         )
-    except (OSError, ValueError) as error:
-        raise InputError(
-            f"The camera {file} cannot be read ({error}).", "It needs `extrinsic` and 16 numbers, `intrinsic` and 9."
-        ) from error
     return pose, intrinsics

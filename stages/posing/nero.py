@@ -12,8 +12,9 @@ from typing import Any
 
 import numpy as np
 
+from stages.artifacts import KnownSphere
 from stages.errors import InputError
-from stages.posing.known import KnownCamera, KnownPoses, StatedRegion, image_size, nearest_rotation
+from stages.posing.known import KnownPoses, pinhole, reading
 
 CAMERA, DEPTH = "-camera.pkl", "-depth.png"
 # Depth is stored in 16 bits from 0 to 15; what is nearer than 14.5 is the object.
@@ -52,21 +53,12 @@ def read_nero(folder: Path) -> KnownPoses:
     cameras, masks = [], {}
     for file in sorted(folder.glob(f"*{CAMERA}"), key=lambda path: (len(path.name), path.name)):
         stem = file.name.removesuffix(CAMERA)
-        pose, intrinsics = _load(file)
-        rotation = nearest_rotation(pose[:, :3], stem, file)
         name = f"{stem}.png"
-        cameras.append(
-            KnownCamera(
-                name=name,
-                size=image_size(folder / name, file),
-                model="PINHOLE",
-                params=tuple(float(intrinsics[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2))),
-                cam_from_world=np.concatenate([rotation, pose[:, 3:]], 1),
-            )
-        )
+        pose, intrinsics = _load(file)
+        cameras.append(pinhole(name, folder / name, intrinsics, pose, file))
         if (folder / f"{stem}{DEPTH}").is_file():
             masks[name] = folder / f"{stem}{DEPTH}"
-    region = StatedRegion(np.zeros(3), 1.0, "the unit sphere of GlossySynthetic")
+    region = KnownSphere(center=np.zeros(3), radius=1.0, source="the unit sphere of GlossySynthetic")
     return KnownPoses(folder, tuple(cameras), region, masks)
 
 
@@ -101,26 +93,14 @@ def read_split(file: Path) -> list[str]:
     Raises:
         InputError: it cannot be read.
     """
-    try:
-        with file.open("rb") as stream:
-            return [str(stem) for stem in _ArraysOnly(stream).load()[0]]
-    except Exception as error:  # a damaged pickle raises nearly anything
-        raise InputError(
-            f"The split {file} cannot be read ({error}).", "It needs NeRO's configs/synthetic_split_128.pkl."
-        ) from error
+    with reading(f"The split {file}", "NeRO's configs/synthetic_split_128.pkl"), file.open("rb") as stream:
+        return [str(stem) for stem in _ArraysOnly(stream).load()[0]]
 
 
 def _load(file: Path) -> tuple[np.ndarray, np.ndarray]:
     """Pose [3, 4] and intrinsics [3, 3]."""
-    try:
-        with file.open("rb") as stream:
-            pose, intrinsics = _ArraysOnly(stream).load()[:2]
-        pose, intrinsics = np.asarray(pose, dtype=np.float64), np.asarray(intrinsics, dtype=np.float64)
-    except Exception as error:  # a damaged pickle raises nearly anything
-        raise InputError(f"The camera {file} cannot be read ({error}).", "It needs a pose and intrinsics.") from error
-    if pose.shape[-1:] != (4,) or pose.shape[:-1] not in ((3,), (4,)) or intrinsics.shape != (3, 3):
-        raise InputError(
-            f"The camera {file} holds arrays {pose.shape} and {intrinsics.shape}, expected (3, 4) and (3, 3).",
-            "It needs a pose and intrinsics.",
-        )
+    with reading(f"The camera {file}", "a pose and intrinsics"), file.open("rb") as stream:
+        pose, intrinsics = (np.asarray(array, dtype=np.float64) for array in _ArraysOnly(stream).load()[:2])
+        if pose.shape not in ((3, 4), (4, 4)) or intrinsics.shape != (3, 3):
+            raise ValueError(f"it holds arrays {pose.shape} and {intrinsics.shape}, expected (3, 4) and (3, 3)")
     return pose[:3], intrinsics

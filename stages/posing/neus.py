@@ -6,13 +6,13 @@ sphere to the sphere of the world that holds the object.
 
 from __future__ import annotations
 
-import zipfile
 from pathlib import Path
 
 import numpy as np
 
+from stages.artifacts import KnownSphere
 from stages.errors import InputError
-from stages.posing.known import KnownCamera, KnownPoses, StatedRegion, image_size
+from stages.posing.known import KnownCamera, KnownPoses, image_size, reading
 
 FILES = ("cameras_sphere.npz", "cameras.npz")
 IMAGES, MASKS = "image", "mask"
@@ -52,7 +52,7 @@ def read_neus(file: Path) -> KnownPoses:
         cameras.append(KnownCamera(name, size, "PINHOLE", tuple(map(float, params)), pose))
     world_from_unit = _matrix(matrices, "scale_mat_0", file)
     radius = float(np.cbrt(abs(np.linalg.det(world_from_unit[:3, :3]))))
-    region = StatedRegion(world_from_unit[:3, 3].copy(), radius, f"scale_mat of {file.name}")
+    region = KnownSphere(center=world_from_unit[:3, 3].copy(), radius=radius, source=f"scale_mat of {file.name}")
     paired = dict(zip(names, (file.parent / mask for mask in masks), strict=True)) if len(masks) == len(names) else {}
     return KnownPoses(file, tuple(cameras), region, paired)
 
@@ -80,11 +80,8 @@ def _files(folder: Path) -> list[str]:
 
 
 def _load(file: Path) -> dict[str, np.ndarray]:
-    try:
-        with np.load(file) as data:  # arrays only: pickles are refused
-            return {key: np.asarray(data[key], dtype=np.float64) for key in data.files}
-    except (OSError, ValueError, zipfile.BadZipFile) as error:
-        raise InputError(f"{file} cannot be read ({error}).", "It needs world_mat_i and scale_mat_i.") from error
+    with reading(str(file), "world_mat_i and scale_mat_i"), np.load(file) as data:  # arrays only: pickles are refused
+        return {key: np.asarray(data[key], dtype=np.float64) for key in data.files}
 
 
 def _matrix(matrices: dict[str, np.ndarray], key: str, file: Path) -> np.ndarray:

@@ -14,8 +14,9 @@ from typing import Any
 
 import numpy as np
 
+from stages.artifacts import KnownSphere
 from stages.errors import InputError
-from stages.posing.known import SUFFIX, KnownCamera, KnownPoses, StatedRegion, image_size, nearest_rotation
+from stages.posing.known import SUFFIX, KnownCamera, KnownPoses, image_size, nearest_rotation, reading
 
 FILES = ("transforms.json", "transforms_train.json")
 SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG", ".webp")
@@ -40,20 +41,17 @@ def read_transforms(file: Path) -> KnownPoses:
     """
     data = _load(file)
     original_from_data = _original_from_data(data, file)
-    cameras = tuple(
-        _camera(frame, data, original_from_data, file) for frame in sorted(data["frames"], key=lambda f: f["file_path"])
-    )
+    frames = sorted(data["frames"], key=lambda frame: frame["file_path"])
+    cameras = tuple(_camera({**data, **frame}, original_from_data, file) for frame in frames)
     region = None
     if "camera_angle_x" in data and not {"fl_x", "aabb_scale", "applied_transform"} & set(data):
-        region = StatedRegion(np.zeros(3), SYNTHETIC_RADIUS, "the box of NeRF-synthetic")
+        region = KnownSphere(center=np.zeros(3), radius=SYNTHETIC_RADIUS, source="the box of NeRF-synthetic")
     return KnownPoses(file, cameras, region)
 
 
 def _load(file: Path) -> dict[str, Any]:
-    try:
+    with reading(str(file), "the JSON of nerfstudio or Blender"):
         data = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputError(f"{file} cannot be read ({error}).", "It needs the JSON of nerfstudio or Blender.") from error
     frames = data.get("frames") if isinstance(data, dict) else None
     if not isinstance(frames, list) or not frames:
         raise InputError(f"{file} has no `frames`.", "It needs the JSON of nerfstudio or Blender.")
@@ -78,11 +76,9 @@ def _original_from_data(data: Mapping[str, Any], file: Path) -> tuple[float, np.
 
 
 def _camera(
-    frame: Mapping[str, Any],
-    data: Mapping[str, Any],
-    original_from_data: tuple[float, np.ndarray, np.ndarray],
-    file: Path,
+    frame: Mapping[str, Any], original_from_data: tuple[float, np.ndarray, np.ndarray], file: Path
 ) -> KnownCamera:
+    """The camera of a frame, in which stands what is said of all of them, too."""
     name = PurePosixPath(frame["file_path"].replace("\\", "/")).as_posix()
     matrix = _array(frame.get("transform_matrix"), f"transform_matrix of {name}", file)
     if matrix.shape not in ((4, 4), (3, 4)):
@@ -91,17 +87,15 @@ def _camera(
     world_from_cam = turn @ nearest_rotation(matrix[:3, :3], name, file) @ OPENCV_FROM_OPENGL
     center = scale * turn @ matrix[:3, 3] + shift
     rotation = world_from_cam.T
-    size, model, params = _intrinsics(frame, data, name, file)
+    size, model, params = _intrinsics(frame, name, file)
     return KnownCamera(name, size, model, params, np.concatenate([rotation, -(rotation @ center)[:, None]], 1))
 
 
-def _intrinsics(
-    frame: Mapping[str, Any], data: Mapping[str, Any], name: str, file: Path
-) -> tuple[tuple[int, int], str, tuple[float, ...]]:
+def _intrinsics(frame: Mapping[str, Any], name: str, file: Path) -> tuple[tuple[int, int], str, tuple[float, ...]]:
     """Size, COLMAP's model and its parameters."""
 
     def value(key: str) -> float | None:
-        found = frame.get(key, data.get(key))
+        found = frame.get(key)
         if found is None:
             return None
         if not isinstance(found, (int, float)) or not math.isfinite(found):
@@ -126,17 +120,14 @@ def _intrinsics(
         size[1] / 2 if center_y is None else center_y,
     )
     distortion = {key: value(key) or 0.0 for key in ("k1", "k2", "k3", "k4", "p1", "p2")}
-    model = _model(frame, data, distortion, name, file)
+    model = _model(frame, distortion, name, file)
     params += tuple(distortion[key] for key in DISTORTIONS[model])
     return size, model, params + DENOMINATOR if model == "FULL_OPENCV" else params
 
 
-def _model(
-    frame: Mapping[str, Any], data: Mapping[str, Any], distortion: Mapping[str, float], name: str, file: Path
-) -> str:
+def _model(frame: Mapping[str, Any], distortion: Mapping[str, float], name: str, file: Path) -> str:
     """COLMAP's name of the camera model."""
-    fisheye = frame.get("is_fisheye", data.get("is_fisheye", False))
-    said = str(frame.get("camera_model", data.get("camera_model", "OPENCV_FISHEYE" if fisheye else "OPENCV")))
+    said = str(frame.get("camera_model", "OPENCV_FISHEYE" if frame.get("is_fisheye") else "OPENCV"))
     if said == "OPENCV_FISHEYE":
         return said
     if said in ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL") and not distortion["k4"]:

@@ -124,20 +124,16 @@ def _match(database_path: Path, model: Any, params: Any, threads: int, cuda: boo
     """All pairs of small sets, else neighbours in space: the poses say which these are."""
     import pycolmap
 
-    common = match_options(params, threads, cuda)
+    options = match_options(params, threads, cuda)
     matcher = params.matcher
     if matcher == "auto":
         matcher = "exhaustive" if model.num_reg_images() <= params.exhaustive_max else "spatial"
-    if matcher == "exhaustive":
-        pycolmap.match_exhaustive(database_path, **common)
-    elif matcher == "sequential":
-        pycolmap.match_sequential(database_path, **common)
-    else:
+    if matcher == "spatial":
         _write_positions(database_path, model)
-        pairing = pycolmap.SpatialPairingOptions()
+        options["pairing_options"] = pairing = pycolmap.SpatialPairingOptions()
         pairing.max_num_neighbors = NEIGHBOURS
         pairing.max_distance, pairing.ignore_z = 1e12, False  # the unit of the poses is not known
-        pycolmap.match_spatial(database_path, pairing_options=pairing, **common)
+    getattr(pycolmap, f"match_{matcher}")(database_path, **options)
     return matcher
 
 

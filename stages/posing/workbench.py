@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 import shutil
+import tempfile
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -90,9 +91,9 @@ class Workbench:
         self.threads, self.workers = threads, workers
         self.cuda = cuda and pycolmap.has_cuda
         self._progress, self._rung = progress, ""
+        self._other = "global" if params.mapper == "incremental" else "incremental"
         self._guided = self._relaxed = self._stationary = False
         self._latest = Base(masked=params.masks == "always")
-        self._maps = 0
         self._import(self._latest)
         with pycolmap.Database.open(self.database(self._latest)) as database:
             self.located = database.num_pose_priors()
@@ -106,7 +107,6 @@ class Workbench:
 
     def rungs(self) -> list[Rung]:
         """All attempts, the cheap and likely ones first."""
-        other = "global" if self.params.mapper == "incremental" else "incremental"
         masked = self.params.masks == "auto" and all(record.has_mask for record in self.image_set.images)
         return [
             self._rung_of(f"{self.matcher} matching", self.first),
@@ -115,7 +115,7 @@ class Workbench:
             self._rung_of("features inside the masks", self.inside_masks, lambda best: masked),
             self._rung_of("affine features", self.affine_features),
             self._rung_of("guided matching", self.guided_matching),
-            self._rung_of(f"{other} mapper", self.other_mapper),
+            self._rung_of(f"{self._other} mapper", self.other_mapper),
             self._rung_of(RELAXED, self.relaxed_thresholds),
         ]
 
@@ -175,9 +175,7 @@ class Workbench:
 
     def other_mapper(self, best: Solution | None) -> Solution | None:
         """All poses at once instead of one after another, or the reverse."""
-        return self._solve(
-            self._base_of(best), "global" if self.params.mapper == "incremental" else "incremental"
-        )  # fmt: skip
+        return self._solve(self._base_of(best), self._other)
 
     def relaxed_thresholds(self, best: Solution | None) -> Solution | None:
         """Photos left out are believed on fewer matches; the others stay where they are."""
@@ -192,11 +190,8 @@ class Workbench:
 
     def contradicted(self, best: Solution) -> list[tuple[float, float]]:
         """Focal lengths in pixels, as EXIF and as the poses have them, of the cameras where they differ much."""
-        pairs = [
-            (self.priors[i], camera.mean_focal_length())
-            for i, camera in best.model.cameras.items()
-            if i in self.priors
-        ]  # fmt: skip
+        cameras = best.model.cameras
+        pairs = [(prior, cameras[i].mean_focal_length()) for i, prior in self.priors.items() if i in cameras]
         return [(prior, found) for prior, found in pairs if max(found / prior, prior / found) > DOUBTFUL_FOCAL]
 
     # ------------------------------------------------------------ what rungs share
@@ -293,9 +288,8 @@ class Workbench:
         )
 
     def _matching(self) -> dict[str, Any]:
-        return match_options(
-            self.params, self.threads, self.cuda, self._guided, self.verified, self._stationary
-        )  # fmt: skip
+        flags = self._guided, self.verified, self._stationary
+        return match_options(self.params, self.threads, self.cuda, *flags)
 
     @property
     def verified(self) -> int:
@@ -310,12 +304,7 @@ class Workbench:
     def _match(self, base: Base) -> None:
         import pycolmap
 
-        matchers: dict[str, Any] = {
-            "exhaustive": pycolmap.match_exhaustive,
-            "spatial": pycolmap.match_spatial,
-            "sequential": pycolmap.match_sequential,
-        }
-        matchers[self.matcher](self.database(base), **self._matching())
+        getattr(pycolmap, f"match_{self.matcher}")(self.database(base), **self._matching())
 
     def _match_pairs(self, base: Base, pairs: Iterable[tuple[int, int]]) -> None:
         """Match and verify pairs of image ids; those that are verified already are left as they are."""
@@ -378,10 +367,7 @@ class Workbench:
         return [*self._map_incremental(base, joined[0]), *joined[1:]]
 
     def _new_folder(self) -> Path:
-        out = self.work / f"models-{self._maps}"
-        self._maps += 1
-        out.mkdir()
-        return out
+        return Path(tempfile.mkdtemp(prefix="models-", dir=self.work))
 
     def _map_global(self, base: Base) -> list[Any]:
         import pycolmap
@@ -455,10 +441,10 @@ def choose_matcher(params: Any, located: int, num_images: int) -> str:
 
 def camera_params(model: str, focal: float, width: int, height: int) -> str:
     """COLMAP's parameter list: focal length(s), principal point at the middle, no distortion."""
-    focals = 2 if model in ("PINHOLE", "OPENCV") else 1
-    distortions = {"SIMPLE_PINHOLE": 0, "PINHOLE": 0, "SIMPLE_RADIAL": 1, "RADIAL": 2, "OPENCV": 4}[model]
-    values = [focal] * focals + [width / 2, height / 2] + [0.0] * distortions
-    return ",".join(f"{value:.8g}" for value in values)
+    import pycolmap
+
+    camera = pycolmap.Camera.create_from_model_name(0, model, focal, width, height)
+    return ",".join(f"{value:.8g}" for value in camera.params)
 
 
 def forget_focal_priors(path: Path, model: str) -> None:
