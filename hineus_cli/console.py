@@ -186,14 +186,20 @@ def table_of(first: str, *numbers: str) -> Table:
     return table
 
 
-def outcome_table(outcomes: Sequence[StageOutcome], width: int) -> Table:
-    """Stage, what became of it and why, its cost, where there is room its key numbers. The total is of what ran now."""
+def _stage_table(state: str, *numbers: str) -> Table:
+    """An empty table of stages: name, state, why, and columns of numbers."""
     table = Table(header_style="bold")
-    for heading in ("stage", "what"):
+    for heading in ("stage", state):
         table.add_column(heading, no_wrap=True)
     table.add_column("why", overflow="fold")
-    for heading in ("wall s", "CPU s", "peak GiB"):
+    for heading in numbers:
         table.add_column(heading, justify="right", no_wrap=True)
+    return table
+
+
+def outcome_table(outcomes: Sequence[StageOutcome], width: int) -> Table:
+    """Stage, what became of it and why, its cost, where there is room its key numbers. The total is of what ran now."""
+    table = _stage_table("what", "wall s", "CPU s", "peak GiB")
     if width >= WIDE:
         table.add_column("numbers", overflow="fold")
 
@@ -226,12 +232,7 @@ def outcome_table(outcomes: Sequence[StageOutcome], width: int) -> Table:
 
 def status_table(statuses: Sequence[StageStatus], width: int) -> Table:
     """Stage, how it stands and why, its size and time, where there is room what else it cost and its date."""
-    table = Table(header_style="bold")
-    for heading in ("stage", "state"):
-        table.add_column(heading, no_wrap=True)
-    table.add_column("why", overflow="fold")
-    for heading in ("size", "wall s", *(("CPU s", "peak GiB", "made (UTC)") if width >= WIDE else ())):
-        table.add_column(heading, justify="right", no_wrap=True)
+    table = _stage_table("state", "size", "wall s", *(("CPU s", "peak GiB", "made (UTC)") if width >= WIDE else ()))
     for status in statuses:
         made = status.manifest
         cells: list[str | Text] = [
