@@ -21,12 +21,12 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 
 from stages.artifacts import IMAGE_SET, PHOTOS, ImageRecord, ImageSet, SkippedImage
-from stages.capture.background import find_background, object_mask
+from stages.capture.background import PLAIN_PHOTOS, find_background, object_mask
 from stages.capture.exif import ORIENTATION, camera_key, focal_px, gps_position
-from stages.capture.listing import list_captures
+from stages.capture.listing import NAMED, list_captures, name_some
 from stages.capture.masks import check_size, match_masks, read_mask, write_mask
 from stages.capture.photo_reading import UnusableError, read_photo, register_formats
-from stages.capture.quality import sharpness
+from stages.capture.quality import Appearance, appearance, find_oddities
 from stages.capture.video import extract_frames
 from stages.engine.fingerprint import file_sha256
 from stages.engine.stage import Stage, StageContext
@@ -40,9 +40,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-PLAIN_PHOTOS = 0.9  # this part of the photos must have a plain background before masks are made from it
 JPEG_QUALITY = 97  # re-encoded lossy photos; visually lossless, about a third of PNG's size
-NAMED_IN_ERRORS = 3  # this many file names are spelt out in an error message
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -85,7 +83,7 @@ def run(context: StageContext[IngestParams]) -> dict[str, Any]:
     names = _Names(path for path, _ in unique)
     done = 0
 
-    def take(item: tuple[str, str]) -> ImageRecord | SkippedImage:
+    def take(item: tuple[str, str]) -> tuple[ImageRecord, Appearance] | SkippedImage:
         nonlocal done
         path, digest = item
         try:
@@ -97,7 +95,8 @@ def run(context: StageContext[IngestParams]) -> dict[str, Any]:
             context.progress(done, len(unique), path)
 
     outcomes = _in_threads(take, unique, context.workers)
-    images = sorted((o for o in outcomes if isinstance(o, ImageRecord)), key=lambda record: record.name)
+    taken = [o for o in outcomes if not isinstance(o, SkippedImage)]
+    images = sorted((record for record, _ in taken), key=lambda record: record.name)
     skipped += [o for o in outcomes if isinstance(o, SkippedImage)]
     if params.auto_mask == "plain":
         images, without = _mask_plain_backgrounds(images, context)
@@ -110,11 +109,14 @@ def run(context: StageContext[IngestParams]) -> dict[str, Any]:
     missing = [path for path in missing if any(record.source == path for record in images)]
     if missing:
         raise InputError(
-            f"{len(missing)} of {len(images)} photos have no mask in {masks_folder}: {_first(missing)}.",
+            f"{len(missing)} of {len(images)} photos have no mask in {masks_folder}: {name_some(missing)}.",
             f"Add {Path(missing[0]).stem}.png and the like, move those photos away, or run with `--no-masks`.",
         )
     for reason, sources in _by_reason(skipped).items():
-        log.warning("left out %s: %s", _first(sources), reason)
+        log.warning("left out %s: %s", name_some(sources), reason)
+    # a video's frames are the sharpest of their stretch and near each other by choice
+    for warning in find_oddities([seen for _, seen in taken if seen.source not in frames]).warnings:
+        log.warning("%s", warning)
     masked = sum(record.has_mask for record in images)
     if 0 < masked < len(images):
         log.warning("only %d of %d photos have a mask (from their alpha channel)", masked, len(images))
@@ -170,7 +172,7 @@ def _too_few(folder: Path, found: int, needed: int, skipped: list[SkippedImage])
         return InputError(f"The folder {folder} is empty: found 0 photos, need at least {needed}.", hint)
     message = f"Found {found} usable photo{'' if found == 1 else 's'} in {folder}, need at least {needed}."
     if skipped:
-        counts = Counter(item.reason for item in skipped).most_common(NAMED_IN_ERRORS)
+        counts = Counter(item.reason for item in skipped).most_common(NAMED)
         example = {item.reason: item.source for item in reversed(skipped)}
         reasons = "; ".join(f"{count} x {reason}, e.g. {example[reason]}" for reason, count in counts)
         message += f" {len(skipped)} file{'' if len(skipped) == 1 else 's'} left out: {reasons}."
@@ -181,7 +183,7 @@ def _tell_unused(poses: KnownPoses, used: set[str]) -> None:
     unused = [camera.name for camera in poses.cameras if camera.name not in used]
     if unused:
         total, file = len(poses.cameras), poses.origin.name
-        log.warning("%d of %d poses in %s have no photo: %s", len(unused), total, file, _first(unused))
+        log.warning("%d of %d poses in %s have no photo: %s", len(unused), total, file, name_some(unused))
 
 
 def _by_reason(skipped: list[SkippedImage]) -> dict[str, list[str]]:
@@ -213,11 +215,6 @@ def read_mask_file(
     mask = read_depth_mask(file)
     check_size(file, photo, mask.shape[::-1], size)
     return mask
-
-
-def _first(names: list[str]) -> str:
-    more = len(names) - NAMED_IN_ERRORS
-    return ", ".join(names[:NAMED_IN_ERRORS]) + (f" and {more} more" if more > 0 else "")
 
 
 def _sha256(path: Path) -> str:
@@ -291,7 +288,7 @@ def _mask_plain_backgrounds(
 # ---------------------------------------------------------------- one photo
 def _take_photo(
     file: Path, source: str, digest: str, mask_file: Path | None, names: _Names, context: StageContext[IngestParams]
-) -> ImageRecord:
+) -> tuple[ImageRecord, Appearance]:
     from PIL import Image
 
     photo = read_photo(file)
@@ -319,18 +316,20 @@ def _take_photo(
         write_mask(mask, pictures.mask_path(name), rgb.size)
 
     focal = focal_px(photo.exif, photo.stored_size)
-    return ImageRecord(
+    seen = appearance(source, np.asarray(rgb))
+    record = ImageRecord(
         name=name,
         source=source,
         width=rgb.width,
         height=rgb.height,
         focal_px=None if focal is None else focal * scale,
         camera=camera_key(photo.exif, rgb.size, source),
-        blur=sharpness(np.asarray(rgb)),
+        blur=seen.sharpness,
         has_mask=mask is not None,
         sha256=digest,
         gps=gps_position(photo.exif),
     )
+    return record, seen
 
 
 def _encoded_suffix(file: Path, lossy: bool) -> str:

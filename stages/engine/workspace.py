@@ -23,7 +23,6 @@ import socket
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +35,7 @@ from stages.engine.manifest import (
     now,
     output_problem,
 )
+from stages.engine.system import installed_version
 from stages.errors import WorkspaceError
 
 FORMAT = 1
@@ -373,10 +373,7 @@ def _parse_record(text: str, path: Path) -> Record:
 
 
 def _hineus_version() -> str:
-    try:
-        return metadata.version("hineus")
-    except metadata.PackageNotFoundError:
-        return "unknown"
+    return installed_version("hineus") or "unknown"
 
 
 # ---------------------------------------------------------------- files
