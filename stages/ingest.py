@@ -11,7 +11,7 @@ import logging
 import math
 import shutil
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from fnmatch import fnmatchcase
@@ -23,7 +23,7 @@ import numpy as np
 from stages.artifacts import IMAGE_SET, PHOTOS, ImageRecord, ImageSet, SkippedImage
 from stages.capture.background import PLAIN_PHOTOS, find_background, object_mask
 from stages.capture.exif import ORIENTATION, camera_key, focal_px, gps_position
-from stages.capture.listing import NAMED, list_captures, name_some
+from stages.capture.listing import NAMED, by_reason, list_captures, name_some
 from stages.capture.masks import check_size, match_masks, read_mask, write_mask
 from stages.capture.photo_reading import UnusableError, read_photo, register_formats
 from stages.capture.quality import Appearance, appearance, find_oddities
@@ -64,12 +64,12 @@ def run(context: StageContext[IngestParams]) -> dict[str, Any]:
         skipped += [SkippedImage(path, f"has no pose in {poses.origin.name}") for path in paths if path not in cameras]
         paths = list(cameras)
         _tell_unused(poses, {camera.name for camera in cameras.values()})
-    kept_back = [path for path in paths if _is_left_out(path, params.leave_out)]
-    skipped += [SkippedImage(path, "named in ingest.leave_out") for path in kept_back]
-    paths = [path for path in paths if path not in set(kept_back)]
+    unseen = {path for path in paths if any(fnmatchcase(path, pattern) for pattern in params.leave_out)}
+    skipped += [SkippedImage(path, "named in ingest.leave_out") for path in paths if path in unseen]
+    paths = [path for path in paths if path not in unseen]
 
     known = context.digests.get("photos", {})
-    digests = _in_threads(lambda path: known.get(path) or _sha256(files[path]), paths, context.workers)
+    digests = _in_threads(lambda path: known.get(path) or file_sha256(files[path]), paths, context.workers)
     first_with: dict[str, str] = {}
     unique: list[tuple[str, str]] = []
     for path, digest in zip(paths, digests, strict=True):
@@ -105,14 +105,13 @@ def run(context: StageContext[IngestParams]) -> dict[str, Any]:
 
     if len(images) < params.min_images:
         raise _too_few(source, len(images), params.min_images, skipped)
-    missing = [path for path, _ in unique if masks_folder and path not in mask_files]
-    missing = [path for path in missing if any(record.source == path for record in images)]
+    missing = [record.source for record in images if masks_folder and record.source not in mask_files]
     if missing:
         raise InputError(
             f"{len(missing)} of {len(images)} photos have no mask in {masks_folder}: {name_some(missing)}.",
             f"Add {Path(missing[0]).stem}.png and the like, move those photos away, or run with `--no-masks`.",
         )
-    for reason, sources in _by_reason(skipped).items():
+    for reason, sources in by_reason(skipped).items():
         log.warning("left out %s: %s", name_some(sources), reason)
     # a video's frames are the sharpest of their stretch and near each other by choice
     for warning in find_oddities([seen for _, seen in taken if seen.source not in frames]).warnings:
@@ -158,11 +157,6 @@ def _frames_of(
     return found, damaged
 
 
-def _is_left_out(path: str, patterns: Sequence[str]) -> bool:
-    """Whether a photo is one of those that no stage is to see."""
-    return any(fnmatchcase(path, pattern) for pattern in patterns)
-
-
 def _too_few(folder: Path, found: int, needed: int, skipped: list[SkippedImage]) -> InputError:
     hint = (
         f"Photograph the object from all sides: 30 to 100 sharp photos that overlap by two thirds. "
@@ -184,13 +178,6 @@ def _tell_unused(poses: KnownPoses, used: set[str]) -> None:
     if unused:
         total, file = len(poses.cameras), poses.origin.name
         log.warning("%d of %d poses in %s have no photo: %s", len(unused), total, file, name_some(unused))
-
-
-def _by_reason(skipped: list[SkippedImage]) -> dict[str, list[str]]:
-    sources: dict[str, list[str]] = {}
-    for item in skipped:
-        sources.setdefault(item.reason, []).append(item.source)
-    return sources
 
 
 def find_masks(photos: list[str], folder: Path, poses: KnownPoses | None) -> dict[str, Path]:
@@ -217,22 +204,14 @@ def read_mask_file(
     return mask
 
 
-def _sha256(path: Path) -> str:
-    try:
-        return file_sha256(path)
-    except OSError:
-        return f"unreadable:{path}"  # reading it as a photo fails next, with the reason
-
-
 class _Names:
     """Gives each photo one name under images/. Names depend on the folder, never on the order of work."""
 
     def __init__(self, paths: Iterable[str]) -> None:
-        self._own = set(paths)
+        own = set(paths)
         # case-insensitive file systems must not merge two photos
-        self._lower = Counter(path.lower() for path in self._own)
-        stems = Counter(str(PurePosixPath(path).with_suffix("")).lower() for path in self._own)
-        self._stems = stems
+        self._lower = {path.lower() for path in own}
+        self._stems = Counter(str(PurePosixPath(path).with_suffix("")).lower() for path in own)
 
     def target(self, path: str, suffix: str | None) -> str:
         """`path` itself (suffix None or unchanged), or its stem with `suffix`, unique in the folder."""

@@ -103,7 +103,7 @@ def test_a_scene_of_every_suite_comes_to_its_undistorted_photos_without_its_test
         in_poses = posed_scene.poses_from_scene.apply(posed_scene.cameras.centers[i])
         np.testing.assert_allclose(in_poses, true.centers[number], atol=1e-5)
     if suite == "nerf-synthetic":  # alpha is the mask
-        assert artifacts.load_mask(place / "undistort", posed_scene.cameras.names[0]) is not None
+        assert artifacts.Pictures(place / "undistort").mask(posed_scene.cameras.names[0]) is not None
 
 
 def test_one_json_a_run_with_settings_costs_and_scores(data: Path):

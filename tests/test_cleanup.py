@@ -52,7 +52,7 @@ def stage(tmp_path):
             import cv2
 
             for index, mask in masks(cameras):
-                path = artifacts.mask_path(undistort, cameras.names[index])
+                path = artifacts.Pictures(undistort).mask_path(cameras.names[index])
                 path.parent.mkdir(exist_ok=True)
                 cv2.imwrite(str(path), mask.astype(np.uint8) * 255)
         context = StageContext(

@@ -64,7 +64,7 @@ def write_transforms(undistort: Path, sfm: Path, place: Path, out: Path) -> dict
             # OpenGL axes: y up, z backward
             "transform_matrix": (np.linalg.inv(cam_from_world) @ np.diag([1.0, -1.0, -1.0, 1.0])).tolist(),
         }
-        mask = artifacts.mask_path(out, name)
+        mask = artifacts.Pictures(out).mask_path(name)
         if mask.exists():
             frame["mask_path"] = mask.relative_to(out).as_posix()
         frames.append(frame)
@@ -126,11 +126,12 @@ def undistorted_model(scene: PosedScene, in_world: Place, sfm: Path, images_fold
 
 
 def _copy_images(scene: PosedScene, undistort: Path, out: Path) -> None:
+    ours, theirs = artifacts.Pictures(undistort), artifacts.Pictures(out)
     for name in scene.cameras.names:
-        for place in (artifacts.image_path, artifacts.mask_path):
-            if place(undistort, name).exists():
-                place(out, name).parent.mkdir(parents=True, exist_ok=True)
-                shutil.copyfile(place(undistort, name), place(out, name))
+        for source, target in ((ours.path(name), theirs.path(name)), (ours.mask_path(name), theirs.mask_path(name))):
+            if source.exists():
+                target.parent.mkdir(parents=True, exist_ok=True)
+                shutil.copyfile(source, target)
 
 
 def _numbers(model: Any) -> dict[str, Any]:

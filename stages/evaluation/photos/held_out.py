@@ -39,6 +39,7 @@ def evaluate_views(workspace: Path, renders: Path | None = None, device: str = "
     """
     opened = _whole(workspace)
     undistort = opened.stage_folder("undistort")
+    pictures = artifacts.Pictures(undistort)
     held_out = artifacts.HELD_OUT.load(opened.stage_folder("train"))
     if not held_out:
         raise InputError(
@@ -50,10 +51,9 @@ def evaluate_views(workspace: Path, renders: Path | None = None, device: str = "
 
     def load(index: int) -> tuple[np.ndarray, np.ndarray | None]:
         nonlocal masked
-        name = cameras.names[index]
-        mask = artifacts.load_mask(undistort, name)
+        image, mask = pictures.masked(cameras.names[index])
         masked += mask is not None
-        return artifacts.load_image(undistort, name), None if mask is None else mask > 127
+        return image, mask
 
     lpips, about_lpips = find_lpips()
     indices = [cameras.names.index(name) for name in held_out]
