@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from configs.params import BakeParams
 from stages.artifacts import (
     ATLAS,
     BASE_COLOR,
@@ -20,9 +21,6 @@ from stages.artifacts import (
 )
 from stages.engine.stage import Stage, StageContext
 from stages.errors import ReconstructionError
-
-if TYPE_CHECKING:
-    from configs.params import BakeParams
 
 
 def run(context: StageContext[BakeParams]) -> dict[str, Any]:

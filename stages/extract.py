@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from configs.params import ExtractParams
 from stages.artifacts import CAMERAS, FIELD, RAW_MESH
 from stages.engine.stage import Stage, StageContext
 from stages.errors import ReconstructionError
 from stages.geometry.cameras import PinholeCameras
-
-if TYPE_CHECKING:
-    from configs.params import ExtractParams
 
 # However small the photos, a coarser grid than this loses the object's shape.
 MIN_RESOLUTION = 64

@@ -16,10 +16,11 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from fnmatch import fnmatchcase
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
+from configs.params import IngestParams
 from stages.artifacts import IMAGE_SET, PHOTOS, ImageRecord, ImageSet, SkippedImage
 from stages.capture.background import PLAIN_PHOTOS, find_background, object_mask
 from stages.capture.exif import ORIENTATION, camera_key, focal_px, gps_position
@@ -34,9 +35,6 @@ from stages.errors import InputError
 from stages.posing.known import KnownPoses, match_photos
 from stages.posing.nero import DEPTH, read_depth_mask
 from stages.posing.reading import read_poses
-
-if TYPE_CHECKING:
-    from configs.params import IngestParams
 
 log = logging.getLogger(__name__)
 
@@ -166,9 +164,8 @@ def _too_few(folder: Path, found: int, needed: int, skipped: list[SkippedImage])
         return InputError(f"The folder {folder} is empty: found 0 photos, need at least {needed}.", hint)
     message = f"Found {found} usable photo{'' if found == 1 else 's'} in {folder}, need at least {needed}."
     if skipped:
-        counts = Counter(item.reason for item in skipped).most_common(NAMED)
-        example = {item.reason: item.source for item in reversed(skipped)}
-        reasons = "; ".join(f"{count} x {reason}, e.g. {example[reason]}" for reason, count in counts)
+        frequent = sorted(by_reason(skipped).items(), key=lambda item: -len(item[1]))[:NAMED]
+        reasons = "; ".join(f"{len(files)} x {reason}, e.g. {files[0]}" for reason, files in frequent)
         message += f" {len(skipped)} file{'' if len(skipped) == 1 else 's'} left out: {reasons}."
     return InputError(message, hint)
 

@@ -196,7 +196,7 @@ def test_a_mesh_is_scored_in_the_frame_of_its_poses_whatever_gps_made_of_the_wor
     artifacts.PLACE.save(workspace.stage_folder("place"), moved)
     artifacts.SCENE.save(workspace.stage_folder("undistort"), scene)
     corners = np.eye(3)
-    artifacts.save_mesh(workspace.stage_folder("cleanup"), corners, np.array([[0, 1, 2]]))
+    artifacts.CLEAN_MESH.save(workspace.stage_folder("cleanup"), (corners, np.array([[0, 1, 2]])))
     world = scene.world_from_scene(moved).apply(corners)
     ours = result_mesh(workspace, {"cleanup"}, tmp_path / "ours.ply")
     assert ours is not None
