@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -34,7 +35,7 @@ def run(context: StageContext[ExtractParams]) -> dict[str, Any]:
         field.sdf,
         resolution,
         block=context.params.block,
-        progress=lambda done, total: context.progress(done, total, f"marching cubes at {resolution}^3"),
+        progress=partial(context.progress, note=f"marching cubes at {resolution}^3"),
     )
     if len(surface.faces) == 0:
         centre = float(field.sdf(np.zeros((1, 3), dtype=np.float32))[0])

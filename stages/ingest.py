@@ -66,26 +66,17 @@ def run(context: StageContext[IngestParams]) -> dict[str, Any]:
     skipped += [SkippedImage(path, "named in ingest.leave_out") for path in paths if path in unseen]
     paths = [path for path in paths if path not in unseen]
 
-    known = context.digests.get("photos", {})
-    digests = _in_threads(lambda path: known.get(path) or file_sha256(files[path]), paths, context.workers)
-    first_with: dict[str, str] = {}
-    unique: list[tuple[str, str]] = []
-    for path, digest in zip(paths, digests, strict=True):
-        if digest in first_with:
-            skipped.append(SkippedImage(path, f"same file as {first_with[digest]}"))
-        else:
-            first_with[digest] = path
-            unique.append((path, digest))
+    unique, copies = _without_copies(paths, files, context)
+    skipped += copies
 
-    mask_files = find_masks([path for path, _ in unique], masks_folder, poses) if masks_folder else {}
-    names = _Names(path for path, _ in unique)
+    mask_files = find_masks(list(unique), masks_folder, poses) if masks_folder else {}
+    names = _Names(unique)
     done = 0
 
-    def take(item: tuple[str, str]) -> tuple[ImageRecord, Appearance] | SkippedImage:
+    def take(path: str) -> tuple[ImageRecord, Appearance] | SkippedImage:
         nonlocal done
-        path, digest = item
         try:
-            return _take_photo(files[path], path, digest, mask_files.get(path), names, context)
+            return _take_photo(files[path], path, unique[path], mask_files.get(path), names, context)
         except UnusableError as reason:
             return SkippedImage(path, str(reason))
         finally:
@@ -153,6 +144,21 @@ def _frames_of(
         log.info("%s: %d frames", video, len(frames))
         found |= {f"{video}/{frame.name}": frame for frame in frames}
     return found, damaged
+
+
+def _without_copies(
+    paths: list[str], files: dict[str, Path], context: StageContext[IngestParams]
+) -> tuple[dict[str, str], list[SkippedImage]]:
+    """Photo -> sha256 of its file, in the order of `paths`; and those that are the same file as an earlier one."""
+    known = context.digests.get("photos", {})
+    digests = _in_threads(lambda path: known.get(path) or file_sha256(files[path]), paths, context.workers)
+    first_with: dict[str, str] = {}
+    copies = []
+    for path, digest in zip(paths, digests, strict=True):
+        first = first_with.setdefault(digest, path)
+        if first != path:
+            copies.append(SkippedImage(path, f"same file as {first}"))
+    return {path: digest for digest, path in first_with.items()}, copies
 
 
 def _too_few(folder: Path, found: int, needed: int, skipped: list[SkippedImage]) -> InputError:
