@@ -169,7 +169,7 @@ class Workspace:
         """Whether a process on this machine that took the lock is still there. Takes no lock, so it disturbs none."""
         try:
             data = json.loads((self.root / ".lock").read_bytes())
-            return data["host"] == socket.gethostname() and psutil.pid_exists(int(data["pid"]))
+            return data["host"] == socket.gethostname() and bool(psutil.pid_exists(int(data["pid"])))
         except (OSError, ValueError, KeyError, TypeError):
             return False
 
