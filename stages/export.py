@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from configs.params import ExportParams
 from stages import artifacts
 from stages.artifacts import ASSET, ATLAS, BASE_COLOR, NORMAL_MAP, OCCLUSION, PLACE, SCENE
 from stages.engine.stage import Stage, StageContext
@@ -20,7 +21,6 @@ from stages.geometry.place import Place
 from stages.geometry.similarity import Similarity
 
 if TYPE_CHECKING:
-    from configs.params import ExportParams
     from stages.files.contents import Textures
 
 

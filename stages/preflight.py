@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 from configs.params import Config
 from stages.capture.inspection import Inspection, inspect
-from stages.capture.listing import NAMED, name_some
+from stages.capture.listing import NAMED, by_reason, name_some
 
 Verdict = Literal["go", "go with warnings", "no-go"]
 
@@ -156,12 +156,8 @@ def _warnings(seen: Inspection, config: Config) -> list[str]:
     if config.ingest.min_images <= len(seen.sizes) < FEW_PHOTOS:
         found.append(f"Only {len(seen.sizes)} photos; 30 to 100 that overlap by two thirds give a whole object.")
     found += seen.oddities.warnings
-    unusable: dict[str, list[str]] = {}
-    for item in seen.skipped:
-        if not item.reason.startswith(EXPECTED):
-            unusable.setdefault(item.reason, []).append(item.source)
-    found += [f"Left out {name_some(names)}: {reason}." for reason, names in unusable.items()]
-    return found
+    unusable = by_reason(item for item in seen.skipped if not item.reason.startswith(EXPECTED))
+    return found + [f"Left out {name_some(names)}: {reason}." for reason, names in unusable.items()]
 
 
 def facts(done: Preflight) -> list[tuple[str, str]]:

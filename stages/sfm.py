@@ -10,8 +10,9 @@ import shutil
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from configs.params import SfmParams
 from stages.artifacts import (
     GIVEN_POSES,
     IMAGE_SET,
@@ -31,9 +32,6 @@ from stages.posing.ladder import Step, climb, describe, photos_wanted
 from stages.posing.reading import read_poses
 from stages.posing.triangulation import triangulate
 from stages.posing.workbench import RELAXED, Workbench
-
-if TYPE_CHECKING:
-    from configs.params import SfmParams
 
 log = logging.getLogger(__name__)
 

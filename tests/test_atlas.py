@@ -209,7 +209,7 @@ def run_stage(tmp_path, mesh, **params):
     cleanup, out = tmp_path / "cleanup", tmp_path / "out"
     cleanup.mkdir()
     out.mkdir()
-    artifacts.save_mesh(cleanup, *mesh)
+    artifacts.CLEAN_MESH.save(cleanup, mesh)
     context = StageContext({"cleanup": cleanup}, {}, out, tmp_path, AtlasParams(**params))
     return ATLAS_STAGE.run(context), artifacts.ATLAS.load(out)
 

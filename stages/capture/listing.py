@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from stages.artifacts import SkippedImage
@@ -70,6 +70,14 @@ def _without_companions(
 
 def _stem(path: str) -> str:
     return str(Path(path).with_suffix("")).lower()
+
+
+def by_reason(skipped: Iterable[SkippedImage]) -> dict[str, list[str]]:
+    """Reason -> the files that were left out for it."""
+    sources: dict[str, list[str]] = {}
+    for item in skipped:
+        sources.setdefault(item.reason, []).append(item.source)
+    return sources
 
 
 def name_some(names: Sequence[str]) -> str:

@@ -12,6 +12,7 @@ from pydantic import BaseModel
 
 from stages.engine.fingerprint import Identity, SourceDigests
 from stages.engine.manifest import Manifest, current_versions, describe_outputs, jsonable, now
+from stages.engine.resources import ResourceMeter
 from stages.engine.stage import Stage, StageContext
 from stages.engine.status import StageStatus, stage_status
 from stages.engine.system import requirement_error
@@ -147,8 +148,6 @@ def _run_stage(
     workers: int,
     listener: Listener,
 ) -> Manifest:
-    from stages.engine.resources import ResourceMeter
-
     identity = status.identity
     if identity is None:
         raise ValueError(f"stage {stage.name} was asked to run before the stages it needs: {status.reason}")
@@ -223,7 +222,9 @@ def _check_outputs(stage: Stage[Any], manifest: Manifest) -> None:
         raise ValueError(f"stage {stage.name} wrote {strange} without declaring it, and did not write {missing}")
 
 
-def _describe(identity: Identity, out: Path, numbers: Mapping[str, Any], meter: Any, workspace: Workspace) -> Manifest:
+def _describe(
+    identity: Identity, out: Path, numbers: Mapping[str, Any], meter: ResourceMeter, workspace: Workspace
+) -> Manifest:
     with storage_errors(workspace.root, f"reading back '{identity.stage}'"):
         outputs = describe_outputs(out)
     return Manifest(

@@ -56,7 +56,7 @@ def result_mesh(workspace: Workspace, fresh: set[str], out: Path) -> Path | None
     """
     if "cleanup" not in fresh:
         return None
-    vertices, faces = artifacts.load_mesh(workspace.stage_folder("cleanup"))
+    vertices, faces = artifacts.CLEAN_MESH.load(workspace.stage_folder("cleanup"))
     scene = artifacts.SCENE.load(workspace.stage_folder("undistort"))
     _write(scene.poses_from_scene, (vertices, faces), out)
     return out
