@@ -15,9 +15,9 @@ from stages.artifacts import ASSET, ATLAS, BASE_COLOR, NORMAL_MAP, OCCLUSION, PL
 from stages.engine.stage import Stage, StageContext
 from stages.errors import ReconstructionError, SystemRequirementError
 from stages.geometry.cameras import PosedScene
-from stages.geometry.orientation import y_up_rotation
 from stages.geometry.place import Place
 from stages.geometry.similarity import Similarity
+from stages.geometry.up import y_up_rotation
 
 if TYPE_CHECKING:
     from configs.params import ExportParams

@@ -18,7 +18,8 @@ import numpy as np
 
 from stages.artifacts import VertexQuality
 from stages.geometry.cameras import PosedScene
-from stages.surface.triangle_mesh import face_areas, raycaster
+from stages.geometry.normalisation import perpendicular
+from stages.surface.triangle_mesh import face_areas, raycaster, sum_around
 
 # From this many photos on a vertex is seen well, if the best of them looks at it within about 60 degrees.
 ENOUGH_PHOTOS = 4
@@ -259,7 +260,7 @@ def _azimuths(directions: np.ndarray, reference: np.ndarray, up: np.ndarray) -> 
     """Degrees [N] that directions [N, 3] lie counter-clockwise of a reference [3], seen from above; -180..180."""
     flat = reference - (reference @ up) * up
     if np.linalg.norm(flat) < 1e-6 * np.linalg.norm(reference):  # straight up: any side is as good
-        flat = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
+        flat = perpendicular(up)
     return np.degrees(np.arctan2(directions @ np.cross(up, flat) / np.linalg.norm(up), directions @ flat))
 
 
@@ -282,4 +283,4 @@ def _extent(vertices: np.ndarray, scene: PosedScene) -> tuple[float, float]:
 
 def _vertex_areas(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """A third of the area of the faces around each vertex [V]."""
-    return np.bincount(faces.ravel(), np.repeat(face_areas(vertices, faces) / 3, 3), minlength=len(vertices))
+    return sum_around(faces, face_areas(vertices, faces)[:, None] / 3, len(vertices))[:, 0]

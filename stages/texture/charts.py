@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from stages.surface.triangle_mesh import face_adjacency, face_normals, label_pieces, vertex_normals
+from stages.surface.triangle_mesh import face_adjacency, face_areas, face_normals, label_pieces, vertex_normals
 
 # xatlas charts may cover at most the mesh's area over this: its time grows steeply with the size of a chart.
 CHARTS_AT_LEAST = 200
@@ -60,7 +60,6 @@ def unwrap_xatlas(
         AtlasTimeoutError: the limit was reached.
         AtlasProcessError: xatlas crashed, or its charts do not fit.
     """
-    area = float(np.linalg.norm(face_normals(vertices, faces), axis=1).sum()) / 2
     root = str(Path(__file__).resolve().parents[2])
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([root, os.environ.get("PYTHONPATH", "")])}
     with tempfile.TemporaryDirectory(prefix="atlas-") as folder:
@@ -69,7 +68,7 @@ def unwrap_xatlas(
             source,
             vertices=vertices,
             faces=faces,
-            max_chart_area=area / CHARTS_AT_LEAST,
+            max_chart_area=face_areas(vertices, faces).sum() / CHARTS_AT_LEAST,
             resolution=texture_size - padding,
             padding=padding,
         )
@@ -153,15 +152,14 @@ def _project(corners: np.ndarray, axis: np.ndarray) -> np.ndarray:
 
 def _cut_overlaps(flat: np.ndarray, axis: np.ndarray, adjacency: np.ndarray, corners: np.ndarray) -> np.ndarray:
     """Chart [F] of each face: connected, of one axis, and without two faces that overlap."""
-    same = axis[adjacency[:, 0]] == axis[adjacency[:, 1]]
-    charts = label_pieces(len(flat), adjacency, same)
+    adjacency = adjacency[axis[adjacency[:, 0]] == axis[adjacency[:, 1]]]
+    charts = label_pieces(len(flat), adjacency)
     pairs = overlapping_pairs(flat, charts)
     if len(pairs):
         # Lowest faces first, so that a winding ramp is cut once a turn.
         depth = corners.mean(1)[np.arange(len(axis)), axis // 2]
         layer = _layers(pairs, depth)
-        same &= layer[adjacency[:, 0]] == layer[adjacency[:, 1]]
-        charts = label_pieces(len(flat), adjacency, same)
+        charts = label_pieces(len(flat), adjacency[layer[adjacency[:, 0]] == layer[adjacency[:, 1]]])
     return charts
 
 
@@ -195,8 +193,7 @@ def _move_overlaps(layout: UvLayout, pairs: np.ndarray, texture_size: int, paddi
     area = np.abs(edges[:, 0, 0] * edges[:, 1, 1] - edges[:, 0, 1] * edges[:, 1, 0])
     layer = _layers(pairs, -area)  # large faces stay
     adjacency = face_adjacency(layout.faces)
-    together = layer[adjacency[:, 0]] == layer[adjacency[:, 1]]
-    charts = label_pieces(len(layout.faces), adjacency, together)
+    charts = label_pieces(len(layout.faces), adjacency[layer[adjacency[:, 0]] == layer[adjacency[:, 1]]])
     source, new_faces = _split_along_seams(layout.faces, charts)
     texels = layout.texels[source]
 
