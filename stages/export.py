@@ -144,7 +144,7 @@ def _write_usdz(asset: Asset) -> int:
     vertices, normals = asset.in_gltf(asset.mesh)
     uvs, faces = asset.mesh.uvs, asset.mesh.faces
     try:
-        data = usdz_bytes(vertices, normals, uvs, faces, asset.textures, meters_per_unit=1.0, extras=asset.extras)
+        data = usdz_bytes(vertices, normals, uvs, faces, asset.textures, extras=asset.extras)
     except ImportError as error:
         raise SystemRequirementError(
             f"USDZ files are written with usd-core, which cannot be imported: {error}.",
