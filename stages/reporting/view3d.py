@@ -15,6 +15,7 @@ from stages.artifacts import AtlasMesh, VertexQuality
 from stages.drawing.rendering import look_at
 from stages.geometry.cameras import PinholeCameras, PosedScene
 from stages.geometry.normalisation import perpendicular
+from stages.geometry.place import BOX_EDGES
 from stages.geometry.up import y_up_rotation
 from stages.reporting.next_views import NextView
 from stages.reporting.pictures import jpeg_uri, shrink
@@ -105,11 +106,9 @@ def pack_scene(
 
 
 def region_lines(box_corners: np.ndarray | None) -> np.ndarray:
-    """Line segments [2 L, 3]: the box of these corners [8, 3] (bit k of a corner's number is its side of axis k), or
-    three great circles of the unit sphere."""
+    """Line segments [2 L, 3]: the box of these corners [8, 3], or three great circles of the unit sphere."""
     if box_corners is not None:
-        edges = [(i, i | bit) for i in range(8) for bit in (1, 2, 4) if not i & bit]
-        return box_corners[np.array(edges).ravel()]
+        return box_corners[np.array(BOX_EDGES).ravel()]
     angles = np.linspace(0, 2 * np.pi, 65)
     circle = np.stack([np.cos(angles), np.sin(angles), np.zeros(65)], 1)
     segments = np.stack([circle[:-1], circle[1:]], 1).reshape(-1, 3)
