@@ -25,7 +25,7 @@ def run(context: StageContext[AtlasParams]) -> dict[str, Any]:
     method, why = "xatlas", ""
     try:
         layout = charts.unwrap_xatlas(vertices, faces, size, params.padding, params.time_limit)
-    except (charts.AtlasTimeoutError, charts.AtlasProcessError) as error:
+    except charts.XatlasError as error:
         method, why = "projected", str(error)
         logger.warning("%s; projecting along the axes instead", error)
         try:

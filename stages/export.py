@@ -16,9 +16,9 @@ from stages.engine.stage import Stage, StageContext
 from stages.engine.system import installed_version
 from stages.errors import ReconstructionError, SystemRequirementError
 from stages.geometry.cameras import PosedScene
-from stages.geometry.orientation import y_up_rotation
 from stages.geometry.place import Place
 from stages.geometry.similarity import Similarity
+from stages.geometry.up import y_up_rotation
 
 if TYPE_CHECKING:
     from stages.files.contents import Textures
@@ -144,7 +144,7 @@ def _write_usdz(asset: Asset) -> int:
     vertices, normals = asset.in_gltf(asset.mesh)
     uvs, faces = asset.mesh.uvs, asset.mesh.faces
     try:
-        data = usdz_bytes(vertices, normals, uvs, faces, asset.textures, meters_per_unit=1.0, extras=asset.extras)
+        data = usdz_bytes(vertices, normals, uvs, faces, asset.textures, extras=asset.extras)
     except ImportError as error:
         raise SystemRequirementError(
             f"USDZ files are written with usd-core, which cannot be imported: {error}.",

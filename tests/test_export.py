@@ -29,9 +29,9 @@ from stages.files.glb import glb_bytes, shapes_glb_bytes
 from stages.files.obj import obj_text
 from stages.files.ply_stl import ply_bytes
 from stages.geometry.cameras import PinholeCameras
-from stages.geometry.orientation import y_up_rotation
 from stages.geometry.place import Place
 from stages.geometry.similarity import Similarity
+from stages.geometry.up import y_up_rotation
 
 ROOT = Path(__file__).parents[1]
 # No rotation maps this tetrahedron with its four colours to its mirror image.

@@ -18,7 +18,7 @@ from configs.params import ReportParams
 from stages import artifacts
 from stages.engine.stage import StageContext
 from stages.engine.workspace import Record
-from stages.geometry.orientation import y_up_rotation
+from stages.geometry.up import y_up_rotation
 from stages.report import THREE
 from stages.reporting.curves import line_chart
 from stages.reporting.numbers import duration

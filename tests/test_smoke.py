@@ -10,7 +10,7 @@ import pytest
 
 from benchmarks import smoke
 from benchmarks.smoke import Bound, judge, load_bounds, record, table
-from stages.geometry.orientation import y_up_rotation
+from stages.geometry.up import y_up_rotation
 
 
 def _bound(value, better, slack):

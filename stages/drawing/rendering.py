@@ -7,18 +7,20 @@ import numpy as np
 
 from stages.drawing.rasterizing import NO_FACE, corner_weights, projected, rasterize
 from stages.geometry.cameras import PinholeCameras
+from stages.geometry.normalisation import perpendicular
 
 BACKGROUND = (255, 255, 255)
+FOV_DEG, ELEVATION_DEG = 35.0, 20.0
 
 
 def look_at(
-    eye: np.ndarray, target: np.ndarray, up: np.ndarray, width: int, height: int, fov_deg: float = 35.0
+    eye: np.ndarray, target: np.ndarray, up: np.ndarray, width: int, height: int, fov_deg: float = FOV_DEG
 ) -> PinholeCameras:
     """One camera at `eye` looking at `target`; `fov_deg` is the vertical field of view."""
     forward = (target - eye) / np.linalg.norm(target - eye)
     right = np.cross(forward, up)
-    if np.linalg.norm(right) < 1e-6:  # looking straight up or down: any right will do
-        right = np.cross(forward, np.eye(3)[np.argmin(np.abs(forward))])
+    if np.linalg.norm(right) < 1e-6:  # looking straight up or down
+        right = perpendicular(forward)
     right /= np.linalg.norm(right)
     rotation = np.stack([right, np.cross(forward, right), forward])
     focal = 0.5 * height / np.tan(np.radians(fov_deg) / 2)
@@ -31,28 +33,20 @@ def look_at(
 
 
 def turntable(
-    vertices: np.ndarray,
-    up: np.ndarray,
-    count: int = 4,
-    width: int = 480,
-    height: int = 480,
-    elevation_deg: float = 20.0,
-    fov_deg: float = 35.0,
+    vertices: np.ndarray, up: np.ndarray, count: int = 4, width: int = 480, height: int = 480
 ) -> list[PinholeCameras]:
-    """`count` cameras around the vertices' bounding sphere, evenly spaced about `up`, each seeing all of
-    it."""
+    """`count` cameras around the vertices' bounding sphere, evenly spaced about `up`, each seeing all of it."""
     up = up / np.linalg.norm(up)
     center = (vertices.min(0) + vertices.max(0)) / 2
     radius = max(float(np.linalg.norm(vertices - center, axis=1).max()), 1e-9)
-    side = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
-    side /= np.linalg.norm(side)
+    side = perpendicular(up)
     ahead = np.cross(up, side)
-    distance = 1.03 * radius / np.sin(np.radians(fov_deg) / 2) * max(1.0, height / width)
-    elevation = np.radians(elevation_deg)
+    distance = 1.03 * radius / np.sin(np.radians(FOV_DEG) / 2) * max(1.0, height / width)
+    elevation = np.radians(ELEVATION_DEG)
     views = []
     for angle in np.linspace(0, 2 * np.pi, count, endpoint=False):
         direction = np.cos(elevation) * (np.cos(angle) * side + np.sin(angle) * ahead) + np.sin(elevation) * up
-        views.append(look_at(center + distance * direction, center, up, width, height, fov_deg))
+        views.append(look_at(center + distance * direction, center, up, width, height))
     return views
 
 

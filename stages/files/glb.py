@@ -11,6 +11,7 @@ import numpy as np
 from stages.files.contents import ROUGHNESS, Textures, checked_mesh
 from stages.texture.tangents import vertex_tangents
 
+NAME = "model"
 _FLOAT, _UINT = 5126, 5125
 _ARRAY_BUFFER, _ELEMENT_ARRAY_BUFFER = 34962, 34963
 # Linear, with mip-maps where it shrinks, clamped at the edges.
@@ -23,7 +24,6 @@ def glb_bytes(
     uvs: np.ndarray,
     faces: np.ndarray,
     textures: Textures,
-    name: str = "model",
     generator: str = "hineus",
     extras: dict[str, Any] | None = None,
 ) -> bytes:
@@ -58,7 +58,7 @@ def glb_bytes(
         attributes["TANGENT"] = buffer.add_numbers(vertex_tangents(vertices, normals, uvs, faces), "VEC4")
     indices = buffer.add_numbers(faces.ravel(), "SCALAR", _ELEMENT_ARRAY_BUFFER)
     material: dict[str, Any] = {
-        "name": name,
+        "name": NAME,
         "pbrMetallicRoughness": {
             "baseColorTexture": {"index": buffer.add_image(textures.base_color, "base_color")},
             "metallicFactor": 0.0,
@@ -71,7 +71,7 @@ def glb_bytes(
         material["occlusionTexture"] = {"index": buffer.add_image(textures.occlusion, "occlusion")}
     primitive = {"attributes": attributes, "indices": indices, "material": 0}
     return buffer.file(
-        [{"name": name, "primitives": [primitive]}],
+        [{"name": NAME, "primitives": [primitive]}],
         generator,
         extras,
         materials=[material],

@@ -14,6 +14,7 @@ import numpy as np
 
 from stages.files.contents import ROUGHNESS, Textures, checked_mesh
 
+ROOT = "/model"
 ROOT_LAYER = "model.usdc"  # AR viewers want the binary form, and first in the package
 # Where files may begin in a package, in bytes; and the id of the zip's field that USD fills up with.
 ALIGNMENT, PADDING_FIELD = 64, 0x1986
@@ -25,20 +26,16 @@ def usdz_bytes(
     uvs: np.ndarray,
     faces: np.ndarray,
     textures: Textures,
-    meters_per_unit: float = 1.0,
-    name: str = "model",
     extras: dict[str, Any] | None = None,
 ) -> bytes:
     """A USDZ package of one mesh with one UsdPreviewSurface, as ARKit asks for it.
 
     Args:
-        vertices: [V, 3] in a right-handed, Y-up frame.
+        vertices: [V, 3] in a right-handed, Y-up frame; metres, as in glTF.
         normals: [V, 3] unit.
         uvs: [V, 2], origin at the bottom-left, as in USD.
         faces: [F, 3], counter-clockwise seen from outside.
         textures: of the material.
-        meters_per_unit: of the vertices.
-        name: of the root prim.
         extras: JSON-able, kept as text under "hineus" in the layer's own data.
 
     Raises:
@@ -55,8 +52,8 @@ def usdz_bytes(
     with tempfile.TemporaryDirectory(prefix="usdz-") as folder:
         layer = Path(folder) / ROOT_LAYER
         stage = Usd.Stage.CreateNew(str(layer))
-        _describe(stage, name, meters_per_unit, extras)
-        _add_material(stage, name, _add_mesh(stage, name, vertices, normals, uvs, faces), set(images))
+        _describe(stage, extras)
+        _add_material(stage, _add_mesh(stage, vertices, normals, uvs, faces), set(images))
         stage.GetRootLayer().Save()
         return _packed({ROOT_LAYER: layer.read_bytes(), **images})
 
@@ -77,22 +74,20 @@ def _packed(files: dict[str, bytes]) -> bytes:
     return data.getvalue()
 
 
-def _describe(stage: Any, name: str, meters_per_unit: float, extras: dict[str, Any] | None) -> None:
+def _describe(stage: Any, extras: dict[str, Any] | None) -> None:
     from pxr import UsdGeom
 
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
-    UsdGeom.SetStageMetersPerUnit(stage, meters_per_unit)
-    stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, f"/{name}").GetPrim())
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, ROOT).GetPrim())
     if extras:
         stage.GetRootLayer().customLayerData = {"hineus": json.dumps(extras)}
 
 
-def _add_mesh(
-    stage: Any, name: str, vertices: np.ndarray, normals: np.ndarray, uvs: np.ndarray, faces: np.ndarray
-) -> Any:
+def _add_mesh(stage: Any, vertices: np.ndarray, normals: np.ndarray, uvs: np.ndarray, faces: np.ndarray) -> Any:
     from pxr import Sdf, UsdGeom, Vt
 
-    mesh = UsdGeom.Mesh.Define(stage, f"/{name}/mesh")
+    mesh = UsdGeom.Mesh.Define(stage, f"{ROOT}/mesh")
     points = Vt.Vec3fArray.FromNumpy(vertices)
     mesh.CreatePointsAttr(points)
     mesh.CreateExtentAttr(UsdGeom.PointBased.ComputeExtent(points))
@@ -106,12 +101,12 @@ def _add_mesh(
     return mesh
 
 
-def _add_material(stage: Any, name: str, mesh: Any, files: set[str]) -> None:
+def _add_material(stage: Any, mesh: Any, files: set[str]) -> None:
     """A preview surface of the images `files`, bound to the mesh."""
     from pxr import Gf, Sdf, UsdShade
 
     types = Sdf.ValueTypeNames
-    material = UsdShade.Material.Define(stage, f"/{name}/material")
+    material = UsdShade.Material.Define(stage, f"{ROOT}/material")
 
     def shader(child: str, kind: str) -> Any:
         made = UsdShade.Shader.Define(stage, material.GetPath().AppendChild(child))

@@ -19,7 +19,7 @@ from stages.geometry.plane import Plane
 from stages.geometry.similarity import Similarity
 
 if TYPE_CHECKING:
-    from jaxtyping import Bool, Float, Float32, Float64, Integer
+    from jaxtyping import Bool, Float, Float32, Float64, Integer, Shaped
 
 
 @dataclass(frozen=True)
@@ -75,6 +75,16 @@ class PinholeCameras:
         """Which points lie before one camera and within its photo, hidden or not."""
         pixels, depth = self.project(index, points)
         return (depth > 0) & (pixels >= 0).all(1) & (pixels < self.sizes[index]).all(1)
+
+    def on_mask(
+        self, index: int, points: Float[np.ndarray, "p 3"], mask: Shaped[np.ndarray, "h w"]
+    ) -> tuple[Bool[np.ndarray, " p"], Bool[np.ndarray, " p"]]:
+        """Which points lie `in_frame`, and which of them on pixels of the photo's mask that are not zero."""
+        framed = self.in_frame(index, points)
+        columns, rows = np.floor(self.project(index, points[framed])[0]).astype(np.int64).T
+        on = framed.copy()
+        on[framed] = mask[rows, columns] != 0
+        return framed, on
 
     def rays(
         self, index: int, pixels: Float[np.ndarray, "p 2"]

@@ -58,15 +58,11 @@ def _inside_silhouettes(
 ) -> Bool[np.ndarray, " p"]:
     """Whether points lie inside the silhouettes of nearly all the views they project into."""
     seen, inside = np.zeros(len(points)), np.zeros(len(points))
-    masked = [i for i, mask in enumerate(masks) if mask is not None]
-    for i in masked:
-        pixels, depth = cameras.project(i, points)
-        width, height = cameras.sizes[i]
-        u, v = np.floor(pixels[:, 0]), np.floor(pixels[:, 1])
-        visible = (depth > 0) & (u >= 0) & (v >= 0) & (u < width) & (v < height)
-        rows, columns = v[visible].astype(int), u[visible].astype(int)
+    masked = [(i, mask) for i, mask in enumerate(masks) if mask is not None]
+    for i, mask in masked:
+        visible, on_object = cameras.on_mask(i, points, mask)
         seen += visible
-        inside[visible] += np.asarray(masks[i])[rows, columns] > 0
+        inside += on_object
     # a voxel most views do not see is no part of what they were pointed at
     return (seen >= max(1.0, 0.5 * len(masked))) & (inside >= HULL_AGREEMENT * seen)
 

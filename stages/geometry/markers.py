@@ -66,13 +66,13 @@ def measure_markers(
         seen: one dictionary per camera, see `detect_markers`.
         size: true length of a side, metres.
     """
-    sightings: dict[int, list[int]] = defaultdict(list)
+    sightings: dict[int, list[tuple[int, Float[np.ndarray, "4 2"]]]] = defaultdict(list)
     for index, markers in enumerate(seen):
-        for number in markers:
-            sightings[number].append(index)
+        for number, quad in markers.items():
+            sightings[number].append((index, quad))
     ratios, measured = [], 0
     for number in sorted(sightings):
-        corners = [_place_corner(cameras, seen, sightings[number], number, k) for k in range(4)]
+        corners = [_place_corner(cameras, [(i, quad[k]) for i, quad in sightings[number]]) for k in range(4)]
         sides = [
             size / float(np.linalg.norm(a - b))
             for a, b in zip(corners, corners[1:] + corners[:1], strict=True)
@@ -88,18 +88,14 @@ def measure_markers(
 
 
 def _place_corner(
-    cameras: PinholeCameras,
-    seen: Sequence[dict[int, Float[np.ndarray, "4 2"]]],
-    indices: list[int],
-    number: int,
-    k: int,
+    cameras: PinholeCameras, sightings: Sequence[tuple[int, Float[np.ndarray, " 2"]]]
 ) -> Float[np.ndarray, " 3"] | None:
-    """Where corner `k` of a marker is, or None where its sightings do not tell."""
-    rays = [cameras.rays(i, seen[i][number][k][None]) for i in indices]
+    """Where a corner is that these cameras see at these pixels, or None where they do not tell."""
+    rays = [cameras.rays(i, pixel[None]) for i, pixel in sightings]
     origins = np.concatenate([origin for origin, _ in rays])
     directions = np.concatenate([direction for _, direction in rays])
     if len(rays) < 2 or (directions @ directions.T).min() > np.cos(np.radians(MIN_PARALLAX_DEG)):
         return None
     corner, _ = meeting_point(origins, directions)
-    misses = [np.linalg.norm(cameras.project(i, corner[None])[0][0] - seen[i][number][k]) for i in indices]
+    misses = [np.linalg.norm(cameras.project(i, corner[None])[0][0] - pixel) for i, pixel in sightings]
     return corner if np.median(misses) <= MAX_MISS_PX else None

@@ -17,11 +17,16 @@ def rotation_onto(source: Float[np.ndarray, " 3"], target: Float[np.ndarray, " 3
     """The smallest rotation that takes unit vector `source` to unit vector `target`."""
     cross, cosine = np.cross(source, target), float(source @ target)
     if cosine < -1 + 1e-9:  # opposite: half a turn about any axis perpendicular to it
-        axis = np.cross(source, np.eye(3)[np.argmin(np.abs(source))])
-        axis /= np.linalg.norm(axis)
+        axis = perpendicular(source)
         return 2 * np.outer(axis, axis) - np.eye(3)
     K = np.array([[0, -cross[2], cross[1]], [cross[2], 0, -cross[0]], [-cross[1], cross[0], 0]])
     return np.eye(3) + K + K @ K / (1 + cosine)
+
+
+def perpendicular(direction: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " 3"]:
+    """A unit vector at right angles to a direction; any will do."""
+    side = np.cross(direction, np.eye(3)[np.argmin(np.abs(direction))])
+    return side / np.linalg.norm(side)
 
 
 def scene_frame(center: Float[np.ndarray, " 3"], radius: float, up: Float[np.ndarray, " 3"]) -> Similarity:

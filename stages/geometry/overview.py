@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from stages.geometry.cameras import PosedScene
+from stages.geometry.place import BOX_EDGES
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -69,8 +70,7 @@ def _region(box_corners: Float[np.ndarray, "8 3"] | None, axis: int, reach: floa
     shapes = f'<circle cx="{middle}" cy="{middle}" r="{SIDE / 2 / reach:.1f}" {stroke}/>'
     if box_corners is not None:
         page = _on_page(box_corners, axis, reach)
-        edges = [(i, i | bit) for i in range(8) for bit in (1, 2, 4) if not i & bit]
-        path = "".join(f"M{page[i, 0]:.1f} {page[i, 1]:.1f}L{page[j, 0]:.1f} {page[j, 1]:.1f}" for i, j in edges)
+        path = "".join(f"M{page[i, 0]:.1f} {page[i, 1]:.1f}L{page[j, 0]:.1f} {page[j, 1]:.1f}" for i, j in BOX_EDGES)
         shapes += f'<path d="{path}" {stroke}/>'
     return shapes
 

@@ -31,6 +31,8 @@ SAMPLES, OUTLIER_SIGMAS = 500, 3.0
 PRECISION = 1e-5
 # The sphere about a given box has some air at the corners, because the mesh is cut off near the sphere.
 BOX_MARGIN = 1.05
+# Edges of a box as pairs of corners; bit k of a corner's number is its side of axis k.
+BOX_EDGES = [(i, i | bit) for i in range(8) for bit in (1, 2, 4) if not i & bit]
 
 
 @dataclass(frozen=True)
@@ -109,7 +111,7 @@ class GivenRegion:
     world_from_poses: Similarity
 
     def box_corners(self) -> Float[np.ndarray, "8 3"] | None:
-        """Corners of the box in the frame of the poses; bit k of a corner's number is its side of axis k."""
+        """Corners of the box in the frame of the poses, numbered as in `BOX_EDGES`."""
         if self.box is None:
             return None
         picks = np.array([[i >> k & 1 for k in range(3)] for i in range(8)])
@@ -173,7 +175,7 @@ def _earth_centred(positions: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 
     return np.stack([across * np.cos(longitude), across * np.sin(longitude), along_axis], 1)
 
 
-def locate(centers: Float[np.ndarray, "n 3"], positions: Float[np.ndarray, "n 3"], seed: int = 0) -> Located:
+def locate(centers: Float[np.ndarray, "n 3"], positions: Float[np.ndarray, "n 3"]) -> Located:
     """Align camera centres to their GPS positions.
 
     The least median of squares over triples, then least squares over the photos that fit.
@@ -181,7 +183,6 @@ def locate(centers: Float[np.ndarray, "n 3"], positions: Float[np.ndarray, "n 3"
     Args:
         centers: in the model's frame.
         positions: latitude, longitude (degrees), altitude (metres).
-        seed: of the triples.
 
     Raises:
         ValueError: why GPS does not tell the place, with the numbers found.
@@ -194,7 +195,7 @@ def locate(centers: Float[np.ndarray, "n 3"], positions: Float[np.ndarray, "n 3"
     _, lengths, _ = np.linalg.svd(centers - centers.mean(0))
     if lengths[1] < MIN_STRIP * lengths[0]:
         raise ValueError("the photos were taken from one line, and the turn about it stays open")
-    kept = _agreeing(centers, targets, seed)
+    kept = _agreeing(centers, targets)
     if kept.sum() < max(MIN_LOCATED, MIN_AGREEING * len(centers)):
         raise ValueError(f"only {kept.sum()} of {len(centers)} GPS positions agree with the cameras and each other")
     world_from_poses = align_points(centers[kept], targets[kept])
@@ -215,11 +216,9 @@ def locate(centers: Float[np.ndarray, "n 3"], positions: Float[np.ndarray, "n 3"
     return Located(world_from_poses, origin, residual, residual / np.sqrt(3 * count) / total, float(tilt), count)
 
 
-def _agreeing(
-    centers: Float[np.ndarray, "n 3"], targets: Float[np.ndarray, "n 3"], seed: int
-) -> Bool[np.ndarray, " n"]:
+def _agreeing(centers: Float[np.ndarray, "n 3"], targets: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
     """Photos whose position agrees with the similarity that most agree with."""
-    random = np.random.default_rng(seed)
+    random = np.random.default_rng(0)
     best, best_misses = np.inf, np.zeros(len(centers))
     for _ in range(SAMPLES):
         triple = random.choice(len(centers), 3, replace=False)

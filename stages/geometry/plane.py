@@ -64,7 +64,6 @@ def find_ground(
     up: Float[np.ndarray, " 3"],
     center: Float[np.ndarray, " 3"],
     radius: float,
-    seed: int = 0,
 ) -> Plane | None:
     """The plane nearly all else stands on, or None where the points show none.
 
@@ -74,13 +73,12 @@ def find_ground(
         points: sparse points.
         up: unit, roughly.
         center, radius: the region of interest; lengths are judged against its radius.
-        seed: of the triples.
     """
     near = points[np.linalg.norm(points - center, axis=1) < REACH * radius] - center
     if len(near) < MIN_POINTS:
         return None
     above = camera_centers - center
-    random = np.random.default_rng(seed)
+    random = np.random.default_rng(0)
     corners = near[random.integers(0, len(near), (HYPOTHESES, 3))]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     lengths = np.linalg.norm(normals, axis=1)

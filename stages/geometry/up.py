@@ -1,4 +1,5 @@
-"""Which way is up: from the ground's plane, or from how the cameras are held. GPS tells it better, see `place`.
+"""Which way is up: from the ground's plane, or from how the cameras are held. GPS tells it better, see `place`. And
+turning the world for file formats and screens that want +Y on top.
 
 EXIF carries no gravity that could be trusted: its orientation flag is a multiple of 90 degrees. Ingest turns the
 photos by it, and that is what makes the cameras' own up worth something.
@@ -12,6 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from stages.geometry.cameras import PinholeCameras
+from stages.geometry.normalisation import rotation_onto
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -68,6 +70,14 @@ def choose_up(cameras: Up, ground: Float[np.ndarray, " 3"] | None) -> Up:
     if ground is not None and (not cameras.sure or angle_deg(ground, cameras.direction) <= MAX_SLOPE_DEG):
         return Up(ground, "the ground's plane")
     return cameras
+
+
+def y_up_rotation(up: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "3 3"]:
+    """The smallest rotation that turns `up` to +Y (glTF's up); what is upside down makes half a turn about X."""
+    up = up / np.linalg.norm(up)
+    if up[1] < -1 + 1e-9:
+        return np.diag([1.0, -1.0, -1.0])
+    return rotation_onto(up, np.array([0.0, 1.0, 0.0]))
 
 
 def angle_deg(a: Float[np.ndarray, " 3"], b: Float[np.ndarray, " 3"]) -> float:

@@ -18,7 +18,8 @@ import numpy as np
 
 from stages.artifacts import VertexQuality
 from stages.geometry.cameras import PosedScene
-from stages.surface.triangle_mesh import face_areas, raycaster
+from stages.geometry.normalisation import perpendicular
+from stages.surface.triangle_mesh import face_areas, raycaster, sum_around
 
 # From this many photos on a vertex is seen well, if the best of them looks at it within about 60 degrees.
 ENOUGH_PHOTOS = 4
@@ -111,8 +112,9 @@ def suggest_views(
     rays = raycaster(vertices, faces)
     around = scene.kind == "object"
     places = _places_around(vertices, scene) if around else _places_before(points, outward, rays, scene)
-    places = _clear_of_the_ground(*places, scene)
-    helps = _help(points, outward, *places, rays)
+    if scene.ground is not None:
+        places = places[scene.ground.heights(places[:, 0]) > ABOVE_GROUND]
+    helps = _help(points, outward, places, rays)
     hidden = float(1 - (helps > 0).any(0).mean())
     extent = _extent(vertices, scene) if around else None
     left = np.ones(POINTS)
@@ -122,17 +124,17 @@ def suggest_views(
         best = int(gains.argmax())
         if gains[best] < MIN_GAIN:
             break
-        position, target = (part[best] for part in places)
+        position, target = places[best]
         views.append(NextView(position, target, float(gains[best]), describe_place(position, target, scene, extent)))
         left *= 1 - (1 - LEFT_OVER) * helps[best]
-        apart = _angles(places[0] - target, position - target) > MIN_APART_DEG
-        places, helps = (places[0][apart], places[1][apart]), helps[apart]
+        apart = _angles(places[:, 0] - target, position - target) > MIN_APART_DEG
+        places, helps = places[apart], helps[apart]
     return Advice(tuple(views), weak, float((left < 1).mean()), hidden)
 
 
 # ---------------------------------------------------------------- places
-def _places_around(vertices: np.ndarray, scene: PosedScene) -> tuple[np.ndarray, np.ndarray]:
-    """Positions [C, 3] all around an object, as far off as the photos are, and its middle as the target of each."""
+def _places_around(vertices: np.ndarray, scene: PosedScene) -> np.ndarray:
+    """Positions all around an object, as far off as the photos are, and its middle as the target of each [C, 2, 3]."""
     middle = (vertices.min(0) + vertices.max(0)).astype(np.float64) / 2
     radius = np.linalg.norm(vertices - middle, axis=1).max()
     off = scene.cameras.centers - middle
@@ -144,13 +146,11 @@ def _places_around(vertices: np.ndarray, scene: PosedScene) -> tuple[np.ndarray,
     if scene.ground is None:  # nobody says what is free below: hardly lower than the photos were
         lowest = min(_elevations(off, scene.up).min() - LOWER_DEG, 0.0)
         directions = directions[_elevations(directions, scene.up) >= lowest]
-    return middle + distance * directions, np.broadcast_to(middle, directions.shape)
+    return np.stack([middle + distance * directions, np.broadcast_to(middle, directions.shape)], 1)
 
 
-def _places_before(
-    points: np.ndarray, outward: np.ndarray, rays: Any, scene: PosedScene
-) -> tuple[np.ndarray, np.ndarray]:
-    """Positions [C, 3] straight before points of a room or facade, as far off as photos are, and those points."""
+def _places_before(points: np.ndarray, outward: np.ndarray, rays: Any, scene: PosedScene) -> np.ndarray:
+    """Positions straight before points of a room or facade, as far off as photos are, and those points [C, 2, 3]."""
     cameras = scene.cameras
     axes = np.concatenate([cameras.centers, cameras.forward], 1).astype(np.float32)
     lengths = rays.cast_rays(axes)["t_hit"].numpy()
@@ -158,22 +158,13 @@ def _places_before(
     distance = float(np.median(met)) if len(met) else 1.0
     positions = points[:DIRECTIONS] + distance * outward[:DIRECTIONS]
     free = rays.compute_distance(positions.astype(np.float32)).numpy() > 0.5 * distance
-    return positions[free], points[:DIRECTIONS][free]
+    return np.stack([positions[free], points[:DIRECTIONS][free]], 1)
 
 
-def _clear_of_the_ground(
-    positions: np.ndarray, targets: np.ndarray, scene: PosedScene
-) -> tuple[np.ndarray, np.ndarray]:
-    if scene.ground is None:
-        return positions, targets
-    above = scene.ground.heights(positions) > ABOVE_GROUND
-    return positions[above], targets[above]
-
-
-def _help(points: np.ndarray, outward: np.ndarray, positions: np.ndarray, targets: np.ndarray, rays: Any) -> np.ndarray:
+def _help(points: np.ndarray, outward: np.ndarray, places: np.ndarray, rays: Any) -> np.ndarray:
     """How well each place shows each point [C, P]: 0 where it is hidden, slanted or out of frame, 1 square on."""
-    helps = np.zeros((len(positions), len(points)))
-    for row, position, target in zip(helps, positions, targets, strict=True):
+    helps = np.zeros((len(places), len(points)))
+    for row, (position, target) in zip(helps, places, strict=True):
         offsets = position - points
         distances = np.linalg.norm(offsets, axis=1)
         directions = offsets / distances[:, None]
@@ -259,7 +250,7 @@ def _azimuths(directions: np.ndarray, reference: np.ndarray, up: np.ndarray) -> 
     """Degrees [N] that directions [N, 3] lie counter-clockwise of a reference [3], seen from above; -180..180."""
     flat = reference - (reference @ up) * up
     if np.linalg.norm(flat) < 1e-6 * np.linalg.norm(reference):  # straight up: any side is as good
-        flat = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
+        flat = perpendicular(up)
     return np.degrees(np.arctan2(directions @ np.cross(up, flat) / np.linalg.norm(up), directions @ flat))
 
 
@@ -282,4 +273,4 @@ def _extent(vertices: np.ndarray, scene: PosedScene) -> tuple[float, float]:
 
 def _vertex_areas(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """A third of the area of the faces around each vertex [V]."""
-    return np.bincount(faces.ravel(), np.repeat(face_areas(vertices, faces) / 3, 3), minlength=len(vertices))
+    return sum_around(faces, face_areas(vertices, faces)[:, None] / 3, len(vertices))[:, 0]

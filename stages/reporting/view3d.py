@@ -12,8 +12,11 @@ from typing import Any
 import numpy as np
 
 from stages.artifacts import AtlasMesh, VertexQuality
-from stages.geometry.cameras import PosedScene
-from stages.geometry.orientation import y_up_rotation
+from stages.drawing.rendering import look_at
+from stages.geometry.cameras import PinholeCameras, PosedScene
+from stages.geometry.normalisation import perpendicular
+from stages.geometry.place import BOX_EDGES
+from stages.geometry.up import y_up_rotation
 from stages.reporting.next_views import NextView
 from stages.reporting.pictures import jpeg_uri, shrink
 
@@ -27,8 +30,10 @@ NO_VALUE = 255
 POINTS_REACH = 4.0
 # The image plane of a drawn camera is this part of the cameras' median distance away, and less than this many radii.
 FRUSTUM, MAX_FRUSTUM = 0.05, 0.12
-# Aspect (width / height) and half height at depth 1 of a camera that is only suggested.
-_NEXT_SHAPE = (1.5, 0.4)
+# A camera that is only suggested: its size, and the angle it sees from top to bottom.
+NEXT_SIZE, NEXT_FOV_DEG = (3, 2), 2 * np.degrees(np.arctan(0.4))
+# The grid on the ground: squares a side, and how far it reaches from the mesh's middle, scene units.
+GRID_CELLS, GRID_REACH = 12, 1.2
 
 
 def pack_mesh(atlas: AtlasMesh, texture: np.ndarray, up: np.ndarray) -> dict[str, Any]:
@@ -80,19 +85,19 @@ def pack_scene(
     depth = min(FRUSTUM * distance, MAX_FRUSTUM)
     points = scene.points[np.linalg.norm(scene.points, axis=1) < POINTS_REACH]
     thinned = points[:: max(1, -(-len(points) // MAX_POINTS))]
-    aspect, half = _NEXT_SHAPE
+    shapes = [look_at(view.position, view.target, scene.up, *NEXT_SIZE, NEXT_FOV_DEG) for view in next_views]
     return {
         "cameras": [
             {"apex": _plain(turn @ center), "corners": _plain((center + depth * ends) @ turn.T), **caption}
-            for center, ends, caption in zip(cameras.centers, _corner_rays(scene), captions, strict=True)
+            for center, ends, caption in zip(cameras.centers, _corner_rays(cameras), captions, strict=True)
         ],
         "next": [
             {
                 "apex": _plain(turn @ view.position),
-                "corners": _plain((view.position + 1.5 * depth * _rays_to(view, scene.up, aspect, half)) @ turn.T),
+                "corners": _plain((view.position + 1.5 * depth * _corner_rays(shape)[0]) @ turn.T),
                 "sentence": view.sentence,
             }
-            for view in next_views
+            for view, shape in zip(next_views, shapes, strict=True)
         ],
         "points": _pack_positions(thinned @ turn.T) if len(thinned) else None,
         "ground": _plain(_ground_grid(scene, atlas) @ turn.T) if scene.ground is not None else None,
@@ -101,40 +106,32 @@ def pack_scene(
 
 
 def region_lines(box_corners: np.ndarray | None) -> np.ndarray:
-    """Line segments [2 L, 3]: the box of these corners [8, 3] (bit k of a corner's number is its side of axis k), or
-    three great circles of the unit sphere."""
+    """Line segments [2 L, 3]: the box of these corners [8, 3], or three great circles of the unit sphere."""
     if box_corners is not None:
-        edges = [(i, i | bit) for i in range(8) for bit in (1, 2, 4) if not i & bit]
-        return box_corners[np.array(edges).ravel()]
+        return box_corners[np.array(BOX_EDGES).ravel()]
     angles = np.linspace(0, 2 * np.pi, 65)
     circle = np.stack([np.cos(angles), np.sin(angles), np.zeros(65)], 1)
     segments = np.stack([circle[:-1], circle[1:]], 1).reshape(-1, 3)
     return np.concatenate([np.roll(segments, axis, axis=1) for axis in range(3)])
 
 
-def _ground_grid(scene: PosedScene, atlas: AtlasMesh, cells: int = 12, reach: float = 1.2) -> np.ndarray:
+def _ground_grid(scene: PosedScene, atlas: AtlasMesh) -> np.ndarray:
     """Line segments [2 L, 3] of a square grid on the ground below the mesh."""
     assert scene.ground is not None
     normal = scene.ground.normal
-    side = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
-    side /= np.linalg.norm(side)
+    side = perpendicular(normal)
     ahead = np.cross(normal, side)
     middle = (atlas.vertices.min(0) + atlas.vertices.max(0)) / 2
     middle = middle - scene.ground.heights(middle[None])[0] * normal
     lines = []
-    for t in np.linspace(-reach, reach, cells + 1):
-        lines += [
-            t * side - reach * ahead,
-            t * side + reach * ahead,
-            t * ahead - reach * side,
-            t * ahead + reach * side,
-        ]
+    for t in np.linspace(-GRID_REACH, GRID_REACH, GRID_CELLS + 1):
+        for across, along in ((side, ahead), (ahead, side)):
+            lines += [t * across - GRID_REACH * along, t * across + GRID_REACH * along]
     return middle + np.array(lines)
 
 
-def _corner_rays(scene: PosedScene) -> np.ndarray:
+def _corner_rays(cameras: PinholeCameras) -> np.ndarray:
     """Scene-frame offsets [N, 4, 3] from each camera's centre to its image corners at depth 1."""
-    cameras = scene.cameras
     width, height = cameras.sizes[:, 0], cameras.sizes[:, 1]
     zero = np.zeros(len(cameras))
     x, y = np.stack([zero, width, width, zero], 1), np.stack([zero, zero, height, height], 1)
@@ -143,18 +140,6 @@ def _corner_rays(scene: PosedScene) -> np.ndarray:
         [(x - K[:, :1, 2]) / K[:, :1, 0], (y - K[:, 1:2, 2]) / K[:, 1:2, 1], np.ones_like(x)], 2
     )  # fmt: skip
     return rays @ cameras.extrinsics[:, :, :3]
-
-
-def _rays_to(view: NextView, up: np.ndarray, aspect: float, half: float) -> np.ndarray:
-    """Offsets [4, 3] to the image corners at depth 1 of a level camera that looks at the target."""
-    ahead = (view.target - view.position) / np.linalg.norm(view.target - view.position)
-    right = np.cross(ahead, up)
-    if np.linalg.norm(right) < 1e-6:
-        right = np.cross(ahead, np.eye(3)[np.argmin(np.abs(ahead))])
-    right /= np.linalg.norm(right)
-    down = np.cross(ahead, right)
-    signs = ((-1, -1), (1, -1), (1, 1), (-1, 1))
-    return np.stack([ahead + half * (aspect * x * right + y * down) for x, y in signs])
 
 
 def _overlay(key: str, label: str, values: np.ndarray, low: float, high: float, missing: str) -> dict[str, Any]:

@@ -12,7 +12,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import product
 
 import numpy as np
 
@@ -29,6 +28,7 @@ MAX_POINTS = 1 << 19
 CORNERS = np.array([(c & 1, c >> 1 & 1, c >> 2 & 1) for c in range(8)])
 # Edge e runs from corner EDGES[e][0] along axis e // 4.
 EDGES = tuple((c, c | 1 << axis) for axis in range(3) for c in range(8) if not c >> axis & 1)
+EDGE_STARTS = np.array([start for start, _ in EDGES])
 # Face 2 * axis + side, its corners counter-clockwise seen from outside the cube.
 _QUAD = {0: ((0, 0), (0, 1), (1, 1), (1, 0)), 1: ((0, 0), (1, 0), (1, 1), (0, 1))}
 
@@ -432,15 +432,10 @@ class _Grid:
         return _BlockMesh(ids, positions, triangles, wanted, np.flatnonzero(active))
 
 
-EDGE_STARTS = np.array([start for start, _ in EDGES])
-
-
 def _corner_views(lattice: np.ndarray) -> list[np.ndarray]:
     """Eight views [n, n, n] of a lattice [n + 1, n + 1, n + 1]: corner c of every cell."""
-    views = []
-    for k, j, i in product(range(2), repeat=3):
-        views.append(lattice[tuple(slice(o, s - 1 + o) for o, s in zip((i, j, k), lattice.shape, strict=True))])
-    return views
+    cells = np.array(lattice.shape) - 1
+    return [lattice[tuple(map(slice, corner, corner + cells))] for corner in CORNERS]
 
 
 def _patterns(values: np.ndarray, cells: np.ndarray) -> np.ndarray:
@@ -457,10 +452,9 @@ def _plane_view(values: np.ndarray, axis: int, side: int) -> np.ndarray:
 
 def _weld(parts: list[_BlockMesh], evaluated: int) -> Isosurface:
     """One mesh from the blocks' meshes: vertices on the same grid edge become one."""
-    ids = np.concatenate([p.edge_ids for p in parts]) if parts else np.zeros(0, dtype=np.int64)
-    ids, first = np.unique(ids, return_index=True)
-    if not len(ids):
+    if not parts:
         return Isosurface(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32), evaluated)
+    ids, first = np.unique(np.concatenate([p.edge_ids for p in parts]), return_index=True)
     positions = np.concatenate([p.positions for p in parts])[first]
     triangles = np.concatenate([p.triangles for p in parts])
     faces = np.searchsorted(ids, triangles)

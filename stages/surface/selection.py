@@ -10,7 +10,15 @@ from collections.abc import Callable, Iterable
 import numpy as np
 
 from stages.geometry.cameras import PinholeCameras
-from stages.surface.triangle_mesh import MAX_RAYS, face_adjacency, face_areas, label_pieces, raycaster, vertex_normals
+from stages.surface.triangle_mesh import (
+    MAX_RAYS,
+    face_adjacency,
+    face_areas,
+    label_pieces,
+    median_edge,
+    raycaster,
+    vertex_normals,
+)
 
 # A face seen flatter than this (cosine) counts as unseen: no photo says anything of it.
 MIN_COSINE = 0.05
@@ -51,9 +59,8 @@ def count_views(
 
     scene = raycaster(vertices, faces)
     normals = vertex_normals(vertices, faces)
-    edges = vertices[faces] - vertices[np.roll(faces, 1, axis=1)]
     # The ray starts this far off the surface, or the faces around the vertex would hide it.
-    offset = 0.5 * float(np.median(np.linalg.norm(edges, axis=2)))
+    offset = 0.5 * median_edge(vertices, faces)
     starts = (vertices + offset * normals).astype(np.float32)
 
     cosines = np.full((len(vertices), len(cameras)), -1.0, dtype=np.float32)
@@ -104,8 +111,7 @@ def smooth_selection(faces: np.ndarray, num_vertices: int, chosen: np.ndarray, r
 def fill_small_gaps(vertices: np.ndarray, faces: np.ndarray, chosen: np.ndarray, max_area: float) -> np.ndarray:
     """The chosen faces [F] bool, and the regions of others that touch them and are no larger than `max_area`."""
     adjacency = face_adjacency(faces)
-    same = ~chosen[adjacency].any(1)
-    labels = label_pieces(len(faces), adjacency, same)
+    labels = label_pieces(len(faces), adjacency[~chosen[adjacency].any(1)])
     region_area = np.bincount(labels, face_areas(vertices, faces))
     touches = np.zeros(len(region_area), dtype=bool)
     border = chosen[adjacency[:, 0]] != chosen[adjacency[:, 1]]
@@ -131,11 +137,7 @@ def outside_hull(
     seen = np.zeros(len(vertices), dtype=np.int64)
     off = np.zeros(len(vertices), dtype=np.int64)
     for index, mask in masks:
-        pixels, depth = cameras.project(index, vertices)
-        height, width = mask.shape
-        with np.errstate(invalid="ignore"):
-            column, row = np.floor(pixels).astype(np.int64).T
-        inside = (depth > 0) & (column >= 0) & (row >= 0) & (column < width) & (row < height)
-        seen += inside
-        off[inside] += ~mask[row[inside], column[inside]]
+        framed, on_mask = cameras.on_mask(index, vertices, mask)
+        seen += framed
+        off += framed & ~on_mask
     return (off > max_part * seen) & (off >= np.minimum(min_views, np.maximum(seen, 1)))

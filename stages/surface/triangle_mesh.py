@@ -27,12 +27,27 @@ def face_areas(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Area-weighted unit normals [V, 3] float64; +z where a vertex has no area around it."""
-    normals = face_normals(vertices, faces)
-    total = np.stack(
-        [np.bincount(faces.ravel(), np.repeat(normals[:, i], 3), minlength=len(vertices)) for i in range(3)], axis=1
-    )
+    total = sum_around(faces, face_normals(vertices, faces), len(vertices))
     length = np.linalg.norm(total, axis=1, keepdims=True)
     return np.where(length > 0, total / np.where(length > 0, length, 1), (0.0, 0.0, 1.0))
+
+
+def sum_around(faces: np.ndarray, values: np.ndarray, num_vertices: int) -> np.ndarray:
+    """Sum [V, C] over the faces around each vertex of values [F, C] of the faces."""
+    corners = faces.ravel()
+    return np.stack([np.bincount(corners, np.repeat(each, 3), minlength=num_vertices) for each in values.T], axis=1)
+
+
+def median_edge(vertices: np.ndarray, faces: np.ndarray) -> float:
+    """Median length of the faces' edges."""
+    edges = vertices[faces] - vertices[np.roll(faces, 1, axis=1)]
+    return float(np.median(np.linalg.norm(edges, axis=2)))
+
+
+def unique_positions(vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Positions [U, 3], each once, and which of them each vertex [V] has: vertices are split along UV seams."""
+    positions, index = np.unique(np.ascontiguousarray(vertices), axis=0, return_inverse=True)
+    return positions, index.reshape(-1)
 
 
 def compact(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -89,14 +104,12 @@ def face_adjacency(faces: np.ndarray) -> np.ndarray:
     return np.stack([use.face[first], use.face[second]], axis=1)
 
 
-def label_pieces(num_faces: int, adjacency: np.ndarray, joined: np.ndarray | None = None) -> np.ndarray:
-    """Connected component [F] of each face; `joined` [P] bool says which of the adjacent pairs [P, 2] count."""
+def label_pieces(count: int, pairs: np.ndarray) -> np.ndarray:
+    """Connected component of each of `count` faces (or vertices, or corners) of which pairs [P, 2] are joined."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
-    pairs = adjacency if joined is None else adjacency[joined]
-    ones = np.ones(len(pairs), dtype=bool)
-    graph = coo_matrix((ones, (pairs[:, 0], pairs[:, 1])), shape=(num_faces, num_faces))
+    graph = coo_matrix((np.ones(len(pairs), dtype=bool), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
     return connected_components(graph, directed=False)[1]
 
 
@@ -136,18 +149,13 @@ def mesh_state(faces: np.ndarray) -> MeshState:
 
 def _fans(faces: np.ndarray, use: EdgeUse) -> np.ndarray:
     """Fan [3F] of each face corner: corners at one vertex are in one fan if manifold edges lead from one to another."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
     first, second = use.manifold_pairs()
     # The half-edge and its twin run in opposite directions: the start of one is the end of the other.
     start = use.face * 3 + use.slot
     end = use.face * 3 + (use.slot + 1) % 3
     rows = np.concatenate([start[first], end[first]])
     columns = np.concatenate([end[second], start[second]])
-    size = faces.size
-    graph = coo_matrix((np.ones(len(rows), dtype=bool), (rows, columns)), shape=(size, size))
-    return connected_components(graph, directed=False)[1]
+    return label_pieces(faces.size, np.stack([rows, columns], axis=1))
 
 
 def repair_manifold(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -11,6 +11,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
@@ -111,30 +112,32 @@ def bake_texture(
     Raises:
         ValueError: the atlas covers no texel, or a photo is not of its camera's size.
     """
-    tell = listener or (lambda done, total, note: None)
-    size, count, num_views = texels.size, len(texels), len(cameras)
-    if not count:
+    size, num_texels, num_views = texels.size, len(texels), len(cameras)
+    if not num_texels:
         raise ValueError(f"expected charts covering texels of a {size}² texture, got none")
-    colors = np.zeros((count, 3), dtype=np.uint8)
-    seen_by = np.zeros(count, dtype=np.uint16)
+    colors = np.zeros((num_texels, 3), dtype=np.uint8)
+    seen_by = np.zeros(num_texels, dtype=np.uint16)
     per_band = max(BAND_BYTES // (16 * (views + 1)), _CHUNK)
-    bands = [slice(start, min(start + per_band, count)) for start in range(0, count, per_band)]
-    total = num_views * (1 + len(bands))
+    bands = [slice(start, min(start + per_band, num_texels)) for start in range(0, num_texels, per_band)]
+    total, done = num_views * (1 + len(bands)) + 1, itertools.count(1)
+
+    def tell(note: str) -> None:
+        if listener is not None:
+            listener(next(done), total, note)
+
     with ThreadPoolExecutor(max_workers=max(1, workers)) as pool:
-        prepare = _Prepare(atlas, cameras, load_photo, _texel_side(atlas, count))
-        gains, sharpness = _compare(atlas, texels, _prefetch(pool, prepare, num_views, workers), num_views, tell, total)
+        prepare = _Prepare(atlas, cameras, load_photo, _texel_side(atlas, num_texels))
+        gains, sharpness = _compare(atlas, texels, _prefetch(pool, prepare, num_views, workers), num_views, tell)
         if not gain:
             gains = np.ones((num_views, 3))
         blend = partial(blend_texels, detail=detail, robust_sigma=robust_sigma, diffuse=diffuse)
         for number, band in enumerate(bands):
-            begun = num_views * (1 + number)
             prepared = _prefetch(pool, prepare, num_views, workers)
             if visit is not None and number == 0:
                 prepared = _visited(prepared, visit, gains)
             _blend(
                 pool, *surface_points(atlas, texels.face_ids[band], texels.corner[band]), gains, sharpness,
-                prepared, views, blend, colors[band], seen_by[band],
-                partial(_tell_blending, tell, begun, total),
+                prepared, views, blend, colors[band], seen_by[band], tell,
             )  # fmt: skip
         prepare.kept.clear()
 
@@ -145,15 +148,15 @@ def bake_texture(
     origin = np.where(seen, Provenance.PHOTO, Provenance.FIELD).astype(np.uint8)
     provenance = texels.paint(origin[:, None])[0][..., 0]
     provenance[padded] = Provenance.PADDING
-    tell(total, total, "done")
+    tell("done")
     return Baked(
         base_color=filled,
         provenance=provenance,
         gains=gains,
         numbers={
             "texture_size": size,
-            "texels": count,
-            "coverage": round(count / size**2, 4),
+            "texels": num_texels,
+            "coverage": round(num_texels / size**2, 4),
             "seen_share": round(float(seen.mean()), 4),
             "filled_share": round(float(1 - seen.mean()), 4),
             "mean_views": round(float(seen_by[seen].mean()), 2) if seen.any() else 0.0,
@@ -162,10 +165,6 @@ def bake_texture(
             "blurred_photos": int((sharpness < BLURRED).sum()),
         },
     )
-
-
-def _tell_blending(tell: Listener, begun: int, total: int, done: int) -> None:
-    tell(begun + done, total, "blending photos")
 
 
 def _texel_side(atlas: AtlasMesh, count: int) -> float:
@@ -211,7 +210,7 @@ def _visited(prepared: Iterator[View], visit: Visitor, gains: np.ndarray) -> Ite
 
 
 def _compare(
-    atlas: AtlasMesh, texels: Texels, prepared: Iterator[View], num_views: int, tell: Listener, total: int
+    atlas: AtlasMesh, texels: Texels, prepared: Iterator[View], num_views: int, tell: Callable[[str], None]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Gains [N, 3] and sharpness [N] of the photos, from a sample of the texels."""
     rng = np.random.default_rng(0)
@@ -226,7 +225,7 @@ def _compare(
                 points, normals, view.matrix, view.center, view.focal, view.inverse_depth, view.confidence, image,
                 weights[index], answer[index],
             )  # fmt: skip
-        tell(index + 1, total, "comparing photos")
+        tell("comparing photos")
     # From the photos themselves: their low bands mix neighbouring colours, more so in slanted views.
     gains = solve_gains(colors.transpose(1, 0, 2), weights.T)
     return gains, sharpness_of_photos((colors - lows).mean(2).T, weights.T)
@@ -243,7 +242,7 @@ def _blend(
     blend: Callable[..., None],
     colors: np.ndarray,
     seen_by: np.ndarray,
-    tell: Callable[[int], None],
+    tell: Callable[[str], None],
 ) -> None:
     """Fill colors [T, 3] uint8 and the number of photos that see each texel [T]."""
     count = len(points)
@@ -262,7 +261,7 @@ def _blend(
 
     for index, view in enumerate(prepared):
         list(pool.map(partial(offer, view, index), chunks))
-        tell(index + 1)
+        tell("blending photos")
 
     def finish(part: slice) -> None:
         blend(best_weights[part], best_lows[part], best_highs[part], colors=colors[part])

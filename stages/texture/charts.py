@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from stages.surface.triangle_mesh import face_adjacency, face_normals, label_pieces, vertex_normals
+from stages.surface.triangle_mesh import face_adjacency, face_areas, face_normals, label_pieces, vertex_normals
 
 # xatlas charts may cover at most the mesh's area over this: its time grows steeply with the size of a chart.
 CHARTS_AT_LEAST = 200
@@ -26,12 +26,8 @@ TOUCHING = 1e-4
 SMOOTHING_ROUNDS = 8
 
 
-class AtlasTimeoutError(Exception):
-    """xatlas ran past its time limit and was stopped."""
-
-
-class AtlasProcessError(Exception):
-    """xatlas failed; the message says how."""
+class XatlasError(Exception):
+    """xatlas failed, or was stopped at its time limit; the message says how."""
 
 
 @dataclass(frozen=True)
@@ -57,10 +53,8 @@ def unwrap_xatlas(
     """Charts by xatlas, in a subprocess that is killed after `time_limit` seconds.
 
     Raises:
-        AtlasTimeoutError: the limit was reached.
-        AtlasProcessError: xatlas crashed, or its charts do not fit.
+        XatlasError: the limit was reached, xatlas crashed, or its charts do not fit.
     """
-    area = float(np.linalg.norm(face_normals(vertices, faces), axis=1).sum()) / 2
     root = str(Path(__file__).resolve().parents[2])
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([root, os.environ.get("PYTHONPATH", "")])}
     with tempfile.TemporaryDirectory(prefix="atlas-") as folder:
@@ -69,7 +63,7 @@ def unwrap_xatlas(
             source,
             vertices=vertices,
             faces=faces,
-            max_chart_area=area / CHARTS_AT_LEAST,
+            max_chart_area=face_areas(vertices, faces).sum() / CHARTS_AT_LEAST,
             resolution=texture_size - padding,
             padding=padding,
         )
@@ -77,16 +71,16 @@ def unwrap_xatlas(
         try:
             done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=time_limit)
         except subprocess.TimeoutExpired as error:
-            raise AtlasTimeoutError(f"xatlas needed more than {time_limit:g} s for {len(faces)} faces") from error
+            raise XatlasError(f"xatlas needed more than {time_limit:g} s for {len(faces)} faces") from error
         if done.returncode != 0 or not target.is_file():
             last = (done.stderr.strip().splitlines() or ["no message"])[-1]
-            raise AtlasProcessError(f"xatlas ended with code {done.returncode}: {last}")
+            raise XatlasError(f"xatlas ended with code {done.returncode}: {last}")
         with np.load(target) as data:
             mapping, new_faces, texels = data["source"], data["faces"].astype(np.int32), data["texels"]
     if new_faces.shape != faces.shape or (mapping[new_faces] != faces).any():
-        raise AtlasProcessError(f"xatlas kept {len(new_faces)} of {len(faces)} faces, or not in order")
+        raise XatlasError(f"xatlas kept {len(new_faces)} of {len(faces)} faces, or not in order")
     if texels.max(initial=0) > texture_size - padding:
-        raise AtlasProcessError(f"the charts need {texels.max():.0f} texels a side, got {texture_size - padding}")
+        raise XatlasError(f"the charts need {texels.max():.0f} texels a side, got {texture_size - padding}")
     texels = texels.astype(np.float64) + padding / 2
     charts = label_pieces(len(new_faces), face_adjacency(new_faces))
     layout = UvLayout(mapping.astype(np.int64), new_faces, texels, charts)
@@ -153,15 +147,14 @@ def _project(corners: np.ndarray, axis: np.ndarray) -> np.ndarray:
 
 def _cut_overlaps(flat: np.ndarray, axis: np.ndarray, adjacency: np.ndarray, corners: np.ndarray) -> np.ndarray:
     """Chart [F] of each face: connected, of one axis, and without two faces that overlap."""
-    same = axis[adjacency[:, 0]] == axis[adjacency[:, 1]]
-    charts = label_pieces(len(flat), adjacency, same)
+    adjacency = adjacency[axis[adjacency[:, 0]] == axis[adjacency[:, 1]]]
+    charts = label_pieces(len(flat), adjacency)
     pairs = overlapping_pairs(flat, charts)
     if len(pairs):
         # Lowest faces first, so that a winding ramp is cut once a turn.
         depth = corners.mean(1)[np.arange(len(axis)), axis // 2]
         layer = _layers(pairs, depth)
-        same &= layer[adjacency[:, 0]] == layer[adjacency[:, 1]]
-        charts = label_pieces(len(flat), adjacency, same)
+        charts = label_pieces(len(flat), adjacency[layer[adjacency[:, 0]] == layer[adjacency[:, 1]]])
     return charts
 
 
@@ -186,7 +179,7 @@ def _move_overlaps(layout: UvLayout, pairs: np.ndarray, texture_size: int, paddi
     xatlas lets a few small faces of a chart fold over; they become charts of their own, at the same scale.
 
     Raises:
-        AtlasProcessError: no room is left for them.
+        XatlasError: no room is left for them.
     """
     import cv2
 
@@ -195,8 +188,7 @@ def _move_overlaps(layout: UvLayout, pairs: np.ndarray, texture_size: int, paddi
     area = np.abs(edges[:, 0, 0] * edges[:, 1, 1] - edges[:, 0, 1] * edges[:, 1, 0])
     layer = _layers(pairs, -area)  # large faces stay
     adjacency = face_adjacency(layout.faces)
-    together = layer[adjacency[:, 0]] == layer[adjacency[:, 1]]
-    charts = label_pieces(len(layout.faces), adjacency, together)
+    charts = label_pieces(len(layout.faces), adjacency[layer[adjacency[:, 0]] == layer[adjacency[:, 1]]])
     source, new_faces = _split_along_seams(layout.faces, charts)
     texels = layout.texels[source]
 
@@ -214,9 +206,7 @@ def _move_overlaps(layout: UvLayout, pairs: np.ndarray, texture_size: int, paddi
         width, height = np.ceil(texels[members].max(0)).astype(np.int64) - low + 1
         corner = _free_box(taken, int(width), int(height))
         if corner is None:
-            raise AtlasProcessError(
-                f"{len(pairs)} pairs of faces overlap in the texture and no room is left to move them"
-            )
+            raise XatlasError(f"{len(pairs)} pairs of faces overlap in the texture and no room is left to move them")
         x, y = corner
         texels[members] += np.array([x, y]) - low
         around = padding + 1

@@ -5,22 +5,16 @@ from __future__ import annotations
 
 import numpy as np
 
+from stages.surface.triangle_mesh import face_adjacency, sum_around, unique_positions
+
 # Pull of the offset back to the average one, for each step between faces: it is local to ~1/sqrt(this) faces.
 PULL = 2e-3
 _ITERATIONS = 300
 
 
 def face_neighbors(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Pairs [E, 2] of faces that share an edge. Vertices at one position count as one: UV seams do not part
-    faces."""
-    _, merged = np.unique(np.ascontiguousarray(vertices), axis=0, return_inverse=True)
-    corners = merged.reshape(-1)[faces].astype(np.int64)
-    edges = np.sort(np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]]), axis=1)
-    face_ids = np.tile(np.arange(len(faces)), 3)
-    key = edges[:, 0] * (len(vertices) + 1) + edges[:, 1]
-    order = np.argsort(key, kind="stable")
-    same = key[order][1:] == key[order][:-1]
-    return np.stack([face_ids[order[:-1][same]], face_ids[order[1:][same]]], 1)
+    """Pairs [E, 2] of faces that share an edge. Vertices at one position count as one: UV seams do not part faces."""
+    return face_adjacency(unique_positions(vertices)[1][faces])
 
 
 def harmonic_offsets(known: np.ndarray, offsets: np.ndarray, neighbors: np.ndarray) -> np.ndarray:
@@ -62,10 +56,7 @@ def harmonic_offsets(known: np.ndarray, offsets: np.ndarray, neighbors: np.ndarr
 
 def vertex_means(values: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """[V, 3] mean of face values [F, 3] around each vertex; vertices at one position share their faces."""
-    _, merged = np.unique(np.ascontiguousarray(vertices), axis=0, return_inverse=True)
-    merged = merged.reshape(-1)
-    corners = merged[faces].ravel()
-    count = np.maximum(np.bincount(corners, minlength=merged.max() + 1), 1)
-    spread = np.repeat(values, 3, axis=0)
-    means = [np.bincount(corners, spread[:, c], minlength=len(count)) / count for c in range(values.shape[1])]
-    return np.stack(means, 1)[merged].astype(np.float32)
+    positions, index = unique_positions(vertices)
+    count = np.bincount(index[faces].ravel(), minlength=len(positions))
+    means = sum_around(index[faces], values, len(positions)) / np.maximum(count, 1)[:, None]
+    return means[index].astype(np.float32)

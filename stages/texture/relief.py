@@ -8,7 +8,7 @@ import numpy as np
 
 from stages.artifacts import AtlasMesh
 from stages.drawing.rasterizing import Texels, surface_points
-from stages.surface.triangle_mesh import MAX_RAYS, raycaster, vertex_normals
+from stages.surface.triangle_mesh import MAX_RAYS, median_edge, raycaster, vertex_normals
 from stages.texture.padding import pad_charts
 from stages.texture.tangents import to_tangent_space, vertex_tangents
 
@@ -148,9 +148,7 @@ def sky_seen(
 
     tell = listener or (lambda done, total: None)
     scene = raycaster(vertices, faces)
-    edges = vertices[faces] - vertices[np.roll(faces, 1, axis=1)]
-    lift = LIFT * float(np.median(np.linalg.norm(edges, axis=2)))
-    starts = points + lift * normals
+    starts = points + LIFT * median_edge(vertices, faces) * normals
     side = np.cross(normals, np.eye(3)[np.abs(normals).argmin(1)])
     side /= np.linalg.norm(side, axis=1, keepdims=True)
     ahead = np.cross(normals, side)

@@ -11,7 +11,7 @@ from numba import njit
 
 from stages.artifacts import AtlasMesh, VertexQuality
 from stages.drawing.rasterizing import Texels
-from stages.surface.triangle_mesh import face_areas
+from stages.surface.triangle_mesh import face_areas, sum_around
 from stages.texture.baking import Provenance
 from stages.texture.observing import sample_points
 from stages.texture.photo_views import View
@@ -130,18 +130,13 @@ def texel_density(atlas: AtlasMesh) -> np.ndarray:
     """Texels per scene unit [V] float32: root of the texels of the faces around a vertex over their area."""
     areas = face_areas(atlas.vertices, atlas.faces)
     texels = face_areas(np.pad(atlas.uvs, ((0, 0), (0, 1))), atlas.faces) * atlas.texture_size**2
-    return np.sqrt(_sum_around(atlas, texels) / np.maximum(_sum_around(atlas, areas), 1e-20)).astype(np.float32)
+    texels, areas = sum_around(atlas.faces, np.stack([texels, areas], 1), len(atlas.vertices)).T
+    return np.sqrt(texels / np.maximum(areas, 1e-20)).astype(np.float32)
 
 
 def invented_share(atlas: AtlasMesh, texels: Texels, provenance: np.ndarray) -> np.ndarray:
     """Part of the texels of the faces around a vertex [V] float32 that no photo saw; 0 where they have no texel."""
     invented = texels.face_ids[provenance.ravel()[texels.index] == Provenance.FIELD]
-    made_up, all_of_them = (
-        _sum_around(atlas, np.bincount(ids, minlength=len(atlas.faces))) for ids in (invented, texels.face_ids)
-    )
+    counts = [np.bincount(ids, minlength=len(atlas.faces)) for ids in (invented, texels.face_ids)]
+    made_up, all_of_them = sum_around(atlas.faces, np.stack(counts, 1), len(atlas.vertices)).T
     return (made_up / np.maximum(all_of_them, 1)).astype(np.float32)
-
-
-def _sum_around(atlas: AtlasMesh, per_face: np.ndarray) -> np.ndarray:
-    """Sum [V] over the faces around each vertex of values [F]."""
-    return np.bincount(atlas.faces.ravel(), np.repeat(per_face, 3), minlength=len(atlas.vertices))
