@@ -103,7 +103,8 @@ def run(context: StageContext[IngestParams]) -> dict[str, Any]:
     for reason, sources in by_reason(skipped).items():
         log.warning("left out %s: %s", name_some(sources), reason)
     # a video's frames are the sharpest of their stretch and near each other by choice
-    for warning in find_oddities([seen for _, seen in taken if seen.source not in frames]).warnings:
+    odd = find_oddities([seen for _, seen in taken if seen.source not in frames])
+    for warning in odd.warnings:
         log.warning("%s", warning)
     masked = sum(record.has_mask for record in images)
     if 0 < masked < len(images):
@@ -118,6 +119,9 @@ def run(context: StageContext[IngestParams]) -> dict[str, Any]:
         "with_focal": sum(record.focal_px is not None for record in images),
         "with_gps": sum(record.gps is not None for record in images),
         "median_blur": round(float(np.median([record.blur for record in images])), 1),
+        "blurred": len(odd.blurred),
+        "badly_exposed": len(odd.badly_exposed),
+        "alike": len(odd.alike),
     }
 
 

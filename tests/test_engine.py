@@ -23,7 +23,7 @@ from stages.engine.manifest import MANIFEST, Manifest, ManifestDamaged, OutputFi
 from stages.engine.resources import ResourceMeter
 from stages.engine.runner import StageOutcome, run_pipeline
 from stages.engine.stage import StageContext
-from stages.engine.status import StageStatus, pipeline_status
+from stages.engine.status import Present, StageStatus, pipeline_status
 from stages.engine.workspace import FORMAT, Workspace
 from stages.errors import ConfigError, HineusError, InputError, SystemRequirementError, WorkspaceError
 
@@ -55,7 +55,7 @@ class Bench:
 
     def states(self, sets: tuple[str, ...] = (), hashes: bool = False) -> dict[str, str]:
         digests = SourceDigests({"photos": self.photos, "masks": self.masks})
-        statuses = pipeline_status(TOY, self.workspace, load_config(sets=sets), digests, hashes)
+        statuses = pipeline_status(TOY, Present(self.workspace, load_config(sets=sets), digests), hashes)
         return {status.name: f"{status.state}: {status.reason}" for status in statuses}
 
     def process(self, **environment: str) -> subprocess.Popen[bytes]:

@@ -22,14 +22,14 @@ def status(
     from configs.params import Config
     from hineus_cli.console import product, status_table
     from stages.engine.fingerprint import SourceDigests
-    from stages.engine.status import pipeline_status
+    from stages.engine.status import Present, pipeline_status
     from stages.engine.workspace import Workspace
 
     opened = Workspace.open(workspace)
     config = load_config(file=opened.config_path) if opened.config_path.exists() else Config()
     sources = {name: None if path is None else Path(path) for name, path in opened.record.sources.items()}
-    digests = SourceDigests(sources, opened.digest_cache)
-    statuses = pipeline_status(context.obj.pipeline, opened, config, digests, verify)
+    present = Present(opened, config, SourceDigests(sources, opened.digest_cache))
+    statuses = pipeline_status(context.obj.pipeline, present, verify)
     if not as_json:
         console = product()
         console.print(status_table(statuses, console.width))

@@ -14,7 +14,7 @@ from stages.engine.fingerprint import Identity, SourceDigests
 from stages.engine.manifest import Manifest, current_versions, describe_outputs, jsonable, now
 from stages.engine.resources import ResourceMeter
 from stages.engine.stage import Stage, StageContext
-from stages.engine.status import StageStatus, stage_status
+from stages.engine.status import Present, StageStatus, stage_status
 from stages.engine.system import requirement_error
 from stages.engine.workspace import Workspace, disk_full_error, is_disk_full, storage_errors
 from stages.errors import ConfigError, HineusError, InputError, did_you_mean
@@ -93,20 +93,20 @@ def run_pipeline(
     outcomes = []
     with workspace.lock():
         workspace.remember(sources, preset, config.model_dump(mode="json"))
-        digests = SourceDigests(sources, workspace.digest_cache)
+        present = Present(workspace, config, SourceDigests(sources, workspace.digest_cache))
         statuses: dict[str, StageStatus] = {}
         for stage in selected:
             workspace.recover(stage.name)
-            status = stage_status(stage, workspace, config, digests, statuses)
+            status = stage_status(stage, present, statuses)
             with storage_errors(workspace.root, "keeping the photos' digests"):
-                digests.save()
+                present.digests.save()
             if status.state == "fresh" and stage.name not in forced:
                 assert status.manifest is not None  # a fresh stage has one
                 outcome = _outcome("skipped", status.reason, status.manifest)
             else:
                 reason = forced[stage.name] if status.state == "fresh" else status.reason
                 listener.stage_started(stage, reason)
-                manifest = _run_stage(stage, workspace, config, digests, status, device, workers, listener)
+                manifest = _run_stage(stage, present, status, device, workers, listener)
                 outcome = _outcome("ran", reason, manifest)
                 status = StageStatus(stage.name, "fresh", (), manifest, manifest.identity)
             statuses[stage.name] = status
@@ -139,15 +139,9 @@ def _select(
 
 
 def _run_stage(
-    stage: Stage[Any],
-    workspace: Workspace,
-    config: BaseModel,
-    digests: SourceDigests,
-    status: StageStatus,
-    device: str,
-    workers: int,
-    listener: Listener,
+    stage: Stage[Any], present: Present, status: StageStatus, device: str, workers: int, listener: Listener
 ) -> Manifest:
+    workspace, config, digests = present.workspace, present.config, present.digests
     identity = status.identity
     if identity is None:
         raise ValueError(f"stage {stage.name} was asked to run before the stages it needs: {status.reason}")

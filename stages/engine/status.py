@@ -44,13 +44,17 @@ class StageStatus:
         return "; ".join(named) or "nothing changed"
 
 
+@dataclass(frozen=True)
+class Present:
+    """What publications are compared with: those in the workspace, all settings of now, and the sources' files."""
+
+    workspace: Workspace
+    config: BaseModel
+    digests: SourceDigests
+
+
 def stage_status(
-    stage: Stage[Any],
-    workspace: Workspace,
-    config: BaseModel,
-    digests: SourceDigests,
-    earlier: Mapping[str, StageStatus],
-    hashes: bool = False,
+    stage: Stage[Any], present: Present, earlier: Mapping[str, StageStatus], hashes: bool = False
 ) -> StageStatus:
     """How `stage` stands, given how the stages it needs stand.
 
@@ -61,10 +65,10 @@ def stage_status(
     Raises:
         InputError: a source cannot be read.
     """
-    manifest, damage = _publication(stage, workspace, hashes)
+    manifest, damage = _publication(stage, present.workspace, hashes)
     waiting = [earlier[name] for name in stage.needs if earlier[name].state != "fresh"]
     before = manifest.identity if manifest else None
-    identity = _identity_now(stage, workspace, config, digests, earlier, before)
+    identity = _identity_now(stage, present, earlier, before)
     reasons = [damage] if damage else []
     if before is not None:
         # Of a stage that will run again only the run itself can tell whether its outputs change.
@@ -82,17 +86,11 @@ def stage_status(
     return StageStatus(stage.name, state, tuple(reasons), manifest, known)
 
 
-def pipeline_status(
-    pipeline: Sequence[Stage[Any]],
-    workspace: Workspace,
-    config: BaseModel,
-    digests: SourceDigests,
-    hashes: bool = False,
-) -> list[StageStatus]:
+def pipeline_status(pipeline: Sequence[Stage[Any]], present: Present, hashes: bool = False) -> list[StageStatus]:
     """How every stage stands. Reads only, so it needs no lock."""
     statuses: dict[str, StageStatus] = {}
     for stage in pipeline:
-        statuses[stage.name] = stage_status(stage, workspace, config, digests, statuses, hashes)
+        statuses[stage.name] = stage_status(stage, present, statuses, hashes)
     return list(statuses.values())
 
 
@@ -123,26 +121,22 @@ def _publication(stage: Stage[Any], workspace: Workspace, hashes: bool) -> tuple
 
 
 def _identity_now(
-    stage: Stage[Any],
-    workspace: Workspace,
-    config: BaseModel,
-    digests: SourceDigests,
-    earlier: Mapping[str, StageStatus],
-    before: Identity | None,
+    stage: Stage[Any], present: Present, earlier: Mapping[str, StageStatus], before: Identity | None
 ) -> Identity:
+    record, config = present.workspace.record, present.config
     inputs = _artifact_digests(stage, earlier)
     for name in stage.reads_manifests:
         if manifest := earlier[name].manifest:
             inputs[manifest_key(name)] = digest(manifest.to_json())
     if stage.reads_run:
-        started = [dict(workspace.record.sources), workspace.record.preset, config.model_dump(mode="json")]
+        started = [dict(record.sources), record.preset, config.model_dump(mode="json")]
         inputs[RUN_KEY] = digest(jsonable(started))
     return Identity(
         stage=stage.name,
         version=stage.version,
         params=jsonable(stage.settings(config).model_dump(mode="json")),
         inputs=inputs,
-        sources={name: _source_files(name, digests, before) for name in stage.sources},
+        sources={name: _source_files(name, present.digests, before) for name in stage.sources},
     )
 
 

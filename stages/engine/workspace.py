@@ -74,7 +74,7 @@ class Workspace:
     def __init__(self, root: Path, record: Record) -> None:
         self.root = root
         self.record = record
-        self._lock_depth = 0
+        self._locked = False
 
     @staticmethod
     def open(root: Path, create: bool = False) -> Workspace:
@@ -129,26 +129,22 @@ class Workspace:
         Raises:
             WorkspaceError: another process holds it, or the folder cannot be written.
         """
-        if self._lock_depth:
-            self._lock_depth += 1
-            try:
-                yield
-            finally:
-                self._lock_depth -= 1
+        if self._locked:
+            yield
             return
         with storage_errors(self.root, "opening the workspace"):
             self.root.mkdir(parents=True, exist_ok=True)
             descriptor = os.open(self.root / ".lock", os.O_RDWR | os.O_CREAT, 0o644)
         try:
             self._take(descriptor)
-            self._lock_depth = 1
+            self._locked = True
             try:
                 yield
             finally:
                 with suppress(OSError):  # nobody holds it any more: see `in_use`
                     os.ftruncate(descriptor, 0)
         finally:
-            self._lock_depth = 0
+            self._locked = False
             os.close(descriptor)
 
     def _take(self, descriptor: int) -> None:
