@@ -95,7 +95,7 @@ class Encoder:
         fields.encode, fields.encode_features = self.encode, self.encode_features
 
 
-REFERENCE = Encoder("PyTorch", encodings.encode_reference, encodings._reference_features)
+REFERENCE = Encoder("PyTorch", encodings.encode_reference, encodings.features_reference)
 CHOSEN = Encoder("chosen", encodings.encode, encodings.encode_features)  # as training takes them
 
 

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from stages.errors import ReconstructionError, SystemRequirementError
-from stages.neural.fields import points_at_a_time
+from stages.neural.acceleration import points_at_a_time
 from stages.neural.rendered import OPAQUE, Rendered
 from stages.neural.schedules import Moment
 from stages.neural.terms.term import Term
