@@ -79,8 +79,8 @@ class FieldDrawer:
         self, origins: Float[Tensor, "r 3"], directions: Float[Tensor, "r 3"]
     ) -> tuple[Float[Tensor, "r 3"], Float[Tensor, " r"], Bool[Tensor, " r"]]:
         """Colours and opacity of rays, and whether they cross the region."""
-        count, background = len(origins), self.renderer.fields.background
-        colors, opacity = (torch.zeros(count, n, device=self.device) for n in (3, 1))
+        background = self.renderer.fields.background
+        colors, opacity = torch.zeros_like(origins), torch.zeros_like(origins[:, 0])
         entry, leave, hit = intersect_unit_sphere(origins, directions)
         crossing = torch.nonzero(hit).squeeze(1)
         if len(crossing):
@@ -89,8 +89,8 @@ class FieldDrawer:
                 crossing, torch.zeros_like(crossing), colors[crossing], None,
             )  # fmt: skip
             rendered = self.renderer.render(batch, self.moment)
-            colors[crossing], opacity[crossing, 0] = rendered.colors, rendered.opacity
+            colors[crossing], opacity[crossing] = rendered.colors, rendered.opacity
         missing = torch.nonzero(~hit).squeeze(1)
         if background is not None and len(missing):
             colors[missing] = self.renderer.background_color(background, origins[missing], directions[missing], None)
-        return colors, opacity.squeeze(1), hit
+        return colors, opacity, hit

@@ -198,28 +198,24 @@ def encode_backward(
 def vjp_forward(jacobian, cotangent, gradients):
     """Fill gradients [N, 3] with jacobian [N, 3, C] times cotangent [N, C]."""
     num_points, _, channels = jacobian.shape
-    num_chunks = (num_points + CHUNK - 1) // CHUNK
-    for chunk in prange(num_chunks):
-        for p in range(chunk * CHUNK, min((chunk + 1) * CHUNK, num_points)):
-            x = y = z = np.float32(0)
-            for c in range(channels):
-                u = cotangent[p, c]
-                x += jacobian[p, 0, c] * u
-                y += jacobian[p, 1, c] * u
-                z += jacobian[p, 2, c] * u
-            gradients[p, 0], gradients[p, 1], gradients[p, 2] = x, y, z
+    for p in prange(num_points):
+        x = y = z = np.float32(0)
+        for c in range(channels):
+            u = cotangent[p, c]
+            x += jacobian[p, 0, c] * u
+            y += jacobian[p, 1, c] * u
+            z += jacobian[p, 2, c] * u
+        gradients[p, 0], gradients[p, 1], gradients[p, 2] = x, y, z
 
 
 @njit(parallel=True, **_OPTIONS)
 def vjp_backward(jacobian, grad_gradients, grad_cotangent):
     """Fill grad_cotangent [N, C] with jacobian^T [N, C, 3] times grad_gradients [N, 3]."""
     num_points, _, channels = jacobian.shape
-    num_chunks = (num_points + CHUNK - 1) // CHUNK
-    for chunk in prange(num_chunks):
-        for p in range(chunk * CHUNK, min((chunk + 1) * CHUNK, num_points)):
-            x, y, z = grad_gradients[p, 0], grad_gradients[p, 1], grad_gradients[p, 2]
-            for c in range(channels):
-                grad_cotangent[p, c] = x * jacobian[p, 0, c] + y * jacobian[p, 1, c] + z * jacobian[p, 2, c]
+    for p in prange(num_points):
+        x, y, z = grad_gradients[p, 0], grad_gradients[p, 1], grad_gradients[p, 2]
+        for c in range(channels):
+            grad_cotangent[p, c] = x * jacobian[p, 0, c] + y * jacobian[p, 1, c] + z * jacobian[p, 2, c]
 
 
 @njit(parallel=True, **_OPTIONS)
@@ -266,10 +262,8 @@ def _trilinear(values, x, y, z):
 @njit(parallel=True, **_OPTIONS)
 def lookup(values, points, found):
     """Fill found [P] with the cached f at points [P, 3]; places outside the cube read its border."""
-    num_chunks = (len(points) + CHUNK - 1) // CHUNK
-    for chunk in prange(num_chunks):
-        for p in range(chunk * CHUNK, min((chunk + 1) * CHUNK, len(points))):
-            found[p] = _trilinear(values, points[p, 0], points[p, 1], points[p, 2])
+    for p in prange(len(points)):
+        found[p] = _trilinear(values, points[p, 0], points[p, 1], points[p, 2])
 
 
 @njit(parallel=True, **_OPTIONS)
@@ -279,26 +273,23 @@ def smallest_on_paths(values, points, targets, start, solid, smallest):
     A step is f long, or half a cell where f is smaller; the walk ends at the target, at the unit sphere, or where f
     falls below `solid`.
     """
-    num_points = len(points)
     half_cell = np.float32(1.0 / (values.shape[0] - 1))
-    num_chunks = (num_points + CHUNK - 1) // CHUNK
-    for chunk in prange(num_chunks):
-        for p in range(chunk * CHUNK, min((chunk + 1) * CHUNK, num_points)):
-            x, y, z = points[p, 0], points[p, 1], points[p, 2]
-            dx, dy, dz = targets[p, 0] - x, targets[p, 1] - y, targets[p, 2] - z
-            length = np.sqrt(dx * dx + dy * dy + dz * dz)
-            dx, dy, dz = dx / length, dy / length, dz / length
-            t, least = start[p], np.float32(2)
-            while t < length:
-                px, py, pz = x + t * dx, y + t * dy, z + t * dz
-                if px * px + py * py + pz * pz > np.float32(1):
-                    break
-                f = _trilinear(values, px, py, pz)
-                least = min(least, f)
-                if f < solid:
-                    break
-                t += max(f, half_cell)
-            smallest[p] = least
+    for p in prange(len(points)):
+        x, y, z = points[p, 0], points[p, 1], points[p, 2]
+        dx, dy, dz = targets[p, 0] - x, targets[p, 1] - y, targets[p, 2] - z
+        length = np.sqrt(dx * dx + dy * dy + dz * dz)
+        dx, dy, dz = dx / length, dy / length, dz / length
+        t, least = start[p], np.float32(2)
+        while t < length:
+            px, py, pz = x + t * dx, y + t * dy, z + t * dz
+            if px * px + py * py + pz * pz > np.float32(1):
+                break
+            f = _trilinear(values, px, py, pz)
+            least = min(least, f)
+            if f < solid:
+                break
+            t += max(f, half_cell)
+        smallest[p] = least
 
 
 @njit(inline="always")
