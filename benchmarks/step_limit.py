@@ -37,10 +37,10 @@ from benchmarks.step_speed import (
     POINTS,
     Encoder,
     alternate,
-    ball_trainer,
     best_device,
     cores_of,
     encoders,
+    noise_trainer,
     points_of_step,
     preset_for,
     training_step,
@@ -243,7 +243,7 @@ def limit_rows(device: str) -> list[list[str]]:
         found = encoders(device, shape.sdf_grid)
         *steps, matrix, table = alternate(
             *(networks_step(shape, encoder, device) for encoder in found),
-            *(training_step(ball_trainer(params, device), encoder) for encoder in found),
+            *(training_step(noise_trainer(params, device), encoder) for encoder in found),
             product_pass(shape, device),
             table_pass(shape.sdf_grid, device),
         )

@@ -7,10 +7,9 @@ python -m benchmarks.step_speed parts --variants all --rounds 20     the second,
 Medians over repetitions on this machine, all cores, or its GPU where there is one (`--device cpu`: not); what is
 compared takes turns, so that a drifting machine hits all.
 
-The kernels' scene is a ball seen by eight cameras, the networks are those of the preset `cpu`, or `gpu` on one.
-
-The parts' scene is a heap of balls seen by 47 cameras. The base learns it for a while, all variants start from what it
-has learned, and they are timed at the middle of the training, when every part is at work. Their learning rates are zero
+The scene is a heap of balls seen by 47 cameras. For the kernels its photos are noise, and the networks are those of the
+preset `cpu`, or `gpu` on one. For the parts the base learns it for a while, all variants start from what it has
+learned, and they are timed at the middle of the training, when every part is at work. Their learning rates are zero
 then, which saves no work, and holds all of them in that state. What is done every few steps only, the refresh of the
 cached grid, is left out: it is the same for all.
 """
@@ -33,8 +32,6 @@ from benchmarks.ablate import BASE, VARIANTS, settings_of
 from benchmarks.pages import markdown_table
 from configs.load import load_config
 from configs.training import TrainParams
-from stages.geometry.cameras import PinholeCameras, PosedScene
-from stages.geometry.similarity import Similarity
 from stages.neural import encodings, fields
 from stages.neural.encoding_shapes import HashGrid
 from stages.neural.sightings import Sightings
@@ -95,7 +92,7 @@ class Encoder:
         fields.encode, fields.encode_features = self.encode, self.encode_features
 
 
-REFERENCE = Encoder("PyTorch", encodings.encode_reference, encodings._reference_features)
+REFERENCE = Encoder("PyTorch", encodings.encode_reference, encodings.features_reference)
 CHOSEN = Encoder("chosen", encodings.encode, encodings.encode_features)  # as training takes them
 
 
@@ -134,30 +131,12 @@ def training_step(trainer: Trainer, encoder: Encoder) -> Callable[[], None]:
     return run
 
 
-def ball_trainer(params: TrainParams, device: str = "cpu") -> Trainer:
-    """A trainer on noise photos of a ring of cameras: what it learns does not matter here."""
-    poses = []
-    for angle in np.arange(8) * np.pi / 4:
-        center = 3 * np.array([np.cos(angle), np.sin(angle), 0.3])
-        forward = -center / np.linalg.norm(center)
-        right = np.cross(forward, [0, 0, 1])
-        right /= np.linalg.norm(right)
-        rotation = np.stack([right, np.cross(forward, right), forward])
-        poses.append(np.concatenate([rotation, -rotation @ center[:, None]], 1))
-    K = np.array([[400.0, 0, 160], [0, 400, 120], [0, 0, 1]])
-    cameras = PinholeCameras(
-        tuple(f"{i}.png" for i in range(8)), np.tile([320, 240], (8, 1)), np.tile(K, (8, 1, 1)), np.stack(poses)
-    )
-    rng = np.random.default_rng(0)
-    points = rng.normal(size=(500, 3))
-    points *= 0.5 / np.linalg.norm(points, axis=1, keepdims=True)
-    observations = np.stack([rng.integers(0, 8, 500), np.arange(500)], 1).astype(np.int32)
-    scene = PosedScene(
-        cameras, Similarity.identity(), points.astype(np.float32), np.full(500, 0.5, np.float32), observations,
-        np.array([0.0, 0, 1]),
-    )  # fmt: skip
-    photos = Photos(cameras, [rng.integers(0, 255, (240, 320, 3), dtype=np.uint8) for _ in range(8)], None, device)
-    return Trainer(photos, Sightings.from_scene(scene, device), params, device)
+def noise_trainer(params: TrainParams, device: str = "cpu") -> Trainer:
+    """A trainer on photos of noise: what it learns does not matter here."""
+    cameras, rng = ball_heap.dome_of_cameras(), np.random.default_rng(0)
+    images = (rng.integers(0, 255, (height, width, 3), dtype=np.uint8) for width, height in cameras.sizes)
+    photos = Photos(cameras, images, None, device)
+    return Trainer(photos, Sightings.from_scene(ball_heap.posed_scene(cameras), device), params, device)
 
 
 def points_of_step(params: TrainParams) -> int:
@@ -182,7 +161,7 @@ def print_kernels(device: str) -> None:
     grid = field_shape(params, 1, background=False).sdf_grid
     found = encoders(device, grid)
     encoding = alternate(*(encoding_pass(encoder.encode, grid, device) for encoder in found))
-    steps = alternate(*(training_step(ball_trainer(params, device), encoder) for encoder in found))
+    steps = alternate(*(training_step(noise_trainer(params, device), encoder) for encoder in found))
     rows = []
     for name, count, seconds in (
         ("encoding, forward and backward", POINTS[device], encoding),

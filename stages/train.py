@@ -79,8 +79,7 @@ def run(context: StageContext[TrainParams]) -> dict[str, Any]:
     summary: dict[str, Any] = _last_numbers(context.to_write(METRICS))
     if params.hold_out:
         context.write(HELD_OUT, tuple(scene.cameras.names[i] for i in held_out.nonzero().flatten().tolist()))
-        nothing = torch.zeros(0, 3, device=trainer.device)
-        psnr = held_out_psnr(photos, lambda batch: trainer.render(batch, 1.0, nothing, None).colors)
+        psnr = held_out_psnr(photos, lambda batch: trainer.render(batch, 1.0).colors)
         summary |= {"held_out": int(held_out.sum()), "held_out_psnr": psnr and round(psnr, 4)}
     return {
         "steps": trainer.step_index,

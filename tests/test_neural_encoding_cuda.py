@@ -195,7 +195,7 @@ def test_kernels_that_do_not_agree_are_not_used_and_it_is_said_once(monkeypatch,
     assert disagreement(Wrong(), grid_of(4), "cpu") > 1e-3
     stand_in = ModuleType("stages.neural.encoding_cuda")
     for kernels, taken in ((encoding_cpu, True), (Wrong(), False)):
-        for name in ("forward", "features_forward", "backward", "vjp_forward", "vjp_backward"):
+        for name in ("forward", "backward", "vjp_forward", "vjp_backward"):
             setattr(stand_in, name, getattr(kernels, name))
         monkeypatch.setitem(sys.modules, "stages.neural.encoding_cuda", stand_in)
         monkeypatch.setattr(sys.modules["stages.neural"], "encoding_cuda", stand_in, raising=False)

@@ -118,7 +118,7 @@ def test_rays_look_the_same_in_both_forms(like_cuda, masks, progress):
         trainer = make_trainer(masks=masks)
         trainer._refresh_cache(trainer.moment(progress))
         batch = trainer.photos.draw(TINY.sampling.rays, torch.Generator().manual_seed(0))
-        rendered = trainer.render(batch, progress, torch.zeros(3, 3) + 0.2, None)
+        rendered = trainer.render(batch, progress, torch.zeros(3, 3) + 0.2)
         (rendered.colors - batch.colors).square().mean().backward()
         forms.append((batch, rendered, trainer.fields))
     (batch, rendered, fields), (other_batch, other_rendered, other_fields) = forms

@@ -62,7 +62,7 @@ def test_colours_alone_are_mixed():
         trainer = make_trainer(params)
         trainer._refresh_cache(trainer.moment(0.3))
         batch = trainer.photos.draw(64, torch.Generator().manual_seed(0))
-        rendered.append(trainer.render(batch, 0.3, torch.rand(5, 3, generator=trainer.generator), None))
+        rendered.append(trainer.render(batch, 0.3, torch.rand(5, 3, generator=trainer.generator)))
     exact, short = rendered
     for name in ("weights", "gradients", "opacity", "extra_sdf", "extra_gradients", "features"):
         assert torch.equal(getattr(exact, name), getattr(short, name)), name

@@ -7,7 +7,7 @@ import torch
 
 from stages.neural import proposal as prop
 from stages.neural.rendering import sample_optical_depths, weights_from_optical_depth
-from stages.neural.sampling import intersect_unit_sphere
+from stages.neural.sampling import Rays, intersect_unit_sphere, invert_cdf, stratified
 
 
 def seeded(seed: int = 0) -> torch.Generator:
@@ -18,14 +18,14 @@ def network() -> prop.ProposalNetwork:
     return prop.ProposalNetwork(seeded())
 
 
-def random_rays(count: int, seed: int = 0) -> tuple[torch.Tensor, ...]:
-    """Rays from radius 2.5 at places within 0.25 of the centre: origins, directions, entry, leave."""
+def random_rays(count: int, seed: int = 0) -> Rays:
+    """Rays from radius 2.5 at places within 0.25 of the centre."""
     generator = seeded(seed)
     origins = 2.5 * torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=1)
     targets = 0.5 * torch.rand(count, 3, generator=generator) - 0.25
     directions = torch.nn.functional.normalize(targets - origins, dim=1)
     entry, leave, _ = intersect_unit_sphere(origins, directions)
-    return origins, directions, entry, leave
+    return Rays(origins, directions, entry, leave)
 
 
 def histogram(rows: int, bins: int, seed: int) -> tuple[torch.Tensor, torch.Tensor]:
@@ -39,11 +39,12 @@ def histogram(rows: int, bins: int, seed: int) -> tuple[torch.Tensor, torch.Tens
 
 def test_edges_ascend_from_entry_to_leave():
     entry, leave = torch.tensor([1.0, 2.0]), torch.tensor([2.0, 4.0])
-    edges = prop.stratified_edges(entry, leave, 8, seeded())
+    rays = Rays(torch.zeros(2, 3), torch.zeros(2, 3), entry, leave)
+    edges = prop.stratified_edges(rays, 8, seeded())
     assert (edges[:, 1:] > edges[:, :-1]).all()
     assert torch.equal(edges[:, 0], entry)
     torch.testing.assert_close(edges[:, -1], leave)
-    even = prop.stratified_edges(entry, leave, 8, None)
+    even = prop.stratified_edges(rays, 8, None)
     torch.testing.assert_close(even[0], torch.linspace(1, 2, 9))
     assert ((edges - even).abs() <= (leave - entry)[:, None] / 16).all()
 
@@ -51,25 +52,25 @@ def test_edges_ascend_from_entry_to_leave():
 def test_draws_follow_the_histogram():
     edges = torch.tensor([[0.0, 0.1, 0.5, 1.0]]).expand(50, 4)
     weights = torch.tensor([[0.2, 0.0, 0.6]]).expand(50, 3)
-    distances = prop.draw_from_weights(edges, weights, 400, seeded())
+    distances = invert_cdf(edges, weights, stratified(50, 400, seeded(), edges.device))
     assert (distances[:, 1:] >= distances[:, :-1]).all()
     assert (distances < 0.1).float().mean().item() == pytest.approx(0.25, abs=0.01)
     assert ((distances > 0.1) & (distances < 0.5)).float().mean() < 1e-3
     late = distances[distances > 0.5]
     assert late.mean().item() == pytest.approx(0.75, abs=0.01)  # even inside an interval
-    fixed = [prop.draw_from_weights(edges, weights, 8, None) for _ in range(2)]
+    fixed = [invert_cdf(edges, weights, stratified(50, 8, None, edges.device)) for _ in range(2)]
     assert torch.equal(*fixed)
     torch.testing.assert_close(fixed[0][0, :2], torch.tensor([0.025, 0.075]))
 
 
 def test_proposal_samples_are_sorted_detached_and_inside():
-    origins, directions, entry, leave = random_rays(20)
-    distances, edges, weights = prop.proposal_distances(network(), origins, directions, entry, leave, 32, 16, seeded())
+    rays = random_rays(20)
+    distances, edges, weights = prop.proposal_distances(network(), rays, 32, 16, seeded())
     assert distances.shape == (20, 16)
     assert edges.shape == (20, 33)
     assert weights.shape == (20, 32)
     assert (distances[:, 1:] >= distances[:, :-1]).all()
-    assert (distances >= entry[:, None] - 1e-5).all() & (distances <= leave[:, None] + 1e-5).all()
+    assert (distances >= rays.entry[:, None] - 1e-5).all() & (distances <= rays.leave[:, None] + 1e-5).all()
     assert weights.requires_grad
     assert not distances.requires_grad
     assert (weights >= 0).all() & (weights.sum(1) <= 1 + 1e-5).all()
@@ -132,12 +133,11 @@ def test_a_few_steps_gather_the_samples_at_a_ball():
 
     def at_surface(count: int, seed: int) -> tuple[torch.Tensor, torch.Tensor]:
         """Part of the samples within 0.06 of the ball's front, and the mean interlevel loss."""
-        origins, directions, entry, leave = random_rays(count, seed)
-        distances, edges, weights = prop.proposal_distances(net, origins, directions, entry, leave, 32, 16, generator)
-        points = origins[:, None] + distances[..., None] * directions[:, None]
-        sdf = points.norm(dim=2) - radius
+        rays = random_rays(count, seed)
+        distances, edges, weights = prop.proposal_distances(net, rays, 32, 16, generator)
+        sdf = rays.at(distances).norm(dim=2) - radius
         rendered, _ = weights_from_optical_depth(sample_optical_depths(sdf, distances, 0.02))
-        closest = -(origins * directions).sum(1, keepdim=True)
+        closest = -(rays.origins * rays.directions).sum(1, keepdim=True)
         front = (sdf.abs() < 0.06) & (distances < closest)
         loss = prop.interlevel_loss(prop.sample_edges(distances), rendered, edges, weights).mean()
         return front.float().mean(), loss

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from stages.neural.density import laplace_density, section_optical_depth
 from stages.neural.rendering import composite, rendering_weights, sample_optical_depths, weights_from_optical_depth
 from stages.neural.sampling import (
+    Rays,
     SdfCache,
     importance_distances,
     importance_distances_reference,
@@ -146,15 +147,15 @@ def test_samples_gather_at_the_surface_sorted_inside_the_interval():
     cache = sphere_cache()
     origins, directions = torch.tensor([[0.0, 0, -2]]).expand(64, 3), torch.tensor([[0.0, 0, 1]]).expand(64, 3)
     entry, leave, _ = intersect_unit_sphere(origins, directions)
-    generator = torch.Generator().manual_seed(0)
-    distances = importance_distances(cache, origins, directions, entry, leave, 16, 0.01, generator)
+    rays, generator = Rays(origins, directions, entry, leave), torch.Generator().manual_seed(0)
+    distances = importance_distances(cache, rays, 16, 0.01, generator)
     assert (distances[:, 1:] >= distances[:, :-1]).all()
     assert (distances >= entry[:, None] - 1e-5).all()
     assert (distances <= leave[:, None] + 1e-5).all()
     near = ((distances - 1.5).abs() < 0.1).float().mean()
     assert near > 0.7  # the surface is at 1.5; an even spread would have 0.1
     assert (distances.max() - distances.min()) > 1.0  # and some look elsewhere
-    fixed = [importance_distances(cache, origins, directions, entry, leave, 16, 0.01, None) for _ in range(2)]
+    fixed = [importance_distances(cache, rays, 16, 0.01, None) for _ in range(2)]
     assert torch.equal(*fixed)
 
 
@@ -171,11 +172,11 @@ def test_the_sampling_kernel_agrees_with_the_reference(scale):
     rays = [tensor[hit] for tensor in (origins, directions, entry, leave)]
     for seed in (None, 1):
         first, second = (None if seed is None else torch.Generator().manual_seed(seed) for _ in range(2))
-        got = importance_distances(cache, *rays, 16, scale, first)
+        got = importance_distances(cache, Rays(*rays), 16, scale, first)
         places = stratified(len(rays[0]), 16, second, torch.device("cpu"))
         # In float64: a grazing ray's weights are near the rounding error of its transmittance in float32.
-        arguments = [tensor.double() for tensor in (*rays, places)]
-        expected = importance_distances_reference(cache64, *arguments, max(scale, 0.5 * cache.cell), 64)
+        rays64 = Rays(*(tensor.double() for tensor in rays))
+        expected = importance_distances_reference(cache64, rays64, places.double(), max(scale, 0.5 * cache.cell), 64)
         torch.testing.assert_close(got.double(), expected, rtol=0, atol=1e-4)
         assert (got - expected).abs().median() < 1e-6
 

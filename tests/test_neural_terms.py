@@ -103,7 +103,7 @@ def test_the_ambiguity_weight_trusts_a_painted_ball_and_doubts_a_shifting_one(vi
     trainer._refresh_cache(trainer.moment(0.5))
     batch = trainer.photos.draw(400, torch.Generator().manual_seed(0))
     with torch.no_grad():
-        rendered = trainer.render(batch, 0.5, torch.zeros(0, 3), None)
+        rendered = trainer.render(batch, 0.5)
     on_ball = rendered.opacity > 0.5
     assert 50 < int(on_ball.sum()) < 350
     height = rendered.surface[0][:, 2]
@@ -134,7 +134,7 @@ def test_the_ambiguity_weight_is_that_of_a_loop_over_rays_and_photos():
     trainer._refresh_cache(moment)
     batch = photos.draw(60, torch.Generator().manual_seed(0))
     with torch.no_grad():
-        rendered = trainer.render(batch, 0.5, torch.zeros(0, 3), None)
+        rendered = trainer.render(batch, 0.5)
     surface, normals = rendered.surface
     margin = max(moment.voxel, trainer.cache.cell / 2)
     doubt = []
@@ -169,7 +169,7 @@ def test_masks_take_rays_out_of_the_ambiguity_weight():
     trainer._refresh_cache(trainer.moment(0.5))
     batch = trainer.photos.draw(400, torch.Generator().manual_seed(0))
     with torch.no_grad():
-        rendered = trainer.render(batch, 0.5, torch.zeros(0, 3), None)
+        rendered = trainer.render(batch, 0.5)
     weights = trainer.terms.color_weight(rendered, rendered.colors, trainer.moment(0.5))
     counted = (rendered.opacity > 0.5) & (batch.masks > 0.5)
     assert int(counted.sum()) < int((rendered.opacity > 0.5).sum())  # the first sphere is larger than the ball
@@ -183,7 +183,7 @@ def test_the_papers_weight_carries_a_gradient_and_the_stable_one_none():
         trainer = make_trainer(changed(TINY, settings))
         trainer._refresh_cache(trainer.moment(0.5))
         batch = trainer.photos.draw(200, torch.Generator().manual_seed(0))
-        rendered = trainer.render(batch, 0.5, torch.zeros(0, 3), None)
+        rendered = trainer.render(batch, 0.5)
         weights = trainer.terms.color_weight(rendered, rendered.colors, trainer.moment(0.5))
         assert weights.requires_grad is carries
 
@@ -203,11 +203,10 @@ def test_reflection_waits_for_its_start_and_colours_only_rays_that_meet_somethin
     trainer = rough_trainer({"terms.reflection.form": "stable", **FLOOR})
     put_on_a_floor(trainer)
     batch = trainer.photos.draw(400, torch.Generator().manual_seed(0))
-    nothing = torch.zeros(0, 3)
     with torch.no_grad():
-        early, late = (trainer.render(batch, progress, nothing, None) for progress in (0.2, 0.5))
+        early, late = (trainer.render(batch, progress) for progress in (0.2, 0.5))
         trainer.fields.reflection = None
-        plain = trainer.render(batch, 0.5, nothing, None)
+        plain = trainer.render(batch, 0.5)
     assert early.reflected.abs().max() == 0
     met, hit = late.reflected > 0, late.opacity > 0.5
     assert 0 < int(met.sum()) < int(hit.sum())
@@ -249,7 +248,7 @@ def test_batches_that_meet_nothing_render(monkeypatch):
     trainer = rough_trainer({"terms.reflection.form": "stable"})
     batch = trainer.photos.rays(torch.zeros(3, dtype=torch.long), torch.full((3, 2), -1e6))
     assert len(batch.leave) == 0
-    rendered = trainer.render(batch, 0.5, torch.zeros(0, 3), None)
+    rendered = trainer.render(batch, 0.5)
     assert rendered.colors.shape == rendered.surface[0].shape == (0, 3)
 
 

@@ -56,7 +56,7 @@ def test_variants_start_from_what_the_base_learned_and_timing_teaches_them_nothi
     monkeypatch.setattr(step_speed, "STEPS_PER_TURN", 1)
     trainers = step_speed.variant_trainers(["base", "all", "scale-learned"])
     base = trainers["base"].fields.state_dict()
-    assert (base["sdf.table"] - step_speed.ball_trainer(trainers["base"].params).fields.sdf.table).abs().max() > 1e-3
+    assert (base["sdf.table"] - step_speed.noise_trainer(trainers["base"].params).fields.sdf.table).abs().max() > 1e-3
     for trainer in trainers.values():
         state = trainer.fields.state_dict()
         assert all(torch.equal(state[name], value) for name, value in base.items())

@@ -91,7 +91,7 @@ def test_the_reference_encoding_trains_like_the_kernels(monkeypatch):
     kernels, reference = make_trainer(), make_trainer()
     expected = kernels.step(0.3)
     monkeypatch.setattr(fields_module, "encode", encodings.encode_reference)
-    monkeypatch.setattr(fields_module, "encode_features", encodings._reference_features)
+    monkeypatch.setattr(fields_module, "encode_features", encodings.features_reference)
     numbers = reference.step(0.3)
     for key, value in expected.items():
         assert float(numbers[key]) == pytest.approx(float(value), rel=1e-3, abs=1e-5), key
@@ -256,7 +256,7 @@ def test_a_step_on_cuda_matches_the_cpu(settings):
         images = torch.arange(8, device=device).repeat(10)
         pixels = torch.tensor([[24.0, 20.0]], device=device).repeat(80, 1)
         batch = photos.rays(images, pixels)
-        rendered.append(trainer.render(batch, 0.3, torch.zeros(0, 3, device=device), None).colors.detach().cpu())
+        rendered.append(trainer.render(batch, 0.3).colors.detach().cpu())
         assert torch.isfinite(trainer.step(0.3)["loss"]).item()
     torch.testing.assert_close(rendered[1], rendered[0], rtol=1e-3, atol=1e-3)
 

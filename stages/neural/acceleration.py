@@ -35,6 +35,11 @@ def fixed_shapes(device: torch.device) -> bool:
     return device.type in ASYNCHRONOUS
 
 
+def points_at_a_time(device: torch.device) -> int:
+    """How many points to evaluate in one go where there are many: what stays in a core's cache, or fills a GPU."""
+    return 1 << 13 if device.type == "cpu" else 1 << 17
+
+
 def first_rows(chosen: Bool[Tensor, " n"], count: int) -> Int[Tensor, " {count}"]:
     """Indices of the first rows that are chosen, from the start again where they are fewer.
 

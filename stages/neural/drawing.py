@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from configs.training import TrainParams
 from stages.geometry.cameras import PinholeCameras
-from stages.neural.fields import Fields, points_at_a_time
+from stages.neural.fields import Fields
 from stages.neural.renderer import Renderer
 from stages.neural.sampling import SdfCache, intersect_unit_sphere
 from stages.neural.terms import Terms
 from stages.neural.training_photos import RayBatch
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float, Float32, UInt8
 
 _RAYS = 4096  # rendered at a time
 
@@ -23,20 +28,20 @@ class FieldDrawing:
     """What one camera sees of the field.
 
     Attributes:
-        colors: [H, W, 3] uint8 sRGB. Without a background network black shines through where nothing is opaque.
-        opacity: [H, W] float32 of the surface, 0 where a ray misses the region of interest.
-        crossing: [H, W] bool, the ray crosses the region of interest.
+        colors: sRGB. Without a background network black shines through where nothing is opaque.
+        opacity: of the surface, 0 where a ray misses the region of interest.
+        crossing: whether the ray crosses the region of interest.
         background: whether there is a background network: without one the field says nothing where rays miss.
     """
 
-    colors: np.ndarray
-    opacity: np.ndarray
-    crossing: np.ndarray
+    colors: UInt8[np.ndarray, "h w 3"]
+    opacity: Float32[np.ndarray, "h w"]
+    crossing: Bool[np.ndarray, "h w"]
     background: bool
 
     @property
-    def drawn(self) -> np.ndarray:
-        """[H, W] bool, where the field says something."""
+    def drawn(self) -> Bool[np.ndarray, "h w"]:
+        """Where the field says something."""
         return self.crossing | self.background
 
 
@@ -52,7 +57,7 @@ class FieldDrawer:
         cache = SdfCache(params.sampling.cache_resolution, device)
         self.renderer = Renderer(fields, cache, params, Terms(fields, cache, params))
         self.moment = self.renderer.moment(1.0)
-        cache.refresh(lambda p: fields.sdf.sdf(p, self.moment.levels), None, points_at_a_time(self.device))
+        cache.refresh(lambda p: fields.sdf.sdf(p, self.moment.levels))
 
     @torch.no_grad()
     def draw(self, cameras: PinholeCameras, index: int) -> FieldDrawing:
@@ -70,20 +75,22 @@ class FieldDrawer:
             self.renderer.fields.background is not None,
         )
 
-    def _rays(self, origins: torch.Tensor, directions: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Colours [R, 3], opacity [R], and whether they cross the region [R] bool, of rays [R, 3]."""
-        count, background = len(origins), self.renderer.fields.background
-        colors, opacity = (torch.zeros(count, n, device=self.device) for n in (3, 1))
+    def _rays(
+        self, origins: Float[Tensor, "r 3"], directions: Float[Tensor, "r 3"]
+    ) -> tuple[Float[Tensor, "r 3"], Float[Tensor, " r"], Bool[Tensor, " r"]]:
+        """Colours and opacity of rays, and whether they cross the region."""
+        background = self.renderer.fields.background
+        colors, opacity = torch.zeros_like(origins), torch.zeros_like(origins[:, 0])
         entry, leave, hit = intersect_unit_sphere(origins, directions)
         crossing = torch.nonzero(hit).squeeze(1)
         if len(crossing):
             batch = RayBatch(
-                crossing, torch.zeros_like(crossing), origins[crossing], directions[crossing], entry[crossing],
-                leave[crossing], colors[crossing], None,
+                origins[crossing], directions[crossing], entry[crossing], leave[crossing],
+                crossing, torch.zeros_like(crossing), colors[crossing], None,
             )  # fmt: skip
-            rendered = self.renderer.render(batch, self.moment, torch.zeros(0, 3, device=self.device), None)
-            colors[crossing], opacity[crossing, 0] = rendered.colors, rendered.opacity
+            rendered = self.renderer.render(batch, self.moment)
+            colors[crossing], opacity[crossing] = rendered.colors, rendered.opacity
         missing = torch.nonzero(~hit).squeeze(1)
         if background is not None and len(missing):
             colors[missing] = self.renderer.background_color(background, origins[missing], directions[missing], None)
-        return colors, opacity.squeeze(1), hit
+        return colors, opacity, hit

@@ -5,6 +5,7 @@ What each function computes: `stages.neural.encodings.EncodingKernels`. The Jaco
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 
 from stages.neural import kernels
@@ -12,24 +13,15 @@ from stages.neural.encoding_shapes import HashGrid
 
 
 def forward(
-    points: torch.Tensor, table: torch.Tensor, grid: HashGrid, active_levels: int
-) -> tuple[torch.Tensor, torch.Tensor]:
+    points: torch.Tensor, table: torch.Tensor, grid: HashGrid, active_levels: int, with_jacobian: bool
+) -> tuple[torch.Tensor, torch.Tensor | None]:
     features = torch.empty(len(points), grid.channels)
-    jacobian = torch.empty(len(points), 3, grid.channels)
+    jacobian = torch.empty(len(points), 3, grid.channels) if with_jacobian else None
     kernels.encode_forward(
         points.detach().numpy(), table.detach().numpy(), grid.resolutions, grid.offsets, grid.dense,
-        active_levels, features.numpy(), jacobian.numpy(),
+        active_levels, features.numpy(), _array(jacobian),
     )  # fmt: skip
     return features, jacobian
-
-
-def features_forward(points: torch.Tensor, table: torch.Tensor, grid: HashGrid, active_levels: int) -> torch.Tensor:
-    features = torch.empty(len(points), grid.channels)
-    kernels.features_forward(
-        points.detach().numpy(), table.detach().numpy(), grid.resolutions, grid.offsets, grid.dense,
-        active_levels, features.numpy(),
-    )  # fmt: skip
-    return features
 
 
 def backward(
@@ -40,27 +32,25 @@ def backward(
     grad_jacobian: tuple[torch.Tensor, torch.Tensor] | None,
     grad_table: torch.Tensor,
 ) -> None:
-    arguments = (points.detach().numpy(), grid.resolutions, grid.offsets, grid.dense, active_levels)
-    if grad_jacobian is None:
-        assert grad_features is not None
-        kernels.features_backward(*arguments, grad_features.contiguous().numpy(), grad_table.numpy())
-        return
-    grad_gradients, cotangent = grad_jacobian
-    if grad_features is None:
-        grad_features = torch.zeros_like(cotangent)
+    grad_gradients, cotangent = grad_jacobian or (None, None)
     kernels.encode_backward(
-        *arguments, grad_features.contiguous().numpy(), grad_gradients.contiguous().numpy(),
-        cotangent.contiguous().numpy(), grad_table.numpy(),
+        points.detach().numpy(), grid.resolutions, grid.offsets, grid.dense, active_levels,
+        _array(grad_features), _array(grad_gradients), _array(cotangent), grad_table.numpy(),
     )  # fmt: skip
 
 
 def vjp_forward(jacobian: torch.Tensor, cotangent: torch.Tensor) -> torch.Tensor:
     gradients = torch.empty(len(jacobian), 3)
-    kernels.vjp_forward(jacobian.numpy(), cotangent.detach().contiguous().numpy(), gradients.numpy())
+    kernels.vjp_forward(jacobian.numpy(), _array(cotangent.detach()), gradients.numpy())
     return gradients
 
 
 def vjp_backward(jacobian: torch.Tensor, grad_gradients: torch.Tensor, channels: int) -> torch.Tensor:
     grad_cotangent = torch.empty(len(jacobian), channels)
-    kernels.vjp_backward(jacobian.numpy(), grad_gradients.contiguous().numpy(), grad_cotangent.numpy())
+    kernels.vjp_backward(jacobian.numpy(), _array(grad_gradients), grad_cotangent.numpy())
     return grad_cotangent
+
+
+def _array(tensor: torch.Tensor | None) -> np.ndarray | None:
+    """Row by row in memory: numba compiles for that alone."""
+    return None if tensor is None else tensor.contiguous().numpy()

@@ -174,28 +174,17 @@ def _vjp_gradient(jacobian, grad_gradients, grad_cotangent, num_points, axis, BL
 
 # ---------------------------------------------------------------- tensors in and out
 def forward(
-    points: torch.Tensor, table: torch.Tensor, grid: HashGrid, active_levels: int
-) -> tuple[torch.Tensor, torch.Tensor]:
-    jacobian = torch.empty(3, active_levels * grid.features, len(points), device=points.device)
-    return _features(points, table, grid, active_levels, jacobian), jacobian
-
-
-def features_forward(points: torch.Tensor, table: torch.Tensor, grid: HashGrid, active_levels: int) -> torch.Tensor:
-    return _features(points, table, grid, active_levels, None)
-
-
-def _features(
-    points: torch.Tensor, table: torch.Tensor, grid: HashGrid, active_levels: int, jacobian: torch.Tensor | None
-) -> torch.Tensor:
-    """Features [N, C]; fills the jacobian [3, A, N] of the A channels in use where there is one."""
+    points: torch.Tensor, table: torch.Tensor, grid: HashGrid, active_levels: int, with_jacobian: bool
+) -> tuple[torch.Tensor, torch.Tensor | None]:
     features, active = torch.empty(grid.channels, len(points), device=points.device), active_levels * grid.features
+    jacobian = torch.empty(3, active, len(points), device=points.device) if with_jacobian else None
     features[active:].zero_()
     _encode[_programs(points, active_levels)](
         points.detach().contiguous(), table.detach(), _levels_of(grid, points.device), features, jacobian,
         len(points), active * len(points),
-        ROW_MASK=2**grid.log2_rows - 1, FEATURES=grid.features, WITH_JACOBIAN=jacobian is not None, BLOCK=BLOCK,
+        ROW_MASK=2**grid.log2_rows - 1, FEATURES=grid.features, WITH_JACOBIAN=with_jacobian, BLOCK=BLOCK,
     )  # fmt: skip
-    return features.T
+    return features.T, jacobian
 
 
 def backward(

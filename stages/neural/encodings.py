@@ -50,14 +50,9 @@ class EncodingKernels(Protocol):
     """
 
     def forward(
-        self, points: Float[Tensor, "n 3"], table: Float[Tensor, "rows f"], grid: HashGrid, active_levels: int
-    ) -> tuple[Tensor, Tensor]:
-        """Features [N, C] and their Jacobian."""
-
-    def features_forward(
-        self, points: Float[Tensor, "n 3"], table: Float[Tensor, "rows f"], grid: HashGrid, active_levels: int
-    ) -> Tensor:
-        """Features [N, C] alone."""
+        self, points: Tensor, table: Tensor, grid: HashGrid, active_levels: int, with_jacobian: bool
+    ) -> tuple[Tensor, Tensor | None]:
+        """Features [N, C] and, where it is asked for, their Jacobian."""
 
     def backward(
         self,
@@ -87,11 +82,12 @@ def encode(
 
     Channels of levels >= active_levels are zero. A hash grid clamps points to [-1, 1]^3.
     """
+    if isinstance(encoding, Frequencies):
+        return _encode_frequencies(points, encoding, active_levels)
+    assert table is not None
     kernels = kernels_for(points, encoding)
     if kernels is None:
         return encode_reference(points, table, encoding, active_levels)
-    assert table is not None
-    assert isinstance(encoding, HashGrid)
     return encode_with(kernels, points, table, encoding, active_levels)
 
 
@@ -99,28 +95,41 @@ def encode_features(
     points: Float[Tensor, "n 3"], table: Float[Tensor, "rows f"] | None, encoding: Encoding, active_levels: int
 ) -> Float[Tensor, "n c"]:
     """Features alone, differentiable with respect to the table: for density without normals."""
+    if isinstance(encoding, Frequencies):
+        return _encode_frequencies(points, encoding, active_levels)[0]
+    assert table is not None
     kernels = kernels_for(points, encoding)
     if kernels is None:
-        return _reference_features(points, table, encoding, active_levels)
+        return features_reference(points, table, encoding, active_levels)
     return _KernelFeatures.apply(points, table, encoding, active_levels, kernels)
 
 
+def _encode_frequencies(
+    points: Float[Tensor, "n 3"], encoding: Frequencies, active_levels: int
+) -> tuple[Float[Tensor, "n c"], Vjp]:
+    frequencies = math.pi * 2.0 ** torch.arange(active_levels, device=points.device, dtype=points.dtype)
+    angles = points[:, None] * frequencies[:, None]  # [N, levels, 3]
+    sines, cosines = torch.sin(angles), torch.cos(angles)
+    padding = encoding.channels - 6 * active_levels
+    features = torch.nn.functional.pad(torch.cat([sines, cosines], 2).flatten(1), (0, padding))
+
+    def vjp(cotangent: Tensor) -> Tensor:
+        of_sines, of_cosines = cotangent[:, : 6 * active_levels].view(-1, active_levels, 6).split(3, 2)
+        return torch.einsum("nka,k->na", of_sines * cosines - of_cosines * sines, frequencies)
+
+    return features, vjp
+
+
 # ---------------------------------------------------------------- which kernels
-def kernels_for(points: Float[Tensor, "n 3"], encoding: Encoding) -> EncodingKernels | None:
-    """The kernels that take these points, or None where the reference does: frequencies, float64, no kernels."""
-    if isinstance(encoding, Frequencies):
-        return None
-    if encoding.features == 4 and takes_kernel(points):
+def kernels_for(points: Float[Tensor, "n 3"], grid: HashGrid) -> EncodingKernels | None:
+    """The kernels that take these points, or None where the reference does: float64, no kernels."""
+    if grid.features == 4 and takes_kernel(points):
         from stages.neural import encoding_cpu
 
         return encoding_cpu
-    if points.device.type == "cuda" and points.dtype == torch.float32 and _is_power_of_two(encoding.features):
-        return _cuda_kernels(encoding.features, points.device)
+    if points.device.type == "cuda" and points.dtype == torch.float32 and grid.features.bit_count() == 1:
+        return _cuda_kernels(grid.features, points.device)
     return None
-
-
-def _is_power_of_two(number: int) -> bool:
-    return number & (number - 1) == 0
 
 
 @cache
@@ -162,40 +171,11 @@ def disagreement(kernels: EncodingKernels, grid: HashGrid, device: torch.device 
 
 # ---------------------------------------------------------------- the reference
 def encode_reference(
-    points: Float[Tensor, "n 3"], table: Float[Tensor, "rows f"] | None, encoding: Encoding, active_levels: int
+    points: Float[Tensor, "n 3"], table: Float[Tensor, "rows f"], grid: HashGrid, active_levels: int
 ) -> tuple[Float[Tensor, "n c"], Vjp]:
     """`encode` in plain torch: the reference of the kernels, and what there is without them."""
-    if isinstance(encoding, Frequencies):
-        return _encode_frequencies(points, encoding, active_levels)
-    assert table is not None
-    features, jacobian = hash_jacobian(points, table, encoding, active_levels)
+    features, jacobian = hash_jacobian(points, table, grid, active_levels)
     return features, lambda cotangent: torch.bmm(jacobian, cotangent.unsqueeze(2)).squeeze(2)
-
-
-def _reference_features(
-    points: Float[Tensor, "n 3"], table: Float[Tensor, "rows f"] | None, encoding: Encoding, active_levels: int
-) -> Float[Tensor, "n c"]:
-    """`encode_features` in plain torch."""
-    if isinstance(encoding, Frequencies):
-        return _encode_frequencies(points, encoding, active_levels)[0]
-    assert table is not None
-    return _hash_features(points, table, encoding, active_levels)
-
-
-def _encode_frequencies(
-    points: Float[Tensor, "n 3"], encoding: Frequencies, active_levels: int
-) -> tuple[Float[Tensor, "n c"], Vjp]:
-    frequencies = math.pi * 2.0 ** torch.arange(active_levels, device=points.device, dtype=points.dtype)
-    angles = points[:, None] * frequencies[:, None]  # [N, levels, 3]
-    sines, cosines = torch.sin(angles), torch.cos(angles)
-    padding = encoding.channels - 6 * active_levels
-    features = torch.nn.functional.pad(torch.cat([sines, cosines], 2).flatten(1), (0, padding))
-
-    def vjp(cotangent: Tensor) -> Tensor:
-        of_sines, of_cosines = cotangent[:, : 6 * active_levels].view(-1, active_levels, 6).split(3, 2)
-        return torch.einsum("nka,k->na", of_sines * cosines - of_cosines * sines, frequencies)
-
-    return features, vjp
 
 
 def hash_jacobian(
@@ -224,9 +204,10 @@ def hash_jacobian(
     return torch.nn.functional.pad(feature, (0, padding)), torch.nn.functional.pad(jacobian, (0, padding))
 
 
-def _hash_features(
+def features_reference(
     points: Float[Tensor, "n 3"], table: Float[Tensor, "rows f"], grid: HashGrid, active_levels: int
 ) -> Float[Tensor, "n c"]:
+    """`encode_features` in plain torch."""
     features = []
     for level in range(active_levels):
         corners, fraction, _ = _corners(points, grid, level)
@@ -289,7 +270,7 @@ class _KernelEncode(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, points, table, grid, active_levels, kernels):
-        features, jacobian = kernels.forward(points, table, grid, active_levels)
+        features, jacobian = kernels.forward(points, table, grid, active_levels, with_jacobian=True)
         ctx.save_for_backward(points, table)
         ctx.grid, ctx.active_levels, ctx.kernels = grid, active_levels, kernels
         ctx.mark_non_differentiable(jacobian)
@@ -340,7 +321,7 @@ class _KernelFeatures(torch.autograd.Function):
     def forward(ctx, points, table, grid, active_levels, kernels):
         ctx.save_for_backward(points, table)
         ctx.grid, ctx.active_levels, ctx.kernels = grid, active_levels, kernels
-        return kernels.features_forward(points, table, grid, active_levels)
+        return kernels.forward(points, table, grid, active_levels, with_jacobian=False)[0]
 
     @staticmethod
     @torch.autograd.function.once_differentiable

@@ -71,11 +71,6 @@ class _KernelSmoothRelu(torch.autograd.Function):
         return grad_z
 
 
-def points_at_a_time(device: torch.device | str) -> int:
-    """How many points to evaluate in one go where there are many: what stays in a core's cache, or fills a GPU."""
-    return 1 << 13 if torch.device(device).type == "cpu" else 1 << 17
-
-
 @dataclass(frozen=True)
 class FieldShape:
     """Everything needed to build the networks again.

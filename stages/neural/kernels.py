@@ -90,7 +90,7 @@ def _interleaved(index, levels):
 
 @njit(**_OPTIONS)
 def _encode_chunk(table, first, count, column, scale, rows, fractions, features, jacobian):
-    """One level's columns of features and jacobian for the located points."""
+    """One level's columns of features, and of jacobian unless it is None, for the located points."""
     for q in range(count):
         p = uint32(first + q)
         fx, fy, fz = fractions[0, q], fractions[1, q], fractions[2, q]
@@ -106,14 +106,15 @@ def _encode_chunk(table, first, count, column, scale, rows, fractions, features,
             c0, c1 = c00 + fy * dy0, c10 + fy * dy1
             dz0, dz1 = d00 + fy * (d01 - d00), d10 + fy * (d11 - d10)
             features[p, c] = c0 + fx * (c1 - c0)
-            jacobian[p, uint32(0), c] = scale * (c1 - c0)
-            jacobian[p, uint32(1), c] = scale * (dy0 + fx * (dy1 - dy0))
-            jacobian[p, uint32(2), c] = scale * (dz0 + fx * (dz1 - dz0))
+            if jacobian is not None:
+                jacobian[p, uint32(0), c] = scale * (c1 - c0)
+                jacobian[p, uint32(1), c] = scale * (dy0 + fx * (dy1 - dy0))
+                jacobian[p, uint32(2), c] = scale * (dz0 + fx * (dz1 - dz0))
 
 
 @njit(parallel=True, **_OPTIONS)
 def encode_forward(points, table, resolutions, offsets, dense, active_levels, features, jacobian):
-    """Fill features [N, C] and jacobian [N, 3, C]."""
+    """Fill features [N, C], and jacobian [N, 3, C] unless it is None."""
     num_points, channels = features.shape
     num_chunks = (num_points + CHUNK - 1) // CHUNK
     for chunk in prange(num_chunks):
@@ -128,9 +129,10 @@ def encode_forward(points, table, resolutions, offsets, dense, active_levels, fe
         for p in range(first, last):
             for c in range(active_levels * 4, channels):
                 features[p, c] = np.float32(0)
-                jacobian[p, 0, c] = np.float32(0)
-                jacobian[p, 1, c] = np.float32(0)
-                jacobian[p, 2, c] = np.float32(0)
+                if jacobian is not None:
+                    jacobian[p, 0, c] = np.float32(0)
+                    jacobian[p, 1, c] = np.float32(0)
+                    jacobian[p, 2, c] = np.float32(0)
 
 
 @njit(**_OPTIONS)
@@ -144,11 +146,11 @@ def _encode_chunk_backward(
         fx, fy, fz = fractions[0, q], fractions[1, q], fractions[2, q]
         r0, r1, r2, r3 = rows[0, q], rows[1, q], rows[2, q], rows[3, q]
         r4, r5, r6, r7 = rows[4, q], rows[5, q], rows[6, q], rows[7, q]
-        sx, sy, sz = (
-            scale * grad_gradients[p, uint32(0)],
-            scale * grad_gradients[p, uint32(1)],
-            scale * grad_gradients[p, uint32(2)],
-        )
+        sx = sy = sz = np.float32(0)
+        if grad_gradients is not None:
+            sx = scale * grad_gradients[p, uint32(0)]
+            sy = scale * grad_gradients[p, uint32(1)]
+            sz = scale * grad_gradients[p, uint32(2)]
         gx, gy, gz = one - fx, one - fy, one - fz
         # Each corner's share is w a + (dw . s) u, w = wx wy wz its weight, a and u the incoming features and cotangent.
         w00, w01, w10, w11 = gx * gy, gx * fy, fx * gy, fx * fy
@@ -156,7 +158,8 @@ def _encode_chunk_backward(
         z00, z01, z10, z11 = w00 * sz, w01 * sz, w10 * sz, w11 * sz
         for f in range(uint32(4)):
             c = uint32(column + f)
-            a, u = grad_features[p, c], cotangent[p, c]
+            a = np.float32(0) if grad_features is None else grad_features[p, c]
+            u = np.float32(0) if cotangent is None else cotangent[p, c]
             grad_table[r0, f] += gz * (w00 * a + e00 * u) - z00 * u
             grad_table[r1, f] += fz * (w00 * a + e00 * u) + z00 * u
             grad_table[r2, f] += gz * (w01 * a + e01 * u) - z01 * u
@@ -173,7 +176,8 @@ def encode_backward(
 ):
     """Add d loss / d table [rows, 4], given the gradients of features [N, C] and of jacobian [N, 3, C].
 
-    The latter is of rank one and given by its factors: grad_gradients [N, 3] times cotangent [N, C].
+    The latter is of rank one and given by its factors: grad_gradients [N, 3] times cotangent [N, C]. One of the two may
+    be None: numba then compiles a kernel without its arithmetic.
     """
     num_points = len(points)
     for index in prange(active_levels):
@@ -194,105 +198,24 @@ def encode_backward(
 def vjp_forward(jacobian, cotangent, gradients):
     """Fill gradients [N, 3] with jacobian [N, 3, C] times cotangent [N, C]."""
     num_points, _, channels = jacobian.shape
-    num_chunks = (num_points + CHUNK - 1) // CHUNK
-    for chunk in prange(num_chunks):
-        for p in range(chunk * CHUNK, min((chunk + 1) * CHUNK, num_points)):
-            x = y = z = np.float32(0)
-            for c in range(channels):
-                u = cotangent[p, c]
-                x += jacobian[p, 0, c] * u
-                y += jacobian[p, 1, c] * u
-                z += jacobian[p, 2, c] * u
-            gradients[p, 0], gradients[p, 1], gradients[p, 2] = x, y, z
+    for p in prange(num_points):
+        x = y = z = np.float32(0)
+        for c in range(channels):
+            u = cotangent[p, c]
+            x += jacobian[p, 0, c] * u
+            y += jacobian[p, 1, c] * u
+            z += jacobian[p, 2, c] * u
+        gradients[p, 0], gradients[p, 1], gradients[p, 2] = x, y, z
 
 
 @njit(parallel=True, **_OPTIONS)
 def vjp_backward(jacobian, grad_gradients, grad_cotangent):
     """Fill grad_cotangent [N, C] with jacobian^T [N, C, 3] times grad_gradients [N, 3]."""
     num_points, _, channels = jacobian.shape
-    num_chunks = (num_points + CHUNK - 1) // CHUNK
-    for chunk in prange(num_chunks):
-        for p in range(chunk * CHUNK, min((chunk + 1) * CHUNK, num_points)):
-            x, y, z = grad_gradients[p, 0], grad_gradients[p, 1], grad_gradients[p, 2]
-            for c in range(channels):
-                grad_cotangent[p, c] = x * jacobian[p, 0, c] + y * jacobian[p, 1, c] + z * jacobian[p, 2, c]
-
-
-@njit(**_OPTIONS)
-def _features_chunk(table, first, count, column, rows, fractions, features):
-    """One level's columns of features for the located points."""
-    for q in range(count):
-        p = uint32(first + q)
-        fx, fy, fz = fractions[0, q], fractions[1, q], fractions[2, q]
-        r0, r1, r2, r3 = rows[0, q], rows[1, q], rows[2, q], rows[3, q]
-        r4, r5, r6, r7 = rows[4, q], rows[5, q], rows[6, q], rows[7, q]
-        for f in range(uint32(4)):
-            c00 = table[r0, f] + fz * (table[r1, f] - table[r0, f])
-            c01 = table[r2, f] + fz * (table[r3, f] - table[r2, f])
-            c10 = table[r4, f] + fz * (table[r5, f] - table[r4, f])
-            c11 = table[r6, f] + fz * (table[r7, f] - table[r6, f])
-            c0, c1 = c00 + fy * (c01 - c00), c10 + fy * (c11 - c10)
-            features[p, uint32(column + f)] = c0 + fx * (c1 - c0)
-
-
-@njit(parallel=True, **_OPTIONS)
-def features_forward(points, table, resolutions, offsets, dense, active_levels, features):
-    """Fill features [N, C] alone."""
-    num_points, channels = features.shape
-    num_chunks = (num_points + CHUNK - 1) // CHUNK
-    for chunk in prange(num_chunks):
-        first, last = chunk * CHUNK, min((chunk + 1) * CHUNK, num_points)
-        count = uint32(last - first)
-        rows, fractions = np.empty((8, CHUNK), np.uint32), np.empty((3, CHUNK), np.float32)
-        for level in range(active_levels):
-            _locate(
-                points, first, count, resolutions[level], offsets[level], offsets[level + 1], dense[level],
-                rows, fractions,
-            )  # fmt: skip
-            _features_chunk(table, first, count, uint32(level * 4), rows, fractions, features)
-        for p in range(first, last):
-            for c in range(active_levels * 4, channels):
-                features[p, c] = np.float32(0)
-
-
-@njit(**_OPTIONS)
-def _features_chunk_backward(first, count, column, rows, fractions, grad_features, grad_table):
-    """One level's additions to grad_table for the located points."""
-    one = np.float32(1)
-    for q in range(count):
-        p = uint32(first + q)
-        fx, fy, fz = fractions[0, q], fractions[1, q], fractions[2, q]
-        r0, r1, r2, r3 = rows[0, q], rows[1, q], rows[2, q], rows[3, q]
-        r4, r5, r6, r7 = rows[4, q], rows[5, q], rows[6, q], rows[7, q]
-        gx, gy, gz = one - fx, one - fy, one - fz
-        w00, w01, w10, w11 = gx * gy, gx * fy, fx * gy, fx * fy
-        for f in range(uint32(4)):
-            a = grad_features[p, uint32(column + f)]
-            q00, q01, q10, q11 = w00 * a, w01 * a, w10 * a, w11 * a
-            grad_table[r0, f] += gz * q00
-            grad_table[r1, f] += fz * q00
-            grad_table[r2, f] += gz * q01
-            grad_table[r3, f] += fz * q01
-            grad_table[r4, f] += gz * q10
-            grad_table[r5, f] += fz * q10
-            grad_table[r6, f] += gz * q11
-            grad_table[r7, f] += fz * q11
-
-
-@njit(parallel=True, **_OPTIONS)
-def features_backward(points, resolutions, offsets, dense, active_levels, grad_features, grad_table):
-    """Add d loss / d table [rows, 4] given the gradient of features [N, C]."""
-    num_points = len(points)
-    for index in prange(active_levels):
-        level = _interleaved(index, active_levels)
-        rows, fractions = np.empty((8, CHUNK), np.uint32), np.empty((3, CHUNK), np.float32)
-        for first in range(0, num_points, CHUNK):
-            count = uint32(min(CHUNK, num_points - first))
-            _locate(
-                points, first, count, resolutions[level], offsets[level], offsets[level + 1], dense[level],
-                rows, fractions,
-            )  # fmt: skip
-            _features_chunk_backward(first, count, uint32(level * 4), rows, fractions, grad_features, grad_table)
+    for p in prange(num_points):
+        x, y, z = grad_gradients[p, 0], grad_gradients[p, 1], grad_gradients[p, 2]
+        for c in range(channels):
+            grad_cotangent[p, c] = x * jacobian[p, 0, c] + y * jacobian[p, 1, c] + z * jacobian[p, 2, c]
 
 
 @njit(parallel=True, **_OPTIONS)
@@ -339,10 +262,8 @@ def _trilinear(values, x, y, z):
 @njit(parallel=True, **_OPTIONS)
 def lookup(values, points, found):
     """Fill found [P] with the cached f at points [P, 3]; places outside the cube read its border."""
-    num_chunks = (len(points) + CHUNK - 1) // CHUNK
-    for chunk in prange(num_chunks):
-        for p in range(chunk * CHUNK, min((chunk + 1) * CHUNK, len(points))):
-            found[p] = _trilinear(values, points[p, 0], points[p, 1], points[p, 2])
+    for p in prange(len(points)):
+        found[p] = _trilinear(values, points[p, 0], points[p, 1], points[p, 2])
 
 
 @njit(parallel=True, **_OPTIONS)
@@ -352,26 +273,23 @@ def smallest_on_paths(values, points, targets, start, solid, smallest):
     A step is f long, or half a cell where f is smaller; the walk ends at the target, at the unit sphere, or where f
     falls below `solid`.
     """
-    num_points = len(points)
     half_cell = np.float32(1.0 / (values.shape[0] - 1))
-    num_chunks = (num_points + CHUNK - 1) // CHUNK
-    for chunk in prange(num_chunks):
-        for p in range(chunk * CHUNK, min((chunk + 1) * CHUNK, num_points)):
-            x, y, z = points[p, 0], points[p, 1], points[p, 2]
-            dx, dy, dz = targets[p, 0] - x, targets[p, 1] - y, targets[p, 2] - z
-            length = np.sqrt(dx * dx + dy * dy + dz * dz)
-            dx, dy, dz = dx / length, dy / length, dz / length
-            t, least = start[p], np.float32(2)
-            while t < length:
-                px, py, pz = x + t * dx, y + t * dy, z + t * dz
-                if px * px + py * py + pz * pz > np.float32(1):
-                    break
-                f = _trilinear(values, px, py, pz)
-                least = min(least, f)
-                if f < solid:
-                    break
-                t += max(f, half_cell)
-            smallest[p] = least
+    for p in prange(len(points)):
+        x, y, z = points[p, 0], points[p, 1], points[p, 2]
+        dx, dy, dz = targets[p, 0] - x, targets[p, 1] - y, targets[p, 2] - z
+        length = np.sqrt(dx * dx + dy * dy + dz * dz)
+        dx, dy, dz = dx / length, dy / length, dz / length
+        t, least = start[p], np.float32(2)
+        while t < length:
+            px, py, pz = x + t * dx, y + t * dy, z + t * dz
+            if px * px + py * py + pz * pz > np.float32(1):
+                break
+            f = _trilinear(values, px, py, pz)
+            least = min(least, f)
+            if f < solid:
+                break
+            t += max(f, half_cell)
+        smallest[p] = least
 
 
 @njit(inline="always")

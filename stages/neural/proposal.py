@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from stages.neural.appearance import positional_encoding
 from stages.neural.mlp import mlp
 from stages.neural.rendering import weights_from_optical_depth
-from stages.neural.sampling import EVEN_SHARE, invert_cdf, stratified
+from stages.neural.sampling import EVEN_SHARE, Rays, invert_cdf, stratified
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -42,50 +42,32 @@ class ProposalNetwork(nn.Module):
 
 
 def stratified_edges(
-    entry: Float[Tensor, " r"], leave: Float[Tensor, " r"], num_intervals: int, generator: torch.Generator | None
+    rays: Rays, num_intervals: int, generator: torch.Generator | None
 ) -> Float[Tensor, "r {num_intervals}+1"]:
     """Ascending edges of intervals from entry to leave, inner edges within half an interval of even."""
-    inner = stratified(len(entry), num_intervals - 1, generator, entry.device)
+    inner = stratified(len(rays), num_intervals - 1, generator, rays.entry.device)
     share = nn.functional.pad((inner * (num_intervals - 1) + 0.5) / num_intervals, (1, 0))
     share = nn.functional.pad(share, (0, 1), value=1.0)
-    return entry[:, None] + (leave - entry)[:, None] * share
-
-
-def draw_from_weights(
-    edges: Float[Tensor, "r e"], weights: Float[Tensor, "r e-1"], num_samples: int, generator: torch.Generator | None
-) -> Float[Tensor, "r {num_samples}"]:
-    """Sorted distances drawn by inverse CDF from a histogram: weights, sum > 0, between edges.
-
-    One stratified draw per sample; the strata's centres without a generator.
-    """
-    return invert_cdf(edges, weights, stratified(len(edges), num_samples, generator, edges.device))
+    return rays.entry[:, None] + (rays.leave - rays.entry)[:, None] * share
 
 
 def proposal_distances(
-    network: ProposalNetwork,
-    origins: Float[Tensor, "r 3"],
-    directions: Float[Tensor, "r 3"],
-    entry: Float[Tensor, " r"],
-    leave: Float[Tensor, " r"],
-    num_proposal: int,
-    num_samples: int,
-    generator: torch.Generator | None,
+    network: ProposalNetwork, rays: Rays, num_proposal: int, num_samples: int, generator: torch.Generator | None
 ) -> tuple[Float[Tensor, "r {num_samples}"], Float[Tensor, "r {num_proposal}+1"], Float[Tensor, "r {num_proposal}"]]:
     """Sorted sample distances, and the edges and weights of the histogram behind them.
 
     The histogram holds the network's rendering weights, one density at the middle of each interval. Samples follow it,
-    but for the share `EVEN_SHARE`, which is spread evenly. The samples are detached; the weights carry the gradient
-    that `interlevel_loss` needs.
+    one stratified draw each (the strata's centres without a generator), but for the share `EVEN_SHARE`, which is spread
+    evenly. The samples are detached; the weights carry the gradient that `interlevel_loss` needs.
     """
-    edges = stratified_edges(entry, leave, num_proposal, generator)
+    edges = stratified_edges(rays, num_proposal, generator)
     middle, delta = 0.5 * (edges[:, 1:] + edges[:, :-1]), edges[:, 1:] - edges[:, :-1]
-    points = origins[:, None] + middle[..., None] * directions[:, None]
-    density = network(points.reshape(-1, 3)).view_as(middle)
+    density = network(rays.at(middle).reshape(-1, 3)).view_as(middle)
     weights, _ = weights_from_optical_depth(density * delta)
     with torch.no_grad():
-        evenly = delta / (leave - entry)[:, None]
+        evenly = delta / (rays.leave - rays.entry)[:, None]
         blended = weights + (EVEN_SHARE * weights.sum(1, keepdim=True) + 1e-4) * evenly
-        distances = draw_from_weights(edges, blended, num_samples, generator)
+        distances = invert_cdf(edges, blended, stratified(len(rays), num_samples, generator, edges.device))
     return distances, edges, weights
 
 

@@ -56,17 +56,22 @@ class Renderer:
         return Moment(progress, scale, levels, grid.voxel_size(levels))
 
     def render(
-        self, batch: RayBatch, moment: Moment, extra: Float[Tensor, "e 3"], generator: torch.Generator | None
+        self,
+        batch: RayBatch,
+        moment: Moment,
+        extra: Float[Tensor, "e 3"] | None = None,
+        generator: torch.Generator | None = None,
     ) -> Rendered:
-        """Render rays and evaluate the SDF at extra points in the same pass.
+        """Render rays and, where there are extra points, evaluate the SDF there in the same pass.
 
         Without a generator samples lie at the centres of their strata: the same rays give the same colours.
         """
         distances, proposal = self._sample(batch, moment, generator)
         num_rays, num_samples = distances.shape
-        points = (batch.origins[:, None] + distances[..., None] * batch.directions[:, None]).reshape(-1, 3)
+        points = batch.at(distances).reshape(-1, 3)
         num_points = len(points)
-        sdf, features, gradients = self.fields.sdf(torch.cat([points, extra]), moment.levels)
+        places = points if extra is None else torch.cat([points, extra])
+        sdf, features, gradients = self.fields.sdf(places, moment.levels)
         weights, transmittance = rendering_weights(
             sdf[:num_points].view(num_rays, num_samples), distances, moment.scale, self.params.density.form
         )
@@ -86,14 +91,10 @@ class Renderer:
         """Distances of the samples, and the proposal network's histogram where it made them."""
         params = self.params.sampling
         if self.fields.proposal is None:
-            return importance_distances(
-                self.cache, batch.origins, batch.directions, batch.entry, batch.leave,
-                params.samples, moment.width, generator,
-            ), None  # fmt: skip
+            return importance_distances(self.cache, batch, params.samples, moment.width, generator), None
         distances, edges, weights = proposal_distances(
-            self.fields.proposal, batch.origins, batch.directions, batch.entry, batch.leave,
-            params.proposal_samples, params.samples, generator,
-        )  # fmt: skip
+            self.fields.proposal, batch, params.proposal_samples, params.samples, generator
+        )
         return distances, (edges, weights)
 
     def _colors(

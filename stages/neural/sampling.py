@@ -1,17 +1,18 @@
 """Where along a ray to look: inside the unit sphere, near the surface of a cached SDF grid.
 
-Shapes: R rays with origins and unit directions [R, 3], K samples a ray. Distances are along the ray, scene units.
+Shapes: r rays, k samples a ray. Distances are along the ray, scene units.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
-from stages.neural.acceleration import fixed_shapes, takes_kernel
+from stages.neural.acceleration import fixed_shapes, points_at_a_time, takes_kernel
 from stages.neural.density import FLAT, section_optical_depth
 from stages.neural.rendering import weights_from_optical_depth
 
@@ -25,6 +26,28 @@ _EVEN_FLOOR = 1e-4
 # Part of the grid that a refresh near the surface takes on CUDA: a band of 4 cells to either side of a sphere that
 # fills the region has a fifth of a grid of 96 cells a side, and less of a finer one.
 _NEAREST_SHARE = 0.25
+
+
+@dataclass(frozen=True)
+class Rays:
+    """Rays that cross the region of interest.
+
+    Attributes:
+        origins, directions: scene frame, directions unit.
+        entry, leave: distances at which the ray crosses the unit sphere.
+    """
+
+    origins: Float[Tensor, "r 3"]
+    directions: Float[Tensor, "r 3"]
+    entry: Float[Tensor, " r"]
+    leave: Float[Tensor, " r"]
+
+    def __len__(self) -> int:
+        return len(self.origins)
+
+    def at(self, distances: Float[Tensor, "r k"]) -> Float[Tensor, "r k 3"]:
+        """Points on the rays."""
+        return self.origins[:, None] + distances[..., None] * self.directions[:, None]
 
 
 def intersect_unit_sphere(
@@ -45,8 +68,7 @@ def intersect_unit_sphere(
 def stratified(
     num_rows: int, num_strata: int, generator: torch.Generator | None, device: torch.device
 ) -> Float[Tensor, "{num_rows} {num_strata}"]:
-    """Ascending places in [0, 1): one draw in each of even strata; their centres without a
-    generator."""
+    """Ascending places in [0, 1): one draw in each of even strata; their centres without a generator."""
     if generator is None:
         offset = torch.full((num_rows, num_strata), 0.5, device=device)
     else:
@@ -86,7 +108,7 @@ class SdfCache:
         return torch.stack([x, y, z], 1).float() * self.cell - 1
 
     @torch.no_grad()
-    def refresh(self, sdf: Callable[[Tensor], Tensor], band: float | None = None, at_a_time: int = 1 << 13) -> int:
+    def refresh(self, sdf: Callable[[Tensor], Tensor], band: float | None = None) -> int:
         """Evaluate sdf([M, 3]) -> [M] on the grid: everywhere, or where |cached f| < band. Returns M.
 
         On CUDA the band is as wide as a fixed part of the grid.
@@ -98,7 +120,7 @@ class SdfCache:
             rows = flat.abs().topk(int(_NEAREST_SHARE * flat.numel()), largest=False, sorted=False).indices
         else:
             rows = torch.nonzero(flat.abs() < band).squeeze(1)
-        for chunk in rows.split(at_a_time):
+        for chunk in rows.split(points_at_a_time(flat.device)):
             flat[chunk] = sdf(self.points(chunk))
         return len(rows)
 
@@ -123,10 +145,7 @@ class SdfCache:
 @torch.no_grad()
 def importance_distances(
     cache: SdfCache,
-    origins: Float[Tensor, "r 3"],
-    directions: Float[Tensor, "r 3"],
-    entry: Float[Tensor, " r"],
-    leave: Float[Tensor, " r"],
+    rays: Rays,
     num_samples: int,
     scale: float,
     generator: torch.Generator | None,
@@ -137,39 +156,33 @@ def importance_distances(
     The weights are those of a Laplace density of the given scale, widened to what the cache resolves; a share
     `EVEN_SHARE` is spread evenly. One stratified draw per sample; the strata's centres without a generator.
     """
-    places = stratified(len(origins), num_samples, generator, origins.device)
+    places = stratified(len(rays), num_samples, generator, rays.origins.device)
     scale = max(scale, 0.5 * cache.cell)
-    if not takes_kernel(origins):
-        return importance_distances_reference(cache, origins, directions, entry, leave, places, scale, num_bins)
+    if not takes_kernel(rays.origins):
+        return importance_distances_reference(cache, rays, places, scale, num_bins)
     from stages.neural import kernels
 
     distances = torch.empty(places.shape)
-    rays = (tensor.contiguous().numpy() for tensor in (origins, directions, entry, leave, places))
+    given = (each.contiguous().numpy() for each in (rays.origins, rays.directions, rays.entry, rays.leave, places))
     kernels.importance_distances(
-        cache.values[0, 0].numpy(), *rays, scale, FLAT, EVEN_SHARE, _EVEN_FLOOR, num_bins, distances.numpy()
+        cache.values[0, 0].numpy(), *given, scale, FLAT, EVEN_SHARE, _EVEN_FLOOR, num_bins, distances.numpy()
     )
     return distances
 
 
 @torch.no_grad()
 def importance_distances_reference(
-    cache: SdfCache,
-    origins: Float[Tensor, "r 3"],
-    directions: Float[Tensor, "r 3"],
-    entry: Float[Tensor, " r"],
-    leave: Float[Tensor, " r"],
-    places: Float[Tensor, "r k"],
-    scale: float,
-    num_bins: int,
+    cache: SdfCache, rays: Rays, places: Float[Tensor, "r k"], scale: float, num_bins: int
 ) -> Float[Tensor, "r k"]:
     """Distances at places in [0, 1) of the weights' CDF, in plain torch.
 
     The reference of the kernel behind `importance_distances`, and the path on CUDA.
     """
-    edges = torch.linspace(0, 1, num_bins + 1, device=origins.device)
-    distances = entry[:, None] + (leave - entry)[:, None] * edges
-    sdf = cache.lookup_reference(origins[:, None] + distances[..., None] * directions[:, None])
-    delta = (leave - entry)[:, None] / num_bins
+    edges = torch.linspace(0, 1, num_bins + 1, device=places.device)
+    length = (rays.leave - rays.entry)[:, None]
+    distances = rays.entry[:, None] + length * edges
+    sdf = cache.lookup_reference(rays.at(distances))
+    delta = length / num_bins
     tau = section_optical_depth(sdf[:, :-1], sdf[:, 1:], delta, scale)
     weights, _ = weights_from_optical_depth(tau)
     weights = weights + (EVEN_SHARE * weights.sum(1, keepdim=True) + _EVEN_FLOOR) / num_bins
@@ -179,8 +192,10 @@ def importance_distances_reference(
 def invert_cdf(
     edges: Float[Tensor, "r e"], weights: Float[Tensor, "r e-1"], places: Float[Tensor, "r k"]
 ) -> Float[Tensor, "r k"]:
-    """Positions at places in [0, 1) of the CDF of a histogram: weights, sum > 0, between edges; evenly spread within an
-    interval."""
+    """Positions at places in [0, 1) of the CDF of a histogram: weights, sum > 0, between edges.
+
+    Evenly spread within an interval.
+    """
     cdf = torch.nn.functional.pad(torch.cumsum(weights, 1), (1, 0))
     cdf = cdf / cdf[:, -1:]
     index = torch.searchsorted(cdf, places.contiguous(), right=True).clamp(1, weights.shape[1])

@@ -4,20 +4,22 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
+from stages.neural.acceleration import points_at_a_time
 from stages.neural.encoding_shapes import Encoding, Frequencies, HashGrid
-from stages.neural.fields import Fields, FieldShape, points_at_a_time
+from stages.neural.fields import Fields, FieldShape
+
+if TYPE_CHECKING:
+    from jaxtyping import Float, Float32
 
 
 class TrainedField:
-    """A frozen signed distance and colour field in the scene frame.
-
-    All methods take and return float32 NumPy arrays of N rows.
-    """
+    """A frozen signed distance and colour field in the scene frame."""
 
     def __init__(self, fields: Fields, device: torch.device | str) -> None:
         self.fields = fields.to(device).eval().requires_grad_(False)
@@ -29,18 +31,23 @@ class TrainedField:
         """Side of the finest encoding cell, scene units: the SDF has no detail below it."""
         return self.fields.shape.sdf_grid.voxel_size()
 
-    def sdf(self, points: np.ndarray) -> np.ndarray:
-        """Signed distance [N] at points [N, 3]: positive outside, negative inside the object."""
+    def sdf(self, points: Float[np.ndarray, "n 3"]) -> Float32[np.ndarray, " n"]:
+        """Signed distance at points: positive outside, negative inside the object."""
         return self._chunked(lambda p: self.fields.sdf.sdf(p, self.levels), points)
 
-    def normals(self, points: np.ndarray) -> np.ndarray:
-        """Unit normals [N, 3], pointing outwards."""
+    def normals(self, points: Float[np.ndarray, "n 3"]) -> Float32[np.ndarray, "n 3"]:
+        """Unit normals, pointing outwards."""
         return self._chunked(lambda p: torch.nn.functional.normalize(self.fields.sdf(p, self.levels)[2], dim=1), points)
 
-    def color(self, points: np.ndarray, normals: np.ndarray, view_dirs: np.ndarray) -> np.ndarray:
-        """sRGB colour [N, 3] in [0, 1] of surface points seen along unit view_dirs (camera to point)."""
+    def color(
+        self,
+        points: Float[np.ndarray, "n 3"],
+        normals: Float[np.ndarray, "n 3"],
+        view_dirs: Float[np.ndarray, "n 3"],
+    ) -> Float32[np.ndarray, "n 3"]:
+        """sRGB colour in [0, 1] of surface points seen along unit view_dirs (camera to point)."""
 
-        def evaluate(p: torch.Tensor, n: torch.Tensor, v: torch.Tensor) -> torch.Tensor:
+        def evaluate(p: Tensor, n: Tensor, v: Tensor) -> Tensor:
             _, features, _ = self.fields.sdf(p, self.levels)
             return self.fields.radiance(p, n, v, features)
 

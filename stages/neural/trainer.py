@@ -5,16 +5,17 @@ Shapes: R rays, K samples a ray, N = R K points, P sparse points, I photos.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from configs.training import TrainParams
 from stages.neural import losses, schedules
 from stages.neural.acceleration import is_mixed, short_products
 from stages.neural.encoding_shapes import Frequencies, HashGrid
-from stages.neural.fields import Fields, FieldShape, points_at_a_time
+from stages.neural.fields import Fields, FieldShape
 from stages.neural.proposal import interlevel_loss, sample_edges, updates_now
 from stages.neural.rendered import Rendered
 from stages.neural.renderer import Renderer
@@ -22,8 +23,11 @@ from stages.neural.sampling import SdfCache
 from stages.neural.schedules import Moment
 from stages.neural.sightings import Sightings, sighting_loss
 from stages.neural.terms import Terms
-from stages.neural.terms.planar import feature_mlp_error, has_feature_mlp
+from stages.neural.terms.planar import has_feature_mlp
 from stages.neural.training_photos import Photos, RayBatch
+
+if TYPE_CHECKING:
+    from jaxtyping import Float, UInt8
 
 # The regression to a hull before training: long enough for an error of about a cell of its grid.
 HULL_STEPS, HULL_POINTS = 200, 2048
@@ -84,13 +88,11 @@ class Trainer:
         self.step_index = 0
         self.cache_step = -(10**9)
 
-    def start_from(self, distances: np.ndarray) -> float:
-        """Bring the SDF to given distances before the first step; returns the mean error at the end.
+    def start_from(self, distances: Float[np.ndarray, "g g g"]) -> float:
+        """Bring the SDF to distances at the centres of a grid over [-1, 1]^3, before the first step.
 
         A short regression with an optimiser of its own: half of the points anywhere in the cube, half near the surface.
-
-        Args:
-            distances: [n, n, n] at the centres of a grid over [-1, 1]^3, axes x, y, z.
+        Axes are x, y, z. Returns the mean error at the end.
         """
         grid = torch.from_numpy(distances).to(self.device)
         cells = len(grid)
@@ -98,9 +100,8 @@ class Trainer:
         levels = self.moment(0.0).levels
         groups = [{"params": group["params"], "lr": group["base_lr"]} for group in self.optimizer.param_groups]
         optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-15)
-        for step in range(HULL_STEPS):
-            for group, settings in zip(optimizer.param_groups, self.optimizer.param_groups, strict=True):
-                group["lr"] = settings["base_lr"] * (1 - step / HULL_STEPS)
+        decay = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: 1 - step / HULL_STEPS)
+        for _ in range(HULL_STEPS):
             anywhere = torch.randint(cells, (HULL_POINTS, 3), generator=self.generator, device=self.device)
             rows = torch.randint(len(near), (HULL_POINTS,), generator=self.generator, device=self.device)
             picks = torch.cat([anywhere, near[rows]])
@@ -109,6 +110,7 @@ class Trainer:
             optimizer.zero_grad(set_to_none=True)
             error.backward()
             optimizer.step()
+            decay.step()
         self._forget_gradients()
         return error.item()
 
@@ -118,7 +120,7 @@ class Trainer:
         return self.renderer.moment(progress)
 
     # ------------------------------------------------------------------ one step
-    def step(self, progress: float) -> dict[str, torch.Tensor]:
+    def step(self, progress: float) -> dict[str, Tensor]:
         """One optimiser step at progress in [0, 1]; returns its terms and checks, batch means as tensors (no sync)."""
         sampling, schedule, weights = self.params.sampling, self.params.schedule, self.params.losses
         moment = self.moment(progress)
@@ -142,7 +144,6 @@ class Trainer:
             [omega * losses.eikonal_error(rendered.gradients), losses.eikonal_error(rendered.extra_gradients)]
         ).mean()
         of_terms = self.terms.losses(rendered, moment)
-        appearance_loss = feature_mlp_error(self.fields, rendered, self.params.terms)
         sparse_loss = sighting_loss(rendered.extra_sdf[: len(places)], sparse_weights, weights)
         exposure_loss = losses.exposure_error(self.fields.log_gains).mean()
         proposal_loss = self._proposal_loss(rendered)
@@ -154,7 +155,6 @@ class Trainer:
             + weights.sparse * schedules.fade_out(progress, weights.sparse_until) * sparse_loss
             + weights.mask * mask_loss
             + weights.exposure * exposure_loss
-            + appearance_loss
             + proposal_loss
         )
         self._forget_gradients()
@@ -179,7 +179,6 @@ class Trainer:
                 **{name: term_loss.detach() for name, (_, term_loss) in of_terms.items()},
                 "sparse": sparse_loss.detach(),
                 "mask": mask_loss.detach(),
-                "appearance": appearance_loss.detach(),
                 "proposal": proposal_loss.detach(),
                 "psnr": -10 * torch.log10(mse.clamp(min=1e-10)),
                 "gradient_norm": torch.linalg.vector_norm(rendered.gradients, dim=1).mean(),
@@ -196,18 +195,16 @@ class Trainer:
         for table, gradient in zip(kept, gradients, strict=True):
             table.grad = None if gradient is None else gradient.zero_()
 
-    def _proposal_loss(self, rendered: Rendered) -> torch.Tensor:
+    def _proposal_loss(self, rendered: Rendered) -> Tensor:
         """What trains the proposal network, in the steps that train it; zero where a grid guides the samples."""
         if rendered.proposal is None or not updates_now(self.step_index, self.params.sampling.proposal_updates):
             return torch.zeros((), device=self.device)
         edges = sample_edges(rendered.distances)
         return interlevel_loss(edges, rendered.weights, *rendered.proposal).mean()
 
-    def render(
-        self, batch: RayBatch, progress: float, extra: torch.Tensor, generator: torch.Generator | None
-    ) -> Rendered:
-        """Render rays and evaluate the SDF at extra points [E, 3], with the schedules at progress."""
-        return self.renderer.render(batch, self.moment(progress), extra, generator)
+    def render(self, batch: RayBatch, progress: float, extra: Float[Tensor, "e 3"] | None = None) -> Rendered:
+        """Render rays and evaluate the SDF at extra points, with the schedules at progress and without chance."""
+        return self.renderer.render(batch, self.moment(progress), extra)
 
     @torch.no_grad()
     def _refresh_cache(self, moment: Moment) -> None:
@@ -218,22 +215,21 @@ class Trainer:
         refreshes = self.step_index // every
         full = self.step_index <= 4 * every or refreshes % 8 == 0
         band = None if full else 4 * self.cache.cell
-        self.cache.refresh(lambda p: self.fields.sdf.sdf(p, moment.levels), band, points_at_a_time(self.device))
+        self.cache.refresh(lambda p: self.fields.sdf.sdf(p, moment.levels), band)
         self.cache_step = self.step_index
 
     # ------------------------------------------------------------------ previews, checkpoints
     @torch.no_grad()
-    def preview(self, image: int, progress: float, width: int = 160) -> np.ndarray:
-        """Photo, render and normals of photo `image` side by side, [H, 3 W, 3] uint8, W about `width`."""
+    def preview(self, image: int, progress: float, width: int = 160) -> UInt8[np.ndarray, "h w3 3"]:
+        """Photo, render and normals of photo `image` side by side, each about `width` wide."""
         photo_width, photo_height = self.photos.sizes[image].tolist()
         step = max(1, photo_width // width)
         y, x = torch.meshgrid(torch.arange(0, photo_height, step), torch.arange(0, photo_width, step), indexing="ij")
         pixels = torch.stack([x, y], 2).view(-1, 2).float().to(self.device)
-        nothing = torch.zeros(0, 3, device=self.device)
         photo, color, normal = (torch.zeros(len(pixels), 3) for _ in range(3))
         for part in torch.arange(len(pixels), device=self.device).split(4096):
             batch = self.photos.rays(torch.full_like(part, image), pixels[part])
-            rendered = self.render(batch, progress, nothing, None)
+            rendered = self.render(batch, progress)
             rows = part[batch.drawn].cpu()
             _, normals = rendered.surface
             photo[rows] = batch.colors.cpu()

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from stages.geometry.cameras import PinholeCameras
 from stages.neural.acceleration import first_rows, fixed_shapes
-from stages.neural.sampling import intersect_unit_sphere
+from stages.neural.sampling import Rays, intersect_unit_sphere
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int, UInt8
@@ -25,24 +25,18 @@ _OVERDRAW = 1.5
 
 
 @dataclass(frozen=True)
-class RayBatch:
-    """Rays that cross the region of interest.
+class RayBatch(Rays):
+    """Rays and what the photos show there.
 
     Attributes:
         drawn: which of the rays asked for these are (those that miss the sphere are dropped).
         images: photo indices.
-        origins, directions: scene frame, directions unit.
-        entry, leave: distances at which the ray crosses the unit sphere.
         colors: observed sRGB in [0, 1].
         masks: in [0, 1], or None when there are no masks.
     """
 
     drawn: Int[Tensor, " r"]
     images: Int[Tensor, " r"]
-    origins: Float[Tensor, "r 3"]
-    directions: Float[Tensor, "r 3"]
-    entry: Float[Tensor, " r"]
-    leave: Float[Tensor, " r"]
     colors: Float[Tensor, "r 3"]
     masks: Float[Tensor, " r"] | None
 
@@ -136,16 +130,9 @@ class Photos:
             kept = torch.nonzero(hit).squeeze(1)[:limit]
         images, pixels = images[kept], pixels[kept].long()
         rows = self.first[images] + pixels[:, 1] * self.sizes[images, 0] + pixels[:, 0]
-        return RayBatch(
-            kept,
-            images,
-            origins[kept],
-            directions[kept],
-            entry[kept],
-            leave[kept],
-            self.pixels[rows].float() / 255,
-            None if self.masks is None else self.masks[rows].float() / 255,
-        )
+        colors = self.pixels[rows].float() / 255
+        masks = None if self.masks is None else self.masks[rows].float() / 255
+        return RayBatch(origins[kept], directions[kept], entry[kept], leave[kept], kept, images, colors, masks)
 
 
 def _flat(

@@ -69,6 +69,5 @@ class Terms:
         return weight
 
     def losses(self, rendered: Rendered, moment: Moment) -> dict[str, tuple[float, Float[Tensor, ""]]]:
-        """Weight and loss of each term that has one, by name."""
-        found = ((term, term.loss(rendered, moment)) for term in self.all)
-        return {term.name: (term.weight, loss) for term, loss in found if loss is not None}
+        """Weight and value of each loss, by name."""
+        return {name: loss for term in self.all for name, loss in term.losses(rendered, moment).items()}

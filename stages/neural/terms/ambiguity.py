@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from stages.errors import ReconstructionError, SystemRequirementError
-from stages.neural.fields import points_at_a_time
+from stages.neural.acceleration import points_at_a_time
 from stages.neural.rendered import OPAQUE, Rendered
 from stages.neural.schedules import Moment
 from stages.neural.terms.term import Term
@@ -179,7 +179,7 @@ class Ambiguity(Term):
             sdf = self.cache.lookup if params.visibility == "paper" else self._network_sdf(moment)
             factor = visibility_literal(sdf, points, centers, params.samples, self.generator, beta)
         else:
-            margin = self._path_margin(facing[ray, view], moment)
+            margin = path_margin(facing[ray, view], moment.width, max(moment.voxel, self.cache.cell / 2))
             if params.visibility == "mesh":
                 factor = self.mesh_visibility(points, centers, margin)
             else:
@@ -188,10 +188,6 @@ class Ambiguity(Term):
         seen = torch.zeros_like(facing)
         seen[ray, view] = factor
         return colors, seen
-
-    def _path_margin(self, facing: Float[Tensor, "*any"], moment: Moment) -> Float[Tensor, "*any"]:
-        """How far from the surface the paths start that leave it at the cosines `facing`."""
-        return path_margin(facing, moment.width, max(moment.voxel, self.cache.cell / 2))
 
     def _network_sdf(self, moment: Moment) -> Callable[[Tensor], Tensor]:
         """f [...] of the network at points [..., 3], in parts: they are many."""

@@ -12,7 +12,6 @@ from torch import Tensor
 
 from configs.training import PlanarParams, TermParams
 from stages.neural import losses, schedules
-from stages.neural.fields import Fields
 from stages.neural.rendered import OPAQUE, Rendered
 from stages.neural.schedules import Moment
 from stages.neural.terms.term import Term
@@ -83,17 +82,22 @@ def planarity_scale(moment: Moment, params: PlanarParams) -> float:
     return schedules.exponential(moment.progress / params.scale_until, params.scale_start, 1.0)
 
 
+def has_feature_mlp(params: TermParams) -> bool:
+    """Whether an MLP makes the features of lambda_pla; the relaxed Eikonal term reads lambda_pla, too."""
+    return params.planar.features == "mlp" and (params.planar.form != "off" or params.eikonal.form != "plain")
+
+
 # ---------------------------------------------------------------------- in a step
 class Planar(Term):
-    """The planar loss."""
+    """The planar loss, and what trains the appearance features where an MLP of its own makes them."""
 
-    name = "planar"
+    def losses(self, rendered: Rendered, moment: Moment) -> dict[str, tuple[float, Float[Tensor, ""]]]:
+        return {
+            "planar": (self.params.terms.planar.weight, self._planar_loss(rendered, moment)),
+            "appearance": (1.0, self._appearance_loss(rendered)),
+        }
 
-    @property
-    def weight(self) -> float:
-        return self.params.terms.planar.weight
-
-    def loss(self, rendered: Rendered, moment: Moment) -> Float[Tensor, ""]:
+    def _planar_loss(self, rendered: Rendered, moment: Moment) -> Float[Tensor, ""]:
         """Mean planar error around the surface points of some of the rays, adaptively weighted (paper L_planar).
 
         The paper's neighbours lie on the ray before the surface; in the stable form half of them do, the others lie on
@@ -132,6 +136,23 @@ class Planar(Term):
             error = planar_error(sdf_around, sdf_center, unit_normals, offsets, radius)
         return planarity_scale(moment, params) * (weight * error).mean()
 
+    def _appearance_loss(self, rendered: Rendered) -> Float[Tensor, ""]:
+        """Mean colour error of the feature MLP at surface points: what trains it in the stable form.
+
+        Zero without the MLP, and in the paper's form.
+        """
+        mlp, batch, terms = self.fields.appearance, rendered.batch, self.params.terms
+        nothing = torch.zeros((), device=self.device)
+        if mlp is None or "stable" not in (terms.planar.form, terms.eikonal.form):
+            return nothing
+        hit = torch.nonzero(rendered.opacity.detach() > OPAQUE).squeeze(1)[: terms.planar.rays]
+        if len(hit) == 0:
+            return nothing
+        predicted = mlp.color(mlp(rendered.surface[0][hit], batch.directions[hit]))
+        gains = torch.exp(self.fields.log_gains.detach())[batch.images[hit]]
+        error = losses.rgb_error(predicted * gains, batch.colors[hit])
+        return (error if batch.masks is None else error * batch.masks[hit]).mean()
+
     def _neighbors(
         self, normals: Float[Tensor, "q 3"], dirs: Float[Tensor, "q 3"], radius: float
     ) -> Float[Tensor, "q j 3"]:
@@ -147,28 +168,3 @@ class Planar(Term):
         disk = torch.nn.functional.normalize(tangent, dim=2) * (reach * radius).sqrt()  # even over the disk's area
         half = torch.arange(shape[1], device=self.device) % 2 == 0
         return torch.where(half[None, :, None], on_ray * reach, disk)
-
-
-# ---------------------------------------------------------------------- appearance features of an MLP of their own
-def has_feature_mlp(params: TermParams) -> bool:
-    """Whether an MLP makes the features of lambda_pla; the relaxed Eikonal term reads lambda_pla, too."""
-    return params.planar.features == "mlp" and (params.planar.form != "off" or params.eikonal.form != "plain")
-
-
-def feature_mlp_error(fields: Fields, rendered: Rendered, params: TermParams) -> Float[Tensor, ""]:
-    """Colour error of the feature MLP at the surface points: what trains it in the stable form.
-
-    Zero without the MLP, and in the paper's form.
-    """
-    mlp, batch = fields.appearance, rendered.batch
-    nothing = torch.zeros((), device=rendered.colors.device)
-    if mlp is None or "stable" not in (params.planar.form, params.eikonal.form):
-        return nothing
-    hit = torch.nonzero(rendered.opacity.detach() > OPAQUE).squeeze(1)[: params.planar.rays]
-    if len(hit) == 0:
-        return nothing
-    surface = rendered.surface[0][hit]
-    predicted = mlp.color(mlp(surface, batch.directions[hit]))
-    gains = torch.exp(fields.log_gains.detach())[batch.images[hit]]
-    error = losses.rgb_error(predicted * gains, batch.colors[hit])
-    return (error if batch.masks is None else error * batch.masks[hit]).mean()

@@ -155,8 +155,8 @@ class Reflection(Term):
             return rendered
         hit = torch.nonzero(rendered.opacity.detach() > OPAQUE).squeeze(1)
         surface, normals = (part[hit] for part in rendered.surface)
+        dirs = reflect(rendered.batch.directions[hit], normals)
         if params.form == "paper":
-            dirs = reflect(rendered.batch.directions[hit], normals)
             along = uniform_points(surface, dirs, params.reach, params.samples, generator)
             sdf, _, gradients = self.fields.sdf(along.view(-1, 3), moment.levels)
             sdf = sdf.view(along.shape[:2])
@@ -164,11 +164,9 @@ class Reflection(Term):
             points, gradients = (nearest_to_surface(sdf, each.view_as(along)) for each in (along, gradients))
             reflectivity = torch.ones_like(probability)
         else:
-            dirs = reflect(rendered.batch.directions[hit], normals)
             probability, points = trace_reflections(
-                self.cache, surface, dirs, moment.width, moment.voxel,
-                params.reach, params.samples,
-            )  # fmt: skip
+                self.cache, surface, dirs, moment.width, moment.voxel, params.reach, params.samples
+            )
             met = torch.nonzero(probability > _REFLECTION_THRESHOLD).squeeze(1)
             hit, normals, dirs, probability, points = (x[met] for x in (hit, normals, dirs, probability, points))
             with torch.no_grad():

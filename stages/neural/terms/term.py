@@ -25,11 +25,8 @@ class Term:
     """A term overrides what it has a say in, and looks into its settings for whether and from when on it has one.
 
     Attributes:
-        name: of its loss in the metrics.
         photos, generator: what training has; None where a trained field is only rendered.
     """
-
-    name = ""
 
     def __init__(
         self,
@@ -62,11 +59,6 @@ class Term:
         """
         return None
 
-    @property
-    def weight(self) -> float:
-        """Of `loss` in the sum."""
-        return 0.0
-
-    def loss(self, rendered: Rendered, moment: Moment) -> Float[Tensor, ""] | None:
-        """What is to be lowered, a number, not yet weighted. None: nothing, ever."""
-        return None
+    def losses(self, rendered: Rendered, moment: Moment) -> dict[str, tuple[float, Float[Tensor, ""]]]:
+        """What is to be lowered, by its name in the metrics: its weight in the sum, and its value before weighting."""
+        return {}
