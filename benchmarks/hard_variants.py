@@ -14,6 +14,7 @@ broke has no result.
 
 from __future__ import annotations
 
+import argparse
 import hashlib
 import shutil
 import sys
@@ -25,7 +26,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.ablate import score_clean_mesh
-from benchmarks.pages import NOT_MEASURED, markdown_table, table_parser, write_tables
+from benchmarks.pages import NOT_MEASURED, markdown_table, write_tables
 from benchmarks.run_sets import OUT, RESULTS, ROOT, find_sets, known_cameras, machine, photos_of, run_hineus
 from stages import artifacts
 from stages.errors import InputError, ReconstructionError
@@ -437,13 +438,14 @@ def tables() -> dict[str, str]:
 def main(argv: Sequence[str] | None = None) -> int:
     from stages.reconstruct import default_preset
 
-    parser = table_parser(__doc__)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("data", type=Path, nargs="?", help="folder of sets")
     parser.add_argument("rows", nargs="*", help="SET or SET-VARIANT; default: all")
     parser.add_argument("--mesh", action="store_true", help="make and score the clean mesh, too")
     parser.add_argument("--preset", help="of the training; default: that of `hineus run`")
     parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="as of `hineus run`")
     parser.add_argument("--again", action="store_true", help="also rows that have a result")
+    parser.add_argument("--table-only", action="store_true", help="run nothing")
     arguments = parser.parse_args(argv)
     failed: list[str] = []
     if not arguments.table_only:

@@ -8,12 +8,13 @@ Results go to benchmarks/results/held_out/NAME.json, where NAME is the workspace
 
 from __future__ import annotations
 
+import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from benchmarks.pages import NOT_MEASURED, markdown_table, table_parser, write_tables
+from benchmarks.pages import NOT_MEASURED, markdown_table, write_tables
 from benchmarks.run_sets import RESULTS as ALL_RESULTS
 from benchmarks.run_sets import machine
 from stages import artifacts
@@ -61,8 +62,9 @@ def tables() -> dict[str, str]:
 
 
 def main() -> int:
-    parser = table_parser(__doc__)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("workspaces", type=Path, nargs="*", help="made with --hold-out")
+    parser.add_argument("--table-only", action="store_true", help="measure nothing")
     arguments = parser.parse_args()
     if not arguments.workspaces and not arguments.table_only:
         parser.error("name workspaces, or --table-only")

@@ -8,7 +8,6 @@ can be split and joined without a change here. `--table-only` of a benchmark wri
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Mapping, Sequence
 from importlib import import_module
@@ -43,13 +42,6 @@ def with_tables(pages: Mapping[Path, str], tables: Mapping[str, str]) -> dict[Pa
         before, rest = made[path].split(begin)
         made[path] = f"{before}{begin}\n{body}\n{end}{rest.split(end)[1]}"
     return made
-
-
-def table_parser(doc: str | None) -> argparse.ArgumentParser:
-    """For the command of a benchmark that has tables: its module's docstring is the help."""
-    parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--table-only", action="store_true", help="measure nothing, only rewrite the tables")
-    return parser
 
 
 def read_pages() -> dict[Path, str]:

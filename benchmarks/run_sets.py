@@ -14,6 +14,7 @@ was cut off goes on where it stopped; seconds are those of the stages, as the wo
 
 from __future__ import annotations
 
+import argparse
 import json
 import shutil
 import subprocess
@@ -24,7 +25,7 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any
 
-from benchmarks.pages import NOT_MEASURED, markdown_table, table_parser, write_tables
+from benchmarks.pages import NOT_MEASURED, markdown_table, write_tables
 from benchmarks.synthetic import MADE_WITH
 from stages import artifacts
 from stages.evaluation.machine import machine
@@ -350,12 +351,13 @@ def _text(value: Any) -> str:
 
 
 def main() -> int:
-    parser = table_parser(__doc__)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("data", type=Path, nargs="?", help="folder of sets")
     parser.add_argument("sets", nargs="*", help="names of sets; default: all")
     parser.add_argument("--demo", action="store_true", help="run the demo, too")
     parser.add_argument("--seeds", type=int, default=1, help="how many seeds, from 0")
     parser.add_argument("--again", action="store_true", help="also sets that have a result")
+    parser.add_argument("--table-only", action="store_true", help="run nothing")
     arguments = parser.parse_args()
     jobs: list[tuple[str, Path | None]] = [(DEMO, None)] if arguments.demo else []
     if arguments.data is not None and not arguments.table_only:

@@ -8,12 +8,13 @@ Results go to benchmarks/results/suites/SUITE/SCENE/; each names its settings an
 
 from __future__ import annotations
 
+import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from benchmarks.pages import NOT_MEASURED, markdown_table, table_parser, write_tables
+from benchmarks.pages import NOT_MEASURED, markdown_table, write_tables
 from benchmarks.run_sets import RESULTS
 from stages import artifacts
 from stages.evaluation.suites.paper import PaperRow, paper_tables
@@ -83,8 +84,9 @@ def tables() -> dict[str, str]:
 
 
 def main() -> int:
-    parser = table_parser(__doc__)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=Path, nargs="?", help="folder of results")
+    parser.add_argument("--table-only", action="store_true", help="take no results")
     arguments = parser.parse_args()
     if arguments.out is None and not arguments.table_only:
         parser.error("name a folder of results, or --table-only")

@@ -33,7 +33,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.pages import NOT_MEASURED, markdown_table, table_parser, write_tables
+from benchmarks.pages import NOT_MEASURED, markdown_table, write_tables
 from benchmarks.run_sets import GIB, OUT, RESULTS, ROOT, machine
 from stages import artifacts
 from stages.artifacts import AtlasMesh
@@ -468,12 +468,13 @@ def tables() -> dict[str, str]:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    parser = table_parser(__doc__)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("workspaces", nargs="?", type=Path, help="folder of workspaces")
     parser.add_argument("data", nargs="?", type=Path, help="folder of sets")
     parser.add_argument("sets", nargs="*", help="names; default: all")
     parser.add_argument("--again", action="store_true", help="also sets that have a result")
     parser.add_argument("--cost", action="store_true", help="measure the bake stage at three sizes for these sets")
+    parser.add_argument("--table-only", action="store_true", help="only rewrite the tables")
     parser.add_argument("--bake", type=int, help=argparse.SUPPRESS)
     arguments = parser.parse_args(argv)
     if arguments.bake:
