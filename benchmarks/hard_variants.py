@@ -16,9 +16,7 @@ from __future__ import annotations
 
 import argparse
 import hashlib
-import json
 import shutil
-import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
@@ -29,19 +27,21 @@ import numpy as np
 
 from benchmarks.ablate import score_clean_mesh
 from benchmarks.pages import NOT_MEASURED, markdown_table, write_tables
-from benchmarks.run_sets import OUT, RESULTS, ROOT, find_sets, known_cameras, machine, photos_of
+from benchmarks.run_sets import OUT, RESULTS, ROOT, find_sets, known_cameras, machine, photos_of, run_hineus
+from stages import artifacts
+from stages.errors import InputError, ReconstructionError
 from stages.posing.neus import read_neus
 
 ROWS = RESULTS / "poses"
 FOLDERS = OUT / "poses"
 POSES, CLEAN = "undistort", "cleanup"
+# Exit codes: photos that cannot be used and poses that cannot be found are results, too.
+ANSWERS = (0, InputError.exit_code, ReconstructionError.exit_code)
 PHOTOS = "photos"
 VIDEO_FPS, VIDEO_HOLD = 30, 10  # every photo is shown for a third of a second
 BLUR_SHARE, BLUR_SIGMA = 0.3, 3 / 640  # of the photos; of the width
 CROP, CROP_SCALE = 0.75, 1.2  # of both sides; then enlarged
 GREY, NOISE = 128, 1.2  # of 255
-FOCAL_35MM = 0xA405
-EXIF_IFD = 0x8769
 
 
 @dataclass(frozen=True)
@@ -147,12 +147,12 @@ def plain_ground(photos: list[Photo], folder: Path) -> None:
 
 def wrong_focal(photos: list[Photo], folder: Path) -> None:
     """EXIF that says twice the focal length."""
-    from PIL import Image
+    from PIL import ExifTags, Image
 
     for photo in photos:
         image = Image.fromarray(photo.pixels)
         exif = Image.Exif()
-        exif.get_ifd(EXIF_IFD)[FOCAL_35MM] = 96
+        exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.FocalLengthIn35mmFilm] = 96
         image.save(folder / f"{Path(photo.name).stem}.jpg", quality=97, subsampling=0, exif=exif)
 
 
@@ -203,11 +203,8 @@ def make_photos(row: str, data: Path) -> Path:
         ValueError: the variant needs masks that the set lacks.
     """
     name, _, variant = row.partition("-")
-    source = photos_of(data / name)
-    if source is None:
-        raise ValueError(f"{data / name} holds no photos")
     if not variant:
-        return source
+        return photos_of(data / name)
     folder = FOLDERS / row / PHOTOS
     if not folder.is_dir():
         partial = folder.with_name(f"{PHOTOS}.partial")
@@ -222,10 +219,8 @@ def load_photos(folder: Path) -> list[Photo]:
     """The photos of a set by name, with its masks."""
     from PIL import Image
 
-    source = photos_of(folder)
-    assert source is not None  # make_photos looked
     photos = []
-    for path in sorted(source.iterdir()):
+    for path in sorted(photos_of(folder).iterdir()):
         with Image.open(path) as image:
             pixels = np.asarray(image.convert("RGB"))
         found = sorted((folder / "masks").glob(f"{path.stem}.*"))
@@ -256,14 +251,12 @@ def true_centers(folder: Path) -> tuple[list[np.ndarray], float] | None:
     The extent of a set in the layout of NeuS is the diameter of its sphere.
     """
     from stages.evaluation.protocols.known_object import has_truth, load_known_object
+    from stages.evaluation.reading import Cameras
 
-    source = photos_of(folder)
-    if source is not None and has_truth(folder):
+    if has_truth(folder):
         known = load_known_object(folder)
-        by_stem = {
-            Path(name).stem: center for name, center in zip(known.cameras.names, known.cameras.centers, strict=True)
-        }
-        return [by_stem[path.stem] for path in sorted(source.iterdir())], known.surface.extent
+        by_stem = Cameras(str(folder), known.cameras).centers
+        return [by_stem[stem] for stem in _stems(photos_of(folder))], known.surface.extent
     if (path := known_cameras(folder)) is not None:
         stated = read_neus(path)
         poses = [camera.cam_from_world for camera in stated.cameras]
@@ -274,12 +267,11 @@ def true_centers(folder: Path) -> tuple[list[np.ndarray], float] | None:
 
 def center_error(workspace: Path, data: Path, row: str) -> dict[str, float] | None:
     """Distance of the camera centres of a workspace to the truth, median and largest, in percent of the extent."""
-    from stages import artifacts
     from stages.geometry.similarity import align_points
 
     name, _, variant = row.partition("-")
     truth, source = true_centers(data / name), photos_of(data / name)
-    if truth is None or source is None:
+    if truth is None:
         return None
     centers, extent = truth
     stems, stem_of = _stems(source), known_stem(source, variant)
@@ -326,21 +318,20 @@ def run_row(row: str, data: Path, mesh: bool, preset: str, settings: Sequence[st
     Raises:
         RuntimeError: `hineus` broke, rather than saying why it cannot.
     """
-    from stages import artifacts
     from stages.evaluation.protocols.known_object import has_truth
 
     photos = make_photos(row, data)
     workspace = FOLDERS / row / "workspace"
     given = [word for setting in settings for word in ("--set", setting)]
-    arguments = ["run", str(photos), "--workspace", str(workspace), "--preset", preset, *given]
-    answer = _ask([*arguments, "--until", POSES])
+    arguments = ["run", str(photos), "--workspace", str(workspace), "--preset", preset, *given, "--json"]
+    answer = run_hineus([*arguments, "--until", POSES], ANSWERS)
     score, failure = None, None if answer["ok"] else _failure(answer)
     name, _, variant = row.partition("-")
-    source = photos_of(data / name)
-    if mesh and failure is None and source is not None and has_truth(data / name):
-        answer = _ask([*arguments, "--until", CLEAN])
+    if mesh and failure is None and has_truth(data / name):
+        answer = run_hineus([*arguments, "--until", CLEAN], ANSWERS)
         if answer["ok"]:
-            score = score_clean_mesh(workspace, workspace, data / name, known_stem=known_stem(source, variant))
+            stem_of = known_stem(photos_of(data / name), variant)
+            score = score_clean_mesh(workspace, workspace, data / name, known_stem=stem_of)
         else:
             failure = _failure(answer)
     stages = {stage["name"]: stage for stage in answer.get("stages", ())}
@@ -369,30 +360,11 @@ def run_row(row: str, data: Path, mesh: bool, preset: str, settings: Sequence[st
     )
 
 
-def _ask(arguments: Sequence[str]) -> dict[str, Any]:
-    """What `hineus ARGUMENTS --json` answers; errors that it foresees are answers, too.
-
-    Raises:
-        RuntimeError: it broke.
-    """
-    command = [sys.executable, "-m", "hineus_cli", *arguments, "--json"]
-    done = subprocess.run(command, cwd=ROOT, stdout=subprocess.PIPE, text=True, check=False)
-    try:
-        answer = json.loads(done.stdout)
-    except ValueError:
-        answer = None
-    if answer is None or done.returncode not in (0, 3, 4):
-        raise RuntimeError(f"{' '.join(arguments)} ended with {done.returncode}: {done.stdout[-2000:]}")
-    return answer
-
-
 def _failure(answer: dict[str, Any]) -> dict[str, str]:
     return {key: answer["error"][key] for key in ("message", "hint")}
 
 
 def _count(workspace: Path, photos: Path) -> int:
-    from stages import artifacts
-
     try:
         return len(artifacts.IMAGE_SET.load(workspace / "ingest").images)
     except OSError:
@@ -410,15 +382,14 @@ def code_hash() -> str:
 # ---------------------------------------------------------------- result files and table
 def save_row(row: Row) -> None:
     ROWS.mkdir(parents=True, exist_ok=True)
-    text = json.dumps(asdict(row), indent=1, allow_nan=False)
-    (ROWS / f"{row.name}.json").write_text(text + "\n", encoding="utf-8")
+    artifacts.write_json(ROWS / f"{row.name}.json", asdict(row))
 
 
 def load_rows() -> list[Row]:
     """All there are: the sets, then the variants in the order of `VARIANTS`."""
     rows = []
     for path in ROWS.glob("*.json"):
-        data = json.loads(path.read_text(encoding="utf-8"))
+        data = artifacts.read_json(path)
         lists = {key: tuple(data[key]) for key in ("attempts", "mesh_settings") if key in data}
         rows.append(Row(**{**data, **lists}))
     order = {name: place for place, name in enumerate(VARIANTS)}

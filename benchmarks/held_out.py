@@ -9,7 +9,6 @@ Results go to benchmarks/results/held_out/NAME.json, where NAME is the workspace
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,18 +17,15 @@ from typing import Any
 from benchmarks.pages import NOT_MEASURED, markdown_table, write_tables
 from benchmarks.run_sets import RESULTS as ALL_RESULTS
 from benchmarks.run_sets import machine
+from stages import artifacts
 
 RESULTS = ALL_RESULTS / "held_out"
 # What is shown: drawing, region, number, its heading.
-COLUMNS = (
-    ("field", "object", "psnr", "field, object: PSNR"),
-    ("field", "object", "ssim", "SSIM"),
-    ("mesh", "object", "psnr", "mesh, object: PSNR"),
-    ("mesh", "object", "ssim", "SSIM"),
-    ("field", "whole", "psnr", "field, whole: PSNR"),
-    ("field", "whole", "ssim", "SSIM"),
-    ("mesh", "whole", "psnr", "mesh, whole: PSNR"),
-    ("mesh", "whole", "ssim", "SSIM"),
+COLUMNS = tuple(
+    (what, region, key, heading)
+    for region in ("object", "whole")
+    for what in ("field", "mesh")
+    for key, heading in (("psnr", f"{what}, {region}: PSNR"), ("ssim", "SSIM"))
 )
 
 
@@ -44,7 +40,7 @@ def measure(workspace: Path) -> dict[str, Any]:
 
 def load_results() -> list[dict[str, Any]]:
     """All results, by name."""
-    return [json.loads(path.read_text(encoding="utf-8")) for path in sorted(RESULTS.glob("*.json"))]
+    return [artifacts.read_json(path) for path in sorted(RESULTS.glob("*.json"))]
 
 
 def table(results: Sequence[dict[str, Any]]) -> str:
@@ -76,7 +72,7 @@ def main() -> int:
     for workspace in arguments.workspaces:
         print(f"{workspace}: drawing", file=sys.stderr, flush=True)
         result = measure(workspace)
-        (RESULTS / f"{result['name']}.json").write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+        artifacts.write_json(RESULTS / f"{result['name']}.json", result)
     write_tables(tables())
     return 0
 

@@ -19,7 +19,7 @@ import json
 import shutil
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from statistics import fmean
@@ -27,6 +27,7 @@ from typing import Any
 
 from benchmarks.pages import NOT_MEASURED, markdown_table, write_tables
 from benchmarks.synthetic import MADE_WITH
+from stages import artifacts
 from stages.evaluation.machine import machine
 from stages.posing import neus
 
@@ -92,9 +93,10 @@ class Result:
 
 
 # ---------------------------------------------------------------- running
-def photos_of(folder: Path) -> Path | None:
-    """The folder of photos of a set."""
-    return next((folder / name for name in ("images", "image") if (folder / name).is_dir()), None)
+def photos_of(folder: Path) -> Path:
+    """The folder of photos of a set; where there is none, it is no set."""
+    other = folder / neus.IMAGES
+    return other if other.is_dir() and not (folder / "images").is_dir() else folder / "images"
 
 
 def known_cameras(folder: Path) -> Path | None:
@@ -109,7 +111,7 @@ def find_sets(data: Path, names: Sequence[str]) -> list[str]:
     Raises:
         SystemExit: a named one has no photos, or there are none at all.
     """
-    found = sorted(folder.name for folder in data.iterdir() if photos_of(folder)) if data.is_dir() else []
+    found = sorted(folder.name for folder in data.iterdir() if photos_of(folder).is_dir()) if data.is_dir() else []
     unknown = [name for name in names if name not in found]
     if unknown or not found:
         sys.exit(
@@ -128,10 +130,9 @@ def run_set(name: str, data: Path | None, seed: int = 0) -> Result:
     workspace = OUT / _seeded(name, seed)
     if data is None:
         arguments, shown = ["demo", "--workspace", str(workspace)], "hineus demo"
-        truth: Path | None = workspace
+        truth = workspace
     else:
         photos = photos_of(data / name)
-        assert photos is not None  # find_sets looked
         arguments = ["run", str(photos), "--workspace", str(workspace)]
         shown = f"hineus run DATA/{name}/{photos.name}"
         truth = data / name
@@ -156,24 +157,30 @@ def run_set(name: str, data: Path | None, seed: int = 0) -> Result:
     return Result(name, shown, machine(), stages, score, validate(glb), glb.stat().st_size, seed)
 
 
-def run_hineus(arguments: Sequence[str]) -> dict[str, Any]:
-    """What `hineus ARGUMENTS --json` answers, run in a process of its own.
+def run_hineus(arguments: Sequence[str], answers: Sequence[int] = (0,)) -> dict[str, Any]:
+    """What `hineus` says to arguments with `--json`, run in a process of its own.
+
+    Args:
+        answers: exit codes with which it is an answer.
 
     Raises:
-        RuntimeError: it failed; its message is included.
+        RuntimeError: it failed or gave no answer; its message is included.
     """
     command = [sys.executable, "-m", "hineus_cli", *arguments]
     done = subprocess.run(command, cwd=ROOT, stdout=subprocess.PIPE, text=True, check=False)
-    if done.returncode != 0:
+    try:
+        answer = json.loads(done.stdout)
+    except ValueError:
+        answer = None
+    if answer is None or done.returncode not in answers:
         raise RuntimeError(f"{' '.join(arguments)} ended with {done.returncode}: {done.stdout[-2000:]}")
-    return json.loads(done.stdout)
+    return answer
 
 
-def _score(workspace: Path, truth: Path | None) -> dict[str, float] | None:
-    from stages import artifacts
+def _score(workspace: Path, truth: Path) -> dict[str, float] | None:
     from stages.evaluation.protocols.known_object import has_truth, score_mesh
 
-    if truth is None or not has_truth(truth):
+    if not has_truth(truth):
         return None
     return score_mesh(artifacts.asset_path(workspace / "export", "ply"), artifacts.MODEL.load(workspace / "sfm"), truth)
 
@@ -202,13 +209,12 @@ def contact_sheet(workspace: Path, path: Path) -> None:
     import numpy as np
     from PIL import Image
 
-    from stages import artifacts
     from stages.drawing.rendering import render_textured, turntable
+    from stages.reporting.pictures import read_rgb
 
     atlas = artifacts.ATLAS.load(workspace / "atlas")
     scene = artifacts.SCENE.load(workspace / "undistort")
-    with Image.open(artifacts.BASE_COLOR.load(workspace / "bake")) as image:
-        texture = np.asarray(image.convert("RGB"))
+    texture = read_rgb(artifacts.BASE_COLOR.load(workspace / "bake"))
     grey = np.full((1, 1, 3), 200, np.uint8)
     rows = []
     for colors, normals in ((texture, None), (grey, atlas.normals)):
@@ -234,14 +240,14 @@ def _seeded(name: str, seed: int) -> str:
 
 def save_result(result: Result, path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(asdict(result), indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    artifacts.write_json(path, asdict(result))
 
 
 def load_results(folder: Path) -> list[Result]:
     """All results there are, the demo first, then by name and seed."""
     results = []
     for path in folder.glob("*.json"):
-        data = json.loads(path.read_text(encoding="utf-8"))
+        data = artifacts.read_json(path)
         data["stages"] = tuple(StageCost(**stage) for stage in data["stages"])
         results.append(Result(**data))
     return sorted(results, key=lambda result: (result.name != DEMO, result.name, result.seed))
@@ -279,22 +285,22 @@ def _summary_row(seeds: Sequence[Result]) -> list[str]:
 
 def stage_table(results: Sequence[Result]) -> str:
     """Wall and CPU seconds of each stage, one column a set."""
-    names = list(dict.fromkeys(stage.name for result in results for stage in result.stages))
-    costs = [{stage.name: stage for stage in result.stages} for result in results]
-    rows = [
-        [name, *(f"{cost[name].wall_s:.1f} / {cost[name].cpu_s:.1f}" if name in cost else "-" for cost in costs)]
-        for name in names
-    ]
+    rows = _stage_rows(results, lambda stage: f"{stage.wall_s:.1f} / {stage.cpu_s:.1f}")
     rows.append(["all", *(f"{result.wall_s:.0f} / {result.cpu_s:.0f}" for result in results)])
     return markdown_table(["stage", *(result.name for result in results)], rows)
 
 
 def memory_table(results: Sequence[Result]) -> str:
     """Peak memory of each stage in GiB, one column a set."""
-    names = list(dict.fromkeys(stage.name for result in results for stage in result.stages))
-    costs = [{stage.name: stage for stage in result.stages} for result in results]
-    rows = [[name, *(f"{cost[name].peak_rss / GIB:.2f}" if name in cost else "-" for cost in costs)] for name in names]
+    rows = _stage_rows(results, lambda stage: f"{stage.peak_rss / GIB:.2f}")
     return markdown_table(["stage", *(result.name for result in results)], rows)
+
+
+def _stage_rows(results: Sequence[Result], cell: Callable[[StageCost], str]) -> list[list[str]]:
+    """One row a stage, one column a set."""
+    names = dict.fromkeys(stage.name for result in results for stage in result.stages)
+    costs = [{stage.name: stage for stage in result.stages} for result in results]
+    return [[name, *(cell(cost[name]) if name in cost else "-" for cost in costs)] for name in names]
 
 
 def texture_table(results: Sequence[Result]) -> str:

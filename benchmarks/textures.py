@@ -412,13 +412,13 @@ def bake_alone(workspace: Path, size: int) -> tuple[float, float, int]:
 # ---------------------------------------------------------------- results and tables
 def save_result(result: SetResult) -> None:
     FOLDER.mkdir(parents=True, exist_ok=True)
-    (FOLDER / f"{result.name}.json").write_text(json.dumps(asdict(result), indent=1) + "\n", encoding="utf-8")
+    artifacts.write_json(FOLDER / f"{result.name}.json", asdict(result))
 
 
 def load_results() -> list[SetResult]:
     results = []
     for path in sorted(FOLDER.glob("*.json")):
-        data = json.loads(path.read_text(encoding="utf-8"))
+        data = artifacts.read_json(path)
         data["scores"] = tuple(Score(**row) for row in data["scores"])
         results.append(SetResult(**data))
     return results

@@ -24,7 +24,7 @@ from stages.engine.workspace import Workspace
 from stages.errors import ConfigError, InputError, ReconstructionError
 from stages.evaluation.peers.running import parse_peer, run_peer
 from stages.evaluation.photos import scoring
-from stages.evaluation.photos.test_photos import TestPhotos
+from stages.evaluation.photos.novel_views import NovelPhotos
 from stages.evaluation.reading import read_mesh
 from stages.evaluation.suites import runs as bench_module
 from stages.evaluation.suites.registry import SUITES, find_scenes
@@ -222,7 +222,7 @@ def test_test_photos_show_the_ball_where_the_scene_has_it(data: Path, suite: str
     scene = find_scenes(SUITES[suite], data, Wanted(hold_out=4))[0]
     assert scene.views is not None
     workspace = Workspace.open(Path("bench") / suite / scene.name / "tiny-seed0")
-    photos = TestPhotos(scene.views, workspace)
+    photos = NovelPhotos(scene.views, workspace)
     assert photos.cameras.names == scene.views.names
     trained = artifacts.SCENE.load(workspace.stage_folder("undistort"))
     apart = np.linalg.norm(photos.cameras.centers[:, None] - trained.cameras.centers[None], axis=2)
@@ -253,7 +253,7 @@ def test_test_photos_have_the_masks_that_the_scene_is_run_with(data: Path, suite
     scene = find_scenes(SUITES[suite], data, Wanted(masks=True, hold_out=4))[0]
     assert scene.views is not None
     workspace = Workspace.open(Path("bench") / suite / scene.name / "tiny-seed0")
-    photos = TestPhotos(scene.views, workspace, scene.masks)
+    photos = NovelPhotos(scene.views, workspace, scene.masks)
     poses_from_scene = artifacts.SCENE.load(workspace.stage_folder("undistort")).poses_from_scene
     for index in range(len(photos.cameras)):
         pixels, mask = photos.load(index)

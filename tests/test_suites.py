@@ -9,6 +9,7 @@ import pytest
 from sphere_scene import RADIUS
 from suite_layouts import COUNT, LAYOUTS, write_mipnerf360, write_neus, write_suite, write_urban_photos
 
+from benchmarks.suites import beyond_rounding
 from stages.errors import InputError
 from stages.evaluation.protocols.blendedmvs import true_points
 from stages.evaluation.suites.paper import paper_tables
@@ -186,7 +187,7 @@ def test_the_paper_s_averages_are_what_its_figures_say_but_for_those_that_are_li
                 slow += row.scores[scene]
             assert row.average == pytest.approx(slow / len(table.scenes))
             if row.deviates(decimals):
-                found[suite, row.method] = (f"{row.average:.{decimals}f}", row.beyond_rounding(decimals))
+                found[suite, row.method] = (f"{row.average:.{decimals}f}", beyond_rounding(row, decimals))
     assert found == DEVIATING
 
 

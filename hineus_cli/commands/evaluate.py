@@ -88,31 +88,28 @@ def evaluate_mesh(
     """A surface against a true one: accuracy, completeness, Chamfer, F-scores and normals, both ways."""
     from stages.evaluation.protocols.plain import MOTIONS, MeshOptions, evaluate_mesh
 
-    def evaluate() -> dict[str, Any]:
-        if icp is not None and icp not in MOTIONS:
-            raise ConfigError(f"There is no ICP '{icp}'.", f"Choose {' or '.join(MOTIONS)}.")
-        numbers, parts = _lengths(thresholds, "--thresholds")
-        corners, margin = _box(box)
-        options = MeshOptions(
-            thresholds=numbers,
-            threshold_parts=parts,
-            samples=samples,
-            spacing=spacing,
-            seed=seed,
-            matrix=matrix,
-            cameras=cameras,
-            true_cameras=true_cameras,
-            icp=icp,
-            visible=visible,
-            masks=masks,
-            grow=grow,
-            box=corners,
-            box_margin=margin,
-            distance_map=distance_map,
-        )
-        return evaluate_mesh(predicted, truth, options)
-
-    _run(context, evaluate, _show_surfaces)
+    if icp is not None and icp not in MOTIONS:
+        raise ConfigError(f"There is no ICP '{icp}'.", f"Choose {' or '.join(MOTIONS)}.")
+    numbers, parts = _thresholds(thresholds)
+    corners, margin = _box(box)
+    options = MeshOptions(
+        thresholds=numbers,
+        threshold_parts=parts,
+        samples=samples,
+        spacing=spacing,
+        seed=seed,
+        matrix=matrix,
+        cameras=cameras,
+        true_cameras=true_cameras,
+        icp=icp,
+        visible=visible,
+        masks=masks,
+        grow=grow,
+        box=corners,
+        box_margin=margin,
+        distance_map=distance_map,
+    )
+    _run(context, lambda: evaluate_mesh(predicted, truth, options), _show_surfaces)
 
 
 def compare(
@@ -282,7 +279,7 @@ def _cell(scores: dict[str, Any] | None, key: str) -> str:
 
 
 # ---------------------------------------------------------------- options
-def _lengths(text: str, option: str) -> tuple[tuple[float, ...], tuple[float, ...]]:
+def _thresholds(text: str) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Numbers in the truth's unit, and parts of its extent, of "0.01,2%"."""
     numbers, parts = [], []
     for word in text.split(","):
@@ -291,7 +288,9 @@ def _lengths(text: str, option: str) -> tuple[tuple[float, ...], tuple[float, ..
         except ValueError:
             value = 0.0
         if not value > 0:
-            raise ConfigError(f"`{option} {text}`: '{word}' is no length.", f"Try `{option} 0.5%,1%`, or `0.01,0.02`.")
+            raise ConfigError(
+                f"`--thresholds {text}`: '{word}' is no length.", "Try `--thresholds 0.5%,1%`, or `0.01,0.02`."
+            )
         if word.strip().endswith("%"):
             parts.append(value / 100)
         else:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Mapping, Sequence
 from datetime import datetime, timedelta
@@ -11,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from stages import artifacts
 from stages.evaluation.protocols.known_object import TRUTH_CAMERAS
 
 OPENGL_FROM_OPENCV = np.diag([1.0, -1, -1, 1])
@@ -77,14 +77,14 @@ def write_truth(
         "frames": frames,
     }
     partial = (folder / TRUTH_CAMERAS).with_suffix(".partial")
-    partial.write_text(json.dumps(truth, indent=1) + "\n", encoding="utf-8")
+    artifacts.write_json(partial, truth)
     os.replace(partial, folder / TRUTH_CAMERAS)
 
 
 def is_complete(folder: Path, made_with: Mapping[str, Any]) -> bool:
     """Whether a set made with this recipe is there, to the last photo."""
     try:
-        truth = json.loads((folder / TRUTH_CAMERAS).read_text(encoding="utf-8"))
+        truth = artifacts.read_json(folder / TRUTH_CAMERAS)
     except (OSError, ValueError):
         return False
     return truth.get("made_with") == made_with and all(

@@ -162,17 +162,19 @@ def evaluate_dtu(predicted: Path, data: Path, scan: int, seed: int = 0) -> dict[
     }
 
 
+def truth_files(data: Path, scan: int) -> tuple[Path, Path, Path]:
+    """Observed cells, ground plane and points of a scan."""
+    cells = data / "ObsMask"
+    return cells / f"ObsMask{scan}_10.mat", cells / f"Plane{scan}.mat", data / "Points/stl" / f"stl{scan:03}_total.ply"
+
+
 def read_dtu(data: Path, scan: int) -> DtuTruth:
     """The truth of one scan from `SampleSet/MVS Data` of DTU, with the scans of `Points`.
 
     Raises:
         InputError: a file is missing or does not hold what it should.
     """
-    observed, plane, scanned = (
-        data / "ObsMask" / f"ObsMask{scan}_10.mat",
-        data / "ObsMask" / f"Plane{scan}.mat",
-        data / "Points" / "stl" / f"stl{scan:03}_total.ply",
-    )
+    observed, plane, scanned = truth_files(data, scan)
     missing = [str(path.relative_to(data)) for path in (observed, plane, scanned) if not path.is_file()]
     if missing:
         raise InputError(

@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+from stages.evaluation.protocols.dtu import truth_files
 from stages.evaluation.suites.scene import SuiteScene, Truth, Wanted, every_nth, folders_with, photo_names
 from stages.posing import neus
 
@@ -27,9 +28,10 @@ def _scene(place: Path, number: int, wanted: Wanted) -> SuiteScene:
     data = evaluation_data([wanted.truth, place.parent, place.parent.parent], number)
     lacking = []
     if data is None:
+        observed, _, scanned = truth_files(Path(), number)
         lacking.append(
-            f"no distance: DTU's evaluation data (ObsMask/ObsMask{number}_10.mat and Points/stl/stl{number:03d}_total"
-            ".ply of SampleSet) is not beside the scans; name its folder with --truth"
+            f"no distance: DTU's evaluation data ({observed.as_posix()} and {scanned.as_posix()} of SampleSet) is not "
+            "beside the scans; name its folder with --truth"
         )
     if views is None:
         lacking.append("no view synthesis: all photos train, as in the papers; --hold-out 8 keeps every 8th back")
@@ -48,11 +50,9 @@ def evaluation_data(places: list[Path | None], number: int) -> Path | None:
     """The folder with `ObsMask/` and `Points/stl/` for a scan, in or below one of the places."""
     for place in filter(None, places):
         for inner in PLACES:
-            found = place / inner
-            if (found / "ObsMask" / f"ObsMask{number}_10.mat").is_file() and (
-                found / "Points" / "stl" / f"stl{number:03d}_total.ply"
-            ).is_file():
-                return found
+            observed, _, scanned = truth_files(place / inner, number)
+            if observed.is_file() and scanned.is_file():
+                return place / inner
     return None
 
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from stages.evaluation.suites.scene import SuiteScene, TestViews, Wanted, folders_with, photo_names
+from stages.evaluation.suites.scene import NovelViews, SuiteScene, Wanted, folders_with, photo_names
 
 TRAIN, TEST = "transforms_train.json", "transforms_test.json"
 EXTRAS = ("_depth_", "_normal_")  # in the names of pictures that are no photos
@@ -19,11 +19,11 @@ def find_scenes(folder: Path, wanted: Wanted) -> list[SuiteScene]:
 
 
 def _scene(place: Path) -> SuiteScene:
-    views: TestViews | None = None
+    views: NovelViews | None = None
     lacking: tuple[str, ...] = ()
     if (place / TEST).is_file() and (place / "test").is_dir():
         names = [name for name in photo_names(place / "test") if not any(extra in name for extra in EXTRAS)]
-        views = TestViews(place / "test", tuple(names), place / TEST, background="white")
+        views = NovelViews(place / "test", tuple(names), place / TEST, background="white")
     else:
         lacking = (f"no view synthesis: {place.name} has no {TEST} with test/",)
     return SuiteScene(place.name, place / "train", place / TRAIN, views=views, lacking=lacking)

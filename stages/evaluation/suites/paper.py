@@ -32,10 +32,6 @@ class PaperRow:
         """Whether the printed average, of so many decimals, is another than that of the figures."""
         return abs(self.average - self.printed) > 0.501 * 10.0**-decimals
 
-    def beyond_rounding(self, decimals: int) -> bool:
-        """Whether rounding of every figure and of the average, half a unit each, cannot explain it either."""
-        return abs(self.average - self.printed) > 1.001 * 10.0**-decimals
-
 
 @dataclass(frozen=True)
 class PaperTable:

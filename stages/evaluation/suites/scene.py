@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Literal
 
 from stages.capture.photo_reading import PHOTO_SUFFIXES
-from stages.evaluation.photos.test_photos import TestViews
+from stages.evaluation.photos.novel_views import NovelViews
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class SuiteScene:
     photos: Path
     poses: Path | None = None
     masks: Path | None = None
-    views: TestViews | None = None
+    views: NovelViews | None = None
     truth: Truth | None = None
     lacking: tuple[str, ...] = ()
 
@@ -81,9 +81,9 @@ def photo_names(folder: Path) -> list[str]:
     )
 
 
-def every_nth(folder: Path, names: list[str], poses: Path, every: int) -> TestViews | None:
+def every_nth(folder: Path, names: list[str], poses: Path, every: int) -> NovelViews | None:
     """Every n-th photo from the first, as Mip-NeRF 360 and LLFF do, as test views; None where `every` is 0."""
-    return TestViews(folder, tuple(names[::every]), poses) if every else None
+    return NovelViews(folder, tuple(names[::every]), poses) if every else None
 
 
 def places_in(folder: Path) -> list[Path]:

@@ -10,8 +10,8 @@ import numpy as np
 from stages import artifacts
 from stages.engine.workspace import Workspace
 from stages.evaluation.photos.images import find_lpips
+from stages.evaluation.photos.novel_views import NovelPhotos
 from stages.evaluation.photos.scoring import score_photos
-from stages.evaluation.photos.test_photos import TestPhotos
 from stages.evaluation.protocols.blendedmvs import evaluate_blended
 from stages.evaluation.protocols.dtu import evaluate_dtu
 from stages.evaluation.protocols.glossy import evaluate_glossy
@@ -38,7 +38,7 @@ def score_result(
     if scene.truth is not None and mesh is not None:
         scores["mesh"] = score_surface(scene.truth, mesh, workspace)
     if scene.views is not None and "train" in fresh:
-        photos = TestPhotos(scene.views, workspace, scene.masks)
+        photos = NovelPhotos(scene.views, workspace, scene.masks)
         indices = range(len(photos.cameras))
         found = score_photos(
             workspace, photos.cameras, indices, photos.load, device, textured="bake" in fresh, lpips=find_lpips()[0]

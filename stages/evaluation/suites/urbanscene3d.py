@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from stages.evaluation.suites.scene import SuiteScene, TestViews, Wanted, every_nth, photo_names, places_in
+from stages.evaluation.suites.scene import NovelViews, SuiteScene, Wanted, every_nth, photo_names, places_in
 from stages.posing import colmap_model, meganerf
 
 PHOTOS = ("photos", "images", "Photos", "Images", "")
@@ -32,7 +32,7 @@ def _refined(place: Path) -> SuiteScene:
     train, test = place / "train", place / "val"
     views, lacking = None, [NO_DISTANCE]
     if meganerf.has_metadata(test) and (test / meganerf.IMAGES).is_dir():
-        views = TestViews(test / meganerf.IMAGES, tuple(photo_names(test / meganerf.IMAGES)), test)
+        views = NovelViews(test / meganerf.IMAGES, tuple(photo_names(test / meganerf.IMAGES)), test)
     else:
         lacking.append(f"no view synthesis: {place.name} has no val/ with photos in it")
     return SuiteScene(place.name, train / meganerf.IMAGES, train, views=views, lacking=tuple(lacking))

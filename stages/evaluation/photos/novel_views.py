@@ -23,7 +23,7 @@ OPAQUE = 127  # alpha above this is the object, as ingest has it
 
 
 @dataclass(frozen=True)
-class TestViews:
+class NovelViews:
     """Photos to judge by, which no stage sees.
 
     Attributes:
@@ -32,24 +32,20 @@ class TestViews:
         background: how the suite's PSNR counts what is not the object: "white", or as "photo" shows it.
     """
 
-    __test__ = False  # pytest takes the name for a test
-
     folder: Path
     names: tuple[str, ...]
     poses: Path
     background: Literal["white", "photo"] = "photo"
 
 
-class TestPhotos:
+class NovelPhotos:
     """Test photos and their cameras.
 
     Attributes:
         cameras: in the scene frame, in the order of the views' names; photos without a pose are left out.
     """
 
-    __test__ = False  # pytest takes the name for a test
-
-    def __init__(self, views: TestViews, workspace: Workspace, masks: Path | None = None) -> None:
+    def __init__(self, views: NovelViews, workspace: Workspace, masks: Path | None = None) -> None:
         """With the folder of the masks that the scene is run with, if it is.
 
         Raises:
