@@ -336,12 +336,15 @@ def score_clean_mesh(
 
     if not has_truth(truth):
         return None
-    vertices, faces = artifacts.load_mesh(folder / "cleanup")
+    vertices, faces = artifacts.CLEAN_MESH.load(folder / "cleanup")
     poses_from_scene = artifacts.SCENE.load(shared / SHARED).poses_from_scene
     with tempfile.TemporaryDirectory() as world:
-        artifacts.save_mesh(Path(world), poses_from_scene.apply(vertices), faces)
+        artifacts.CLEAN_MESH.save(Path(world), (poses_from_scene.apply(vertices), faces))
         return score_mesh(
-            Path(world) / artifacts.MESH, artifacts.MODEL.load(shared / "sfm"), truth, known_stem or file_stem
+            Path(world) / artifacts.CLEAN_MESH.files[0],
+            artifacts.MODEL.load(shared / "sfm"),
+            truth,
+            known_stem or file_stem,
         )
 
 

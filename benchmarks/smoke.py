@@ -195,7 +195,7 @@ def held_out_drawing(workspace: Path, mesh: AtlasMesh, texture: np.ndarray) -> t
     names = artifacts.HELD_OUT.load(workspace / "train")
 
     def load(index: int) -> tuple[np.ndarray, None]:
-        return artifacts.load_image(workspace / "undistort", cameras.names[index]), None
+        return artifacts.Pictures(workspace / "undistort").image(cameras.names[index]), None
 
     scores = [(view.psnr, view.ssim) for view in score_views(mesh, texture, cameras, load, names)]
     if not scores:

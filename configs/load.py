@@ -18,15 +18,14 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-import annotated_types
 import yaml
 from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 
-from configs.dotted import nested
+from configs.dotted import flatten, nested
 from configs.params import Config
 from configs.renames import with_new_names
-from stages.errors import ConfigError
+from stages.errors import ConfigError, did_you_mean
 
 
 @dataclass(frozen=True)
@@ -67,16 +66,16 @@ def load_config(preset: str | None = None, file: Path | None = None, sets: Seque
         groups.append([(str(file), _parse(_read(file), str(file)))])
     groups.append([(f"--set {text}", _parse_set(text)) for text in sets])
 
-    merged: dict[str, Any] = {}
+    merged: dict[str, Any] = {}  # by dotted key
     origins: dict[str, str] = {}
     for group in groups:
         layers = [(origin, _checked(with_new_names(layer, origin), origin)) for origin, layer in group]
         backbones = [_backbone(layer.get("train", {}).get("backbone")) for _, layer in layers]
         for origin, layer in (*itertools.chain(*backbones), *layers):
-            merged = _merge(merged, layer)
-            origins.update({key: origin for key in _dotted(layer)})
+            merged |= flatten(layer)
+            origins |= {part: origin for key in flatten(layer) for part in (key, *_ancestors(key))}
     try:
-        return Config.model_validate(merged)
+        return Config.model_validate(nested(merged))
     except ValidationError as error:
         raise _refusal(error, origins) from None
 
@@ -105,7 +104,7 @@ def preset_text(name: str) -> str:
     if name not in preset_names():
         raise ConfigError(
             f"There is no preset '{name}'.",
-            _did_you_mean(name, preset_names(), "--preset {}", "The presets are"),
+            f"{did_you_mean(name, preset_names(), '--preset {}')}The presets are {', '.join(preset_names())}.",
         )
     return (resources.files("configs") / "presets" / f"{name}.yaml").read_text(encoding="utf-8")
 
@@ -171,19 +170,9 @@ def _type_name(annotation: Any) -> str:
 
 
 def _bounds(field: FieldInfo) -> str:
-    signs = (
-        (annotated_types.Gt, "gt", ">"),
-        (annotated_types.Ge, "ge", ">="),
-        (annotated_types.Lt, "lt", "<"),
-        (annotated_types.Le, "le", "<="),
-    )
-    bounds = [
-        f"{sign} {getattr(rule, attribute)}"
-        for rule in field.metadata
-        for kind, attribute, sign in signs
-        if isinstance(rule, kind)
-    ]
-    return ", ".join(bounds)
+    signs = {"gt": ">", "ge": ">=", "lt": "<", "le": "<="}  # the rules' attributes
+    rules = [(rule, name) for rule in field.metadata for name in signs if hasattr(rule, name)]
+    return ", ".join(f"{signs[name]} {getattr(rule, name)}" for rule, name in rules)
 
 
 # ---------------------------------------------------------------- reading YAML
@@ -254,23 +243,6 @@ def _parse_set(text: str) -> dict[str, Any]:
     return nested({".".join(parts): value})
 
 
-def _merge(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
-    merged = dict(below)
-    for key, value in above.items():
-        if isinstance(value, Mapping) and isinstance(merged.get(key), Mapping):
-            merged[key] = _merge(merged[key], value)
-        else:
-            merged[key] = value
-    return merged
-
-
-def _dotted(layer: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
-    for key, value in layer.items():
-        yield f"{prefix}{key}"
-        if isinstance(value, Mapping):
-            yield from _dotted(value, f"{prefix}{key}.")
-
-
 # ---------------------------------------------------------------- refusing
 _BOUND_ERRORS = ("greater_than", "greater_than_equal", "less_than", "less_than_equal")
 
@@ -313,12 +285,6 @@ def _nearest(key: str) -> str:
     if near:
         return f"Did you mean `{near[0]}`? `hineus config --describe` lists all settings."
     return "`hineus config --describe` lists all settings."
-
-
-def _did_you_mean(name: str, known: Sequence[str], form: str, otherwise: str) -> str:
-    near = difflib.get_close_matches(name, known, 1)
-    listed = f"{otherwise} {', '.join(known)}."
-    return f"Did you mean `{form.format(near[0])}`? {listed}" if near else listed
 
 
 def _refusal(error: ValidationError, origins: Mapping[str, str]) -> ConfigError:

@@ -1,6 +1,6 @@
 """What a person sees: console, logging, progress bars, tables. Everything for people goes to stderr.
 
-Only this module configures logging.
+Only this module configures logging. It is imported inside the commands, since rich takes its time.
 """
 
 from __future__ import annotations
@@ -12,16 +12,20 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from types import TracebackType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-if TYPE_CHECKING:
-    from rich.console import Console
-    from rich.progress import Progress
-    from rich.table import Table
+from rich.console import Console
+from rich.logging import RichHandler
+from rich.panel import Panel
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table
+from rich.text import Text
 
-    from stages.engine.runner import StageOutcome
-    from stages.engine.stage import Stage
-    from stages.engine.status import StageStatus
+from stages.engine.run_log import TRACEBACKS
+from stages.engine.runner import Listener, StageOutcome
+from stages.engine.stage import Stage
+from stages.engine.status import StageStatus
+from stages.engine.workspace import show_bytes
 
 OURS = ("hineus_cli", "stages", "configs")
 CONSOLE_HANDLER = "hineus-console"
@@ -47,8 +51,6 @@ def product() -> Console:
 
 
 def _console(stderr: bool) -> Console:
-    from rich.console import Console
-
     stream = sys.stderr if stderr else sys.stdout
     width = None if stream.isatty() else PLAIN_WIDTH
     return Console(stderr=stderr, width=width, highlight=False, soft_wrap=False)
@@ -57,10 +59,6 @@ def _console(stderr: bool) -> Console:
 # ---------------------------------------------------------------- logging
 def set_up_logging(verbose: bool = False) -> None:
     """Warnings of everybody and what our stages say go to stderr; `verbose` adds our debug lines."""
-    from rich.logging import RichHandler
-
-    from stages.engine.run_log import TRACEBACKS
-
     console = people()
     handler: logging.Handler
     if console.is_terminal:
@@ -97,9 +95,6 @@ def stdout_kept_clean() -> Iterator[None]:
 # ---------------------------------------------------------------- errors
 def show_error(message: str, hint: str = "") -> None:
     """A panel where a person looks on; plain lines in a pipe, where they can be searched for."""
-    from rich.panel import Panel
-    from rich.text import Text
-
     console = people()
     if not console.is_terminal:
         print(f"Error: {message}", file=sys.stderr)
@@ -114,23 +109,20 @@ def show_error(message: str, hint: str = "") -> None:
 
 # ---------------------------------------------------------------- progress
 def _bars(console: Console) -> Progress:
-    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
-    from rich.progress import TimeRemainingColumn as Remaining
-
     return Progress(
         TextColumn("{task.description:<10}"),
         BarColumn(bar_width=30),
         TaskProgressColumn(),
         TimeElapsedColumn(),
         TextColumn("left"),
-        Remaining(),
+        TimeRemainingColumn(),
         TextColumn("{task.fields[note]}"),
         console=console,
         disable=not console.is_terminal,
     )
 
 
-class ProgressDisplay:
+class ProgressDisplay(Listener):
     """A bar with an ETA for each stage; in a pipe, a line at its start, its end and now and then between."""
 
     def __init__(self) -> None:
@@ -187,8 +179,6 @@ class ProgressDisplay:
 # ---------------------------------------------------------------- tables
 def table_of(first: str, *numbers: str) -> Table:
     """An empty table: a column of names, and columns of numbers."""
-    from rich.table import Table
-
     table = Table(header_style="bold")
     table.add_column(first)
     for heading in numbers:
@@ -196,17 +186,20 @@ def table_of(first: str, *numbers: str) -> Table:
     return table
 
 
-def outcome_table(outcomes: Sequence[StageOutcome], width: int) -> Table:
-    """Stage, what became of it and why, its cost, where there is room its key numbers. The total is of what ran now."""
-    from rich.table import Table
-    from rich.text import Text
-
+def _stage_table(state: str, *numbers: str) -> Table:
+    """An empty table of stages: name, state, why, and columns of numbers."""
     table = Table(header_style="bold")
-    for heading in ("stage", "what"):
+    for heading in ("stage", state):
         table.add_column(heading, no_wrap=True)
     table.add_column("why", overflow="fold")
-    for heading in ("wall s", "CPU s", "peak GiB"):
+    for heading in numbers:
         table.add_column(heading, justify="right", no_wrap=True)
+    return table
+
+
+def outcome_table(outcomes: Sequence[StageOutcome], width: int) -> Table:
+    """Stage, what became of it and why, its cost, where there is room its key numbers. The total is of what ran now."""
+    table = _stage_table("what", "wall s", "CPU s", "peak GiB")
     if width >= WIDE:
         table.add_column("numbers", overflow="fold")
 
@@ -239,17 +232,7 @@ def outcome_table(outcomes: Sequence[StageOutcome], width: int) -> Table:
 
 def status_table(statuses: Sequence[StageStatus], width: int) -> Table:
     """Stage, how it stands and why, its size and time, where there is room what else it cost and its date."""
-    from rich.table import Table
-    from rich.text import Text
-
-    from stages.engine.workspace import show_bytes
-
-    table = Table(header_style="bold")
-    for heading in ("stage", "state"):
-        table.add_column(heading, no_wrap=True)
-    table.add_column("why", overflow="fold")
-    for heading in ("size", "wall s", *(("CPU s", "peak GiB", "made (UTC)") if width >= WIDE else ())):
-        table.add_column(heading, justify="right", no_wrap=True)
+    table = _stage_table("state", "size", "wall s", *(("CPU s", "peak GiB", "made (UTC)") if width >= WIDE else ()))
     for status in statuses:
         made = status.manifest
         cells: list[str | Text] = [

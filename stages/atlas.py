@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import logging
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from configs.params import AtlasParams
 from stages.artifacts import ATLAS, CAMERAS, CLEAN_MESH, AtlasMesh
 from stages.engine.stage import Stage, StageContext
 from stages.errors import ReconstructionError
-
-if TYPE_CHECKING:
-    from configs.params import AtlasParams
 
 logger = logging.getLogger(__name__)
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from functools import partial
+from typing import Any
 
+from configs.params import BakeParams
 from stages.artifacts import (
     ATLAS,
     BASE_COLOR,
@@ -20,9 +22,6 @@ from stages.artifacts import (
 )
 from stages.engine.stage import Stage, StageContext
 from stages.errors import ReconstructionError
-
-if TYPE_CHECKING:
-    from configs.params import BakeParams
 
 
 def run(context: StageContext[BakeParams]) -> dict[str, Any]:
@@ -67,19 +66,12 @@ def run(context: StageContext[BakeParams]) -> dict[str, Any]:
     numbers = dict(baked.numbers)
     if params.normal_map:
         full = context.read(CLEAN_FULL_MESH)
-        normal_map, met = bake_normals(
-            atlas, texels, *full, lambda done, total: context.progress(done, total, "normals")
-        )
+        normal_map, met = bake_normals(atlas, texels, *full, partial(context.progress, note="normals"))
         write_png(context.to_write(NORMAL_MAP), normal_map)
         numbers["normals_share"] = round(met, 4)
     if params.occlusion_rays > 0:
-        occlusion = bake_occlusion(
-            atlas,
-            texels,
-            params.occlusion_rays,
-            params.occlusion_reach,
-            lambda done, total: context.progress(done, total, "occlusion"),
-        )
+        tell = partial(context.progress, note="occlusion")
+        occlusion = bake_occlusion(atlas, texels, params.occlusion_rays, params.occlusion_reach, tell)
         write_png(context.to_write(OCCLUSION), occlusion)
     return numbers
 

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from configs.params import CleanupParams
 from stages.artifacts import CLEAN_FULL_MESH, CLEAN_MESH, GIVEN_REGION, PINHOLE_PHOTOS, RAW_MESH, SCENE, Pictures
 from stages.engine.stage import Stage, StageContext
 from stages.errors import ReconstructionError
@@ -15,9 +16,6 @@ from stages.geometry.cameras import PinholeCameras, PosedScene
 from stages.geometry.place import GivenRegion
 from stages.geometry.plane import Plane, fit_plane
 from stages.geometry.similarity import Similarity
-
-if TYPE_CHECKING:
-    from configs.params import CleanupParams
 
 logger = logging.getLogger(__name__)
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import difflib
+from collections.abc import Iterable
+
 
 class HineusError(Exception):
     """An error in the user's terms. `message` says what happened, `hint` is a command or an action to try."""
@@ -42,3 +45,9 @@ class SystemRequirementError(HineusError):
     """The machine lacks something: a library, memory, a GPU. Install it or choose another way."""
 
     exit_code = 6
+
+
+def did_you_mean(name: str, known: Iterable[str], form: str = "{}") -> str:
+    """The start of a hint: "Did you mean `--preset cpu`? " by the nearest known name; empty where none is near."""
+    near = difflib.get_close_matches(name, known, 1)
+    return f"Did you mean `{form.format(near[0])}`? " if near else ""

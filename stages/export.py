@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from configs.params import ExportParams
 from stages import artifacts
 from stages.artifacts import ASSET, ATLAS, BASE_COLOR, NORMAL_MAP, OCCLUSION, PLACE, SCENE
 from stages.engine.stage import Stage, StageContext
+from stages.engine.system import installed_version
 from stages.errors import ReconstructionError, SystemRequirementError
 from stages.geometry.cameras import PosedScene
 from stages.geometry.place import Place
@@ -20,7 +21,6 @@ from stages.geometry.similarity import Similarity
 from stages.geometry.up import y_up_rotation
 
 if TYPE_CHECKING:
-    from configs.params import ExportParams
     from stages.files.contents import Textures
 
 
@@ -225,11 +225,8 @@ def vertex_colors(texture_png: bytes, uvs: np.ndarray) -> np.ndarray:
 
 
 def generator() -> str:
-    """Name and version of this program."""
-    try:
-        return f"hineus {version('hineus')}"
-    except PackageNotFoundError:  # run from a checkout that was never installed
-        return "hineus"
+    """Name and, where it is installed, version of this program."""
+    return f"hineus {installed_version('hineus') or ''}".rstrip()
 
 
 def provenance(scene: PosedScene, place: Place, gltf_from_world: np.ndarray, run: str | None) -> dict[str, Any]:

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from functools import partial
+from typing import Any
 
 import numpy as np
 
+from configs.params import ExtractParams
 from stages.artifacts import CAMERAS, FIELD, RAW_MESH
 from stages.engine.stage import Stage, StageContext
 from stages.errors import ReconstructionError
 from stages.geometry.cameras import PinholeCameras
-
-if TYPE_CHECKING:
-    from configs.params import ExtractParams
 
 # However small the photos, a coarser grid than this loses the object's shape.
 MIN_RESOLUTION = 64
@@ -36,7 +35,7 @@ def run(context: StageContext[ExtractParams]) -> dict[str, Any]:
         field.sdf,
         resolution,
         block=context.params.block,
-        progress=lambda done, total: context.progress(done, total, f"marching cubes at {resolution}^3"),
+        progress=partial(context.progress, note=f"marching cubes at {resolution}^3"),
     )
     if len(surface.faces) == 0:
         centre = float(field.sdf(np.zeros((1, 3), dtype=np.float32))[0])

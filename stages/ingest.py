@@ -11,22 +11,23 @@ import logging
 import math
 import shutil
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from fnmatch import fnmatchcase
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
+from configs.params import IngestParams
 from stages.artifacts import IMAGE_SET, PHOTOS, ImageRecord, ImageSet, SkippedImage
-from stages.capture.background import find_background, object_mask
+from stages.capture.background import PLAIN_PHOTOS, find_background, object_mask
 from stages.capture.exif import ORIENTATION, camera_key, focal_px, gps_position
-from stages.capture.listing import list_captures
+from stages.capture.listing import NAMED, by_reason, list_captures, name_some
 from stages.capture.masks import check_size, match_masks, read_mask, write_mask
 from stages.capture.photo_reading import UnusableError, read_photo, register_formats
-from stages.capture.quality import sharpness
+from stages.capture.quality import Appearance, appearance, find_oddities
 from stages.capture.video import extract_frames
 from stages.engine.fingerprint import file_sha256
 from stages.engine.stage import Stage, StageContext
@@ -35,14 +36,9 @@ from stages.posing.known import KnownPoses, match_photos
 from stages.posing.nero import DEPTH, read_depth_mask
 from stages.posing.reading import read_poses
 
-if TYPE_CHECKING:
-    from configs.params import IngestParams
-
 log = logging.getLogger(__name__)
 
-PLAIN_PHOTOS = 0.9  # this part of the photos must have a plain background before masks are made from it
 JPEG_QUALITY = 97  # re-encoded lossy photos; visually lossless, about a third of PNG's size
-NAMED_IN_ERRORS = 3  # this many file names are spelt out in an error message
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -66,30 +62,21 @@ def run(context: StageContext[IngestParams]) -> dict[str, Any]:
         skipped += [SkippedImage(path, f"has no pose in {poses.origin.name}") for path in paths if path not in cameras]
         paths = list(cameras)
         _tell_unused(poses, {camera.name for camera in cameras.values()})
-    kept_back = [path for path in paths if _is_left_out(path, params.leave_out)]
-    skipped += [SkippedImage(path, "named in ingest.leave_out") for path in kept_back]
-    paths = [path for path in paths if path not in set(kept_back)]
+    unseen = {path for path in paths if any(fnmatchcase(path, pattern) for pattern in params.leave_out)}
+    skipped += [SkippedImage(path, "named in ingest.leave_out") for path in paths if path in unseen]
+    paths = [path for path in paths if path not in unseen]
 
-    known = context.digests.get("photos", {})
-    digests = _in_threads(lambda path: known.get(path) or _sha256(files[path]), paths, context.workers)
-    first_with: dict[str, str] = {}
-    unique: list[tuple[str, str]] = []
-    for path, digest in zip(paths, digests, strict=True):
-        if digest in first_with:
-            skipped.append(SkippedImage(path, f"same file as {first_with[digest]}"))
-        else:
-            first_with[digest] = path
-            unique.append((path, digest))
+    unique, copies = _without_copies(paths, files, context)
+    skipped += copies
 
-    mask_files = find_masks([path for path, _ in unique], masks_folder, poses) if masks_folder else {}
-    names = _Names(path for path, _ in unique)
+    mask_files = find_masks(list(unique), masks_folder, poses) if masks_folder else {}
+    names = _Names(unique)
     done = 0
 
-    def take(item: tuple[str, str]) -> ImageRecord | SkippedImage:
+    def take(path: str) -> tuple[ImageRecord, Appearance] | SkippedImage:
         nonlocal done
-        path, digest = item
         try:
-            return _take_photo(files[path], path, digest, mask_files.get(path), names, context)
+            return _take_photo(files[path], path, unique[path], mask_files.get(path), names, context)
         except UnusableError as reason:
             return SkippedImage(path, str(reason))
         finally:
@@ -97,7 +84,8 @@ def run(context: StageContext[IngestParams]) -> dict[str, Any]:
             context.progress(done, len(unique), path)
 
     outcomes = _in_threads(take, unique, context.workers)
-    images = sorted((o for o in outcomes if isinstance(o, ImageRecord)), key=lambda record: record.name)
+    taken = [o for o in outcomes if not isinstance(o, SkippedImage)]
+    images = sorted((record for record, _ in taken), key=lambda record: record.name)
     skipped += [o for o in outcomes if isinstance(o, SkippedImage)]
     if params.auto_mask == "plain":
         images, without = _mask_plain_backgrounds(images, context)
@@ -106,15 +94,17 @@ def run(context: StageContext[IngestParams]) -> dict[str, Any]:
 
     if len(images) < params.min_images:
         raise _too_few(source, len(images), params.min_images, skipped)
-    missing = [path for path, _ in unique if masks_folder and path not in mask_files]
-    missing = [path for path in missing if any(record.source == path for record in images)]
+    missing = [record.source for record in images if masks_folder and record.source not in mask_files]
     if missing:
         raise InputError(
-            f"{len(missing)} of {len(images)} photos have no mask in {masks_folder}: {_first(missing)}.",
+            f"{len(missing)} of {len(images)} photos have no mask in {masks_folder}: {name_some(missing)}.",
             f"Add {Path(missing[0]).stem}.png and the like, move those photos away, or run with `--no-masks`.",
         )
-    for reason, sources in _by_reason(skipped).items():
-        log.warning("left out %s: %s", _first(sources), reason)
+    for reason, sources in by_reason(skipped).items():
+        log.warning("left out %s: %s", name_some(sources), reason)
+    # a video's frames are the sharpest of their stretch and near each other by choice
+    for warning in find_oddities([seen for _, seen in taken if seen.source not in frames]).warnings:
+        log.warning("%s", warning)
     masked = sum(record.has_mask for record in images)
     if 0 < masked < len(images):
         log.warning("only %d of %d photos have a mask (from their alpha channel)", masked, len(images))
@@ -156,9 +146,19 @@ def _frames_of(
     return found, damaged
 
 
-def _is_left_out(path: str, patterns: Sequence[str]) -> bool:
-    """Whether a photo is one of those that no stage is to see."""
-    return any(fnmatchcase(path, pattern) for pattern in patterns)
+def _without_copies(
+    paths: list[str], files: dict[str, Path], context: StageContext[IngestParams]
+) -> tuple[dict[str, str], list[SkippedImage]]:
+    """Photo -> sha256 of its file, in the order of `paths`; and those that are the same file as an earlier one."""
+    known = context.digests.get("photos", {})
+    digests = _in_threads(lambda path: known.get(path) or file_sha256(files[path]), paths, context.workers)
+    first_with: dict[str, str] = {}
+    copies = []
+    for path, digest in zip(paths, digests, strict=True):
+        first = first_with.setdefault(digest, path)
+        if first != path:
+            copies.append(SkippedImage(path, f"same file as {first}"))
+    return {path: digest for digest, path in first_with.items()}, copies
 
 
 def _too_few(folder: Path, found: int, needed: int, skipped: list[SkippedImage]) -> InputError:
@@ -170,9 +170,8 @@ def _too_few(folder: Path, found: int, needed: int, skipped: list[SkippedImage])
         return InputError(f"The folder {folder} is empty: found 0 photos, need at least {needed}.", hint)
     message = f"Found {found} usable photo{'' if found == 1 else 's'} in {folder}, need at least {needed}."
     if skipped:
-        counts = Counter(item.reason for item in skipped).most_common(NAMED_IN_ERRORS)
-        example = {item.reason: item.source for item in reversed(skipped)}
-        reasons = "; ".join(f"{count} x {reason}, e.g. {example[reason]}" for reason, count in counts)
+        frequent = sorted(by_reason(skipped).items(), key=lambda item: -len(item[1]))[:NAMED]
+        reasons = "; ".join(f"{len(files)} x {reason}, e.g. {files[0]}" for reason, files in frequent)
         message += f" {len(skipped)} file{'' if len(skipped) == 1 else 's'} left out: {reasons}."
     return InputError(message, hint)
 
@@ -181,14 +180,7 @@ def _tell_unused(poses: KnownPoses, used: set[str]) -> None:
     unused = [camera.name for camera in poses.cameras if camera.name not in used]
     if unused:
         total, file = len(poses.cameras), poses.origin.name
-        log.warning("%d of %d poses in %s have no photo: %s", len(unused), total, file, _first(unused))
-
-
-def _by_reason(skipped: list[SkippedImage]) -> dict[str, list[str]]:
-    sources: dict[str, list[str]] = {}
-    for item in skipped:
-        sources.setdefault(item.reason, []).append(item.source)
-    return sources
+        log.warning("%d of %d poses in %s have no photo: %s", len(unused), total, file, name_some(unused))
 
 
 def find_masks(photos: list[str], folder: Path, poses: KnownPoses | None) -> dict[str, Path]:
@@ -215,27 +207,14 @@ def read_mask_file(
     return mask
 
 
-def _first(names: list[str]) -> str:
-    more = len(names) - NAMED_IN_ERRORS
-    return ", ".join(names[:NAMED_IN_ERRORS]) + (f" and {more} more" if more > 0 else "")
-
-
-def _sha256(path: Path) -> str:
-    try:
-        return file_sha256(path)
-    except OSError:
-        return f"unreadable:{path}"  # reading it as a photo fails next, with the reason
-
-
 class _Names:
     """Gives each photo one name under images/. Names depend on the folder, never on the order of work."""
 
     def __init__(self, paths: Iterable[str]) -> None:
-        self._own = set(paths)
+        own = set(paths)
         # case-insensitive file systems must not merge two photos
-        self._lower = Counter(path.lower() for path in self._own)
-        stems = Counter(str(PurePosixPath(path).with_suffix("")).lower() for path in self._own)
-        self._stems = stems
+        self._lower = {path.lower() for path in own}
+        self._stems = Counter(str(PurePosixPath(path).with_suffix("")).lower() for path in own)
 
     def target(self, path: str, suffix: str | None) -> str:
         """`path` itself (suffix None or unchanged), or its stem with `suffix`, unique in the folder."""
@@ -291,7 +270,7 @@ def _mask_plain_backgrounds(
 # ---------------------------------------------------------------- one photo
 def _take_photo(
     file: Path, source: str, digest: str, mask_file: Path | None, names: _Names, context: StageContext[IngestParams]
-) -> ImageRecord:
+) -> tuple[ImageRecord, Appearance]:
     from PIL import Image
 
     photo = read_photo(file)
@@ -319,18 +298,20 @@ def _take_photo(
         write_mask(mask, pictures.mask_path(name), rgb.size)
 
     focal = focal_px(photo.exif, photo.stored_size)
-    return ImageRecord(
+    seen = appearance(source, np.asarray(rgb))
+    record = ImageRecord(
         name=name,
         source=source,
         width=rgb.width,
         height=rgb.height,
         focal_px=None if focal is None else focal * scale,
         camera=camera_key(photo.exif, rgb.size, source),
-        blur=sharpness(np.asarray(rgb)),
+        blur=seen.sharpness,
         has_mask=mask is not None,
         sha256=digest,
         gps=gps_position(photo.exif),
     )
+    return record, seen
 
 
 def _encoded_suffix(file: Path, lossy: bool) -> str:

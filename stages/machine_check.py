@@ -9,11 +9,10 @@ import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from importlib import metadata
 from pathlib import Path
 from typing import Literal
 
-from stages.engine.system import SYSTEM_LIBRARIES, apt_line, missing_libraries
+from stages.engine.system import SYSTEM_LIBRARIES, apt_line, installed_version, missing_libraries
 from stages.reconstruct import available_cores
 
 State = Literal["ok", "note", "missing"]
@@ -76,7 +75,7 @@ def examine(folder: Path) -> list[Finding]:
     optional = [_optional(module, *rest) for module, rest in OPTIONAL.items()]
     broken = any(finding.state == "missing" for finding in packages)
     return [
-        Finding("hineus", "ok", f"{_version('hineus') or 'not installed'} in {Path(__file__).parents[1]}"),
+        Finding("hineus", "ok", f"{installed_version('hineus') or 'not installed'} in {Path(__file__).parents[1]}"),
         Finding("Python", "ok", f"{platform.python_version()} ({sys.executable})"),
         Finding("platform", "ok", platform.platform()),
         *packages,
@@ -90,7 +89,7 @@ def examine(folder: Path) -> list[Finding]:
 
 
 def _package(module: str, distribution: str) -> Finding:
-    version = _version(distribution)
+    version = installed_version(distribution)
     problem = _probe(_PROBES.get(module, f"import {module}"))
     if problem is None:
         return Finding(module, "ok", version or "version unknown")
@@ -99,7 +98,7 @@ def _package(module: str, distribution: str) -> Finding:
 
 
 def _optional(module: str, distribution: str, without: str) -> Finding:
-    version = _version(distribution)
+    version = installed_version(distribution)
     if version is not None:
         return Finding(module, "ok", version)
     return Finding(module, "note", f"not installed: {without}", f"pip install {distribution}")
@@ -146,13 +145,6 @@ def _disk(folder: Path) -> Finding:
     if free < ENOUGH_DISK_GB:
         return Finding("disk", "note", found, f"a workspace may take up to {ENOUGH_DISK_GB:.0f} GB")
     return Finding("disk", "ok", found)
-
-
-def _version(distribution: str) -> str | None:
-    try:
-        return metadata.version(distribution)
-    except metadata.PackageNotFoundError:
-        return None
 
 
 def _probe(program: str) -> str | None:

@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import logging
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from configs.params import PlaceParams
 from configs.texts import read_distance, read_region
 from stages.artifacts import GIVEN_POSES, GIVEN_REGION, IMAGE_SET, MODEL, PHOTOS, PLACE, ImageSet, Pictures
 from stages.engine.stage import Stage, StageContext
@@ -21,9 +22,6 @@ from stages.geometry.markers import MarkerScale, detect_markers, measure_markers
 from stages.geometry.place import GivenRegion, Located, Place, given_region, locate
 from stages.geometry.similarity import Similarity
 from stages.posing.undistortion import plan_warp, posed_cameras, registered_photos
-
-if TYPE_CHECKING:
-    from configs.params import PlaceParams
 
 log = logging.getLogger(__name__)
 

@@ -9,13 +9,13 @@ from pathlib import Path
 from typing import Any, Literal
 
 from configs.params import Config
-from stages.capture.preflight import Inspection, inspect
+from stages.capture.inspection import Inspection, inspect
+from stages.capture.listing import NAMED, by_reason, name_some
 
 Verdict = Literal["go", "go with warnings", "no-go"]
 
 FEW_PHOTOS = 20  # a full turn in steps of less than 20 degrees; sets below it lose photos
 EXPECTED = ("not an image", "the raw file of", "the clip of")  # reasons to leave a file out that are no news
-NAMED = 4  # this many photos are named in a warning
 
 # All measured with `benchmarks/run_sets.py` on two cores, see docs/benchmarks/results.md.
 GIB = 1 << 30
@@ -80,9 +80,7 @@ class Preflight:
             "sizes": [[*size, count] for size, count in Counter(seen.sizes).most_common()],
             "cameras": dict(Counter(photo.camera for photo in seen.photos)),
             "with_focal": sum(photo.has_focal for photo in seen.photos),
-            "blurred": list(seen.blurred),
-            "badly_exposed": list(seen.badly_exposed),
-            "alike": [list(pair) for pair in seen.alike],
+            **asdict(seen.oddities),
             "plain_background": seen.plain,
             "needs": asdict(self.needs),
             "warnings": list(self.warnings),
@@ -91,15 +89,19 @@ class Preflight:
         }
 
 
-def preflight(source: Path, masks: Path | None, folder: Path, config: Config, device: str, workers: int) -> Preflight:
+def preflight(
+    source: Path, masks: Path | None, folder: Path, config: Config, device: str, workers: int, decode: bool
+) -> Preflight:
     """Look at the photos, and at the memory and the disk of `folder`, where the workspace will lie.
+
+    `decode`: whether to judge the photos' pixels, too; before a run that is left to ingest, which decodes them anyway.
 
     Raises:
         InputError: there is no such folder or video.
     """
     import psutil
 
-    seen = inspect(source, masks, config.ingest.video_frames, workers)
+    seen = inspect(source, masks, config.ingest.video_frames, workers, decode)
     needs = estimate(seen, config, device, workers)
     while not folder.exists():
         folder = folder.parent
@@ -153,24 +155,9 @@ def _warnings(seen: Inspection, config: Config) -> list[str]:
     found = []
     if config.ingest.min_images <= len(seen.sizes) < FEW_PHOTOS:
         found.append(f"Only {len(seen.sizes)} photos; 30 to 100 that overlap by two thirds give a whole object.")
-    if seen.blurred:
-        found.append(f"Far less sharp than the others: {_named(seen.blurred)}. Take them again or move them away.")
-    if seen.badly_exposed:
-        found.append(f"Far darker or lighter than the others: {_named(seen.badly_exposed)}. Fix the exposure.")
-    if seen.alike:
-        pairs = tuple(f"{earlier} = {later}" for earlier, later in seen.alike)
-        found.append(f"Nearly the same picture: {_named(pairs)}. They take time and add nothing.")
-    unusable: dict[str, list[str]] = {}
-    for item in seen.skipped:
-        if not item.reason.startswith(EXPECTED):
-            unusable.setdefault(item.reason, []).append(item.source)
-    found += [f"Left out {_named(tuple(names))}: {reason}." for reason, names in unusable.items()]
-    return found
-
-
-def _named(names: tuple[str, ...]) -> str:
-    more = len(names) - NAMED
-    return ", ".join(names[:NAMED]) + (f" and {more} more" if more > 0 else "")
+    found += seen.oddities.warnings
+    unusable = by_reason(item for item in seen.skipped if not item.reason.startswith(EXPECTED))
+    return found + [f"Left out {name_some(names)}: {reason}." for reason, names in unusable.items()]
 
 
 def facts(done: Preflight) -> list[tuple[str, str]]:

@@ -75,7 +75,7 @@ def reconstruct(request: Request, pipeline: Sequence[Stage], listener: Listener 
     with workspace.lock(), log_to_file(workspace.log_path):
         photos = sources["photos"]
         if photos is not None and not workspace.stage_folder("ingest").exists():
-            _tell_preflight(preflight(photos, sources["masks"], workspace.root, config, device, workers))
+            _tell_preflight(preflight(photos, sources["masks"], workspace.root, config, device, workers, decode=False))
         log.debug("preset %s, device %s, %d workers, %s", preset, device, workers, sources)
         outcomes = run_pipeline(
             pipeline,
@@ -103,7 +103,8 @@ def check_photos(request: Request) -> Preflight:
     assert photos is not None, "the command line demands it"
     config = load_config(request.preset or default_preset(), request.config, request.sets)
     workers = request.workers or available_cores()
-    return preflight(photos, request.masks, choose_folder(request), config, choose_device(request.device), workers)
+    device = choose_device(request.device)
+    return preflight(photos, request.masks, choose_folder(request), config, device, workers, decode=True)
 
 
 def _tell_preflight(done: Preflight) -> None:

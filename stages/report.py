@@ -9,10 +9,11 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
+from configs.params import ReportParams
 from stages.artifacts import (
     ATLAS,
     BASE_COLOR,
@@ -39,9 +40,6 @@ from stages.engine.stage import Stage, StageContext
 from stages.errors import HineusError
 from stages.geometry.cameras import PosedScene
 from stages.geometry.place import GivenRegion
-
-if TYPE_CHECKING:
-    from configs.params import ReportParams
 
 T = TypeVar("T")
 
@@ -192,18 +190,7 @@ REPORT: Stage[ReportParams] = Stage(
         QUALITY,
     ),
     writes=(PAGE,),
-    reads_manifests=(
-        "ingest",
-        "sfm",
-        "place",
-        "undistort",
-        "train",
-        "extract",
-        "cleanup",
-        "atlas",
-        "bake",
-        "export",
-    ),
+    reads_manifests=("ingest", "sfm", "place", "undistort", "train", "extract", "cleanup", "atlas", "bake", "export"),
     reads_run=True,
     summary="everything -> one HTML page",
 )

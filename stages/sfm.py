@@ -7,11 +7,12 @@ from __future__ import annotations
 
 import logging
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from configs.params import SfmParams
 from stages.artifacts import (
     GIVEN_POSES,
     IMAGE_SET,
@@ -27,13 +28,10 @@ from stages.engine.stage import Stage, StageContext
 from stages.errors import InputError, ReconstructionError
 from stages.posing.evidence import MIN_VERIFIED, Evidence
 from stages.posing.known import match_photos
-from stages.posing.ladder import Solution, Step, climb, describe, photos_wanted
+from stages.posing.ladder import Step, climb, describe, photos_wanted
 from stages.posing.reading import read_poses
 from stages.posing.triangulation import triangulate
 from stages.posing.workbench import RELAXED, Workbench
-
-if TYPE_CHECKING:
-    from configs.params import SfmParams
 
 log = logging.getLogger(__name__)
 
@@ -52,18 +50,13 @@ def run(context: StageContext[SfmParams]) -> dict[str, Any]:
     """
     if "poses" in context.sources:
         return _from_known_poses(context)
-    import pycolmap
 
     params, photos, image_set = context.params, context.read(PHOTOS), context.read(IMAGE_SET)
     _check_masks(image_set, params)
-    work = context.scratch / "colmap"
-    shutil.rmtree(work, ignore_errors=True)  # a killed run may have left half a database
-    work.mkdir(parents=True)
     names = [record.name for record in image_set.images]
     needed = _needed(len(names), params)
 
-    with _quiet_glog(work / "log"):
-        pycolmap.set_random_seed(params.seed)
+    with _working(context) as work:
         bench = Workbench(
             work,
             photos.images,
@@ -96,54 +89,57 @@ def run(context: StageContext[SfmParams]) -> dict[str, Any]:
         log.warning("the EXIF focal length, %.0f px, is wrong: the poses say %.0f px", prior, found)
     if steps[-1].kept and steps[-1].rung == RELAXED:
         log.warning("poses were found with relaxed thresholds only: they are rough, and some may be wrong")
-    return _publish(context, best, unregistered, steps, bench)
+    others = len(best.others)
+    return _publish(context, best.model, best.registered, unregistered, params.mapper, bench.matcher, others, steps)
 
 
 def _publish(
     context: StageContext[SfmParams],
-    best: Solution,
+    model: Any,
+    registered: Iterable[str],
     unregistered: tuple[Unregistered, ...],
-    steps: Sequence[Step],
-    bench: Workbench,
+    mapper: str,
+    matcher: str,
+    others: int = 0,
+    steps: Sequence[Step] = (),
 ) -> dict[str, Any]:
-    """Write model and registration; returns the numbers of the manifest."""
-    _write_model(context, best.model)
-    error, track = best.error_px, best.model.compute_mean_track_length()
-    kept = next(step.rung for step in reversed(steps) if step.kept)
-    ladder = [step.as_dict() for step in steps]
-    registration = Registration(
-        registered=tuple(sorted(best.registered)),
-        unregistered=unregistered,
-        mean_reprojection_error_px=error,
-        mean_track_length=track,
-        num_points=best.points,
-        num_models=1 + len(best.others),
-        mapper=context.params.mapper,
-        matcher=bench.matcher,
-        kept=kept,
-        ladder=tuple(ladder),
-    )
-    context.write(REGISTRATION, registration)
-    context.progress(1, 1, "done")
-    return {
-        "registered": len(best.registered),
-        "images": len(best.registered) + len(unregistered),
-        "points": best.points,
-        "mean_reprojection_error_px": round(error, 3),
-        "mean_track_length": round(track, 2),
-        "models": 1 + len(best.others),
-        "matcher": bench.matcher,
-        "focal_px": [round(camera.mean_focal_length(), 1) for camera in best.model.cameras.values()][:4],
-        "kept": kept,
-        "attempts": len(steps),
-        "ladder": ladder,
-    }
+    """Write model and registration; returns the numbers of the manifest.
 
-
-def _write_model(context: StageContext[SfmParams], model: Any) -> None:
+    Args:
+        others: models that mapping gave beside this one.
+        steps: the attempts; none where the poses were given.
+    """
     folder = context.to_write(MODEL)
     folder.mkdir(parents=True)
     model.write(str(folder))
+    points = model.num_points3D()
+    registration = Registration(
+        registered=tuple(sorted(registered)),
+        unregistered=unregistered,
+        mean_reprojection_error_px=model.compute_mean_reprojection_error() if points else 0.0,
+        mean_track_length=model.compute_mean_track_length() if points else 0.0,
+        num_points=points,
+        num_models=1 + others,
+        mapper=mapper,
+        matcher=matcher,
+        kept=next((step.rung for step in reversed(steps) if step.kept), ""),
+        ladder=tuple(step.as_dict() for step in steps),
+    )
+    context.write(REGISTRATION, registration)
+    context.progress(1, 1, "done")
+    numbers = {
+        "registered": len(registration.registered),
+        "images": len(registration.registered) + len(unregistered),
+        "points": points,
+        "mean_reprojection_error_px": round(registration.mean_reprojection_error_px, 3),
+        "mean_track_length": round(registration.mean_track_length, 2),
+        "models": registration.num_models,
+        "matcher": matcher,
+        "focal_px": [round(camera.mean_focal_length(), 1) for camera in model.cameras.values()][:4],
+    }
+    if steps:
+        numbers |= {"kept": registration.kept, "attempts": len(steps), "ladder": list(registration.ladder)}
+    return numbers
 
 
 def _from_known_poses(context: StageContext[SfmParams]) -> dict[str, Any]:
@@ -164,11 +160,7 @@ def _from_known_poses(context: StageContext[SfmParams]) -> dict[str, Any]:
     if len(cameras) < needed:
         hint = "Give the poses of these photos, or leave --poses out (`--no-poses`) to have them found."
         raise _too_few(len(cameras), unregistered, needed, "", hint)
-    work = context.scratch / "colmap"
-    shutil.rmtree(work, ignore_errors=True)  # a killed run may have left half a database
-    work.mkdir(parents=True)
-    with _quiet_glog(work / "log"):
-        pycolmap.set_random_seed(params.seed)
+    with _working(context) as work:
         model, matcher = triangulate(
             work,
             context.read(PHOTOS).images,
@@ -179,8 +171,9 @@ def _from_known_poses(context: StageContext[SfmParams]) -> dict[str, Any]:
             cuda=pycolmap.has_cuda and context.device == "cuda",
             progress=context.progress,
         )
-    points = model.num_points3D()
-    error = model.compute_mean_reprojection_error() if points else 0.0
+    context.write(GIVEN_POSES, GivenPoses(origin=poses.origin.name, region=poses.region))
+    numbers = _publish(context, model, cameras, unregistered, "known poses", matcher)
+    points, error = numbers["points"], numbers["mean_reprojection_error_px"]
     if points < FEW_POINTS * len(cameras):
         log.warning(
             "only %d points could be triangulated from the known poses of %d photos: they help training little",
@@ -189,30 +182,7 @@ def _from_known_poses(context: StageContext[SfmParams]) -> dict[str, Any]:
         )
     if error > DOUBTFUL_ERROR_PX:
         log.warning("the known poses fit the photos badly: a mean reprojection error of %.1f px", error)
-    _write_model(context, model)
-    context.write(GIVEN_POSES, GivenPoses(origin=poses.origin.name, region=poses.region))
-    registration = Registration(
-        registered=tuple(sorted(cameras)),
-        unregistered=unregistered,
-        mean_reprojection_error_px=error,
-        mean_track_length=model.compute_mean_track_length() if points else 0.0,
-        num_points=points,
-        mapper="known poses",
-        matcher=matcher,
-    )
-    context.write(REGISTRATION, registration)
-    context.progress(1, 1, "done")
-    return {
-        "registered": len(cameras),
-        "images": len(image_set.images),
-        "points": points,
-        "mean_reprojection_error_px": round(error, 3),
-        "mean_track_length": round(registration.mean_track_length, 2),
-        "models": 1,
-        "matcher": matcher,
-        "poses_from": poses.origin.name,
-        "focal_px": [round(camera.mean_focal_length(), 1) for camera in model.cameras.values()][:4],
-    }
+    return {**numbers, "poses_from": poses.origin.name}
 
 
 def _check_masks(image_set: ImageSet, params: SfmParams) -> None:
@@ -225,11 +195,15 @@ def _check_masks(image_set: ImageSet, params: SfmParams) -> None:
 
 
 @contextmanager
-def _quiet_glog(folder: Path) -> Iterator[None]:
-    """COLMAP's own log goes to files in `folder` instead of the terminal, and ours says where on failure."""
+def _working(context: StageContext[SfmParams]) -> Iterator[Path]:
+    """An empty folder for COLMAP, which is seeded; its own log goes to files in there instead of the terminal."""
     import pycolmap
 
-    folder.mkdir(parents=True, exist_ok=True)
+    work = context.scratch / "colmap"
+    shutil.rmtree(work, ignore_errors=True)  # a killed run may have left half a database
+    folder = work / "log"
+    folder.mkdir(parents=True)
+    pycolmap.set_random_seed(context.params.seed)
     settings = pycolmap.logging
     before = settings.logtostderr, settings.alsologtostderr, settings.stderrthreshold
     settings.logtostderr, settings.alsologtostderr = False, False
@@ -237,7 +211,7 @@ def _quiet_glog(folder: Path) -> Iterator[None]:
     for level in (settings.Level.INFO, settings.Level.WARNING, settings.Level.ERROR):
         settings.set_log_destination(level, str(folder / level.name.lower()))
     try:
-        yield
+        yield work
     finally:
         settings.logtostderr, settings.alsologtostderr, settings.stderrthreshold = before
 

@@ -9,18 +9,16 @@ import shutil
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any
+from typing import IO, Any
 
 import numpy as np
 
+from configs.training import TrainParams
 from stages import artifacts
 from stages.artifacts import FIELD, HELD_OUT, METRICS, PINHOLE_PHOTOS, PREVIEWS, SCENE, Pictures
 from stages.engine.stage import Stage, StageContext
 from stages.errors import ConfigError, InputError, ReconstructionError
 from stages.geometry.cameras import PinholeCameras
-
-if TYPE_CHECKING:
-    from configs.training import TrainParams
 
 log = logging.getLogger(__name__)
 
@@ -96,13 +94,10 @@ def run(context: StageContext[TrainParams]) -> dict[str, Any]:
 
 def _use_threads(context: StageContext[TrainParams]) -> None:
     """Torch and numba take as many threads as the run was given."""
+    import numba
     import torch
 
     torch.set_num_threads(context.workers)
-    try:
-        import numba
-    except ImportError:  # training goes without its kernels
-        return
     numba.set_num_threads(min(context.workers, numba.config.NUMBA_NUM_THREADS))
 
 

@@ -10,10 +10,11 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from configs.params import UndistortParams
 from stages.artifacts import (
     CAMERAS,
     GIVEN_POSES,
@@ -44,9 +45,6 @@ from stages.posing.undistortion import (
     warp_maps,
     warp_mask,
 )
-
-if TYPE_CHECKING:
-    from configs.params import UndistortParams
 
 PNG_COMPRESSION = 2  # of 9; twice as fast as the default for a few percent of size
 

@@ -61,13 +61,13 @@ def write_capture(
         for dot in at:
             distance = np.hypot(x - dot[0], y - dot[1])
             photo = np.maximum(photo, (255 * np.clip(3.5 - distance, 0, 1))[..., None].astype(np.uint8))
-        path = artifacts.image_path(ingest, name)
+        path = artifacts.Pictures(ingest).path(name)
         path.parent.mkdir(parents=True, exist_ok=True)
         assert cv2.imwrite(str(path), photo, [cv2.IMWRITE_JPEG_QUALITY, 100])
         if masks:
             center = pose[:, :3] @ (CENTER + shift) + pose[:, 3]
             miss = np.linalg.norm(center - (rays @ center)[:, None] * rays, axis=1)
-            path = artifacts.mask_path(ingest, name)
+            path = artifacts.Pictures(ingest).mask_path(name)
             path.parent.mkdir(parents=True, exist_ok=True)
             assert cv2.imwrite(str(path), (miss < BALL).reshape(HEIGHT, WIDTH).astype(np.uint8) * 255)
         records.append(ImageRecord(name, name, WIDTH, HEIGHT, None, "camera", 1.0, masks, str(i)))

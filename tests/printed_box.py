@@ -59,7 +59,7 @@ def ingested(folder: Path, photos: list[np.ndarray], focal: float | None = None)
     records = []
     for i, photo in enumerate(photos):
         name = f"{i:03d}.png"
-        path = artifacts.image_path(folder, name)
+        path = artifacts.Pictures(folder).path(name)
         path.parent.mkdir(parents=True, exist_ok=True)
         cv2.imwrite(str(path), cv2.cvtColor(photo, cv2.COLOR_GRAY2BGR))
         height, width = photo.shape

@@ -85,7 +85,7 @@ def full_inputs(context: StageContext) -> StageContext:
     inputs = context.inputs
     records = []
     for name in ("a.png", "b <odd>.png", "c.png"):
-        path = artifacts.image_path(inputs["ingest"], name)
+        path = artifacts.Pictures(inputs["ingest"]).path(name)
         path.parent.mkdir(exist_ok=True)
         write_png(path, np.full((30, 40, 3), 120, np.uint8))
         records.append(ImageRecord(name, name, 40, 30, None, "0", 5.0, False, "00"))
@@ -122,7 +122,7 @@ def full_inputs(context: StageContext) -> StageContext:
     artifacts.OVERVIEW.load(inputs["undistort"]).write_text(overview_svg(scene, region.box_corners()))
     artifacts.QUALITY.save(inputs["bake"], quality())
     artifacts.HELD_OUT.save(inputs["train"], ["a.png"])
-    write_png(artifacts.image_path(inputs["undistort"], "a.png"), np.full((16, 16, 3), 77, np.uint8))
+    write_png(artifacts.Pictures(inputs["undistort"]).path("a.png"), np.full((16, 16, 3), 77, np.uint8))
     return replace(context, manifests={name: manifest(name, faces=1234, share=0.123456) for name in REPORT.needs})
 
 

@@ -69,6 +69,6 @@ def write_undistorted(folder: Path, cameras: PinholeCameras, masks: bool = False
     artifacts.SCENE.save(folder, sphere_scene(cameras))
     for i, name in enumerate(cameras.names):
         photo, mask = render(cameras, i)
-        Image.fromarray(photo).save(artifacts.image_path(folder, name))
+        Image.fromarray(photo).save(artifacts.Pictures(folder).path(name))
         if masks:
-            Image.fromarray(mask).save(artifacts.mask_path(folder, name))
+            Image.fromarray(mask).save(artifacts.Pictures(folder).mask_path(name))

@@ -309,13 +309,13 @@ def test_the_mesh_is_scored_in_the_world_frame(here, monkeypatch):
     assert ablate.score_clean_mesh(folder, here / "shared", truth / "scan") is None
     (folder / "cleanup").mkdir(parents=True)
     corners = np.eye(3)
-    artifacts.save_mesh(folder / "cleanup", corners, np.array([[0, 1, 2]]))
+    artifacts.CLEAN_MESH.save(folder / "cleanup", (corners, np.array([[0, 1, 2]])))
     world = Similarity(2.0, np.eye(3), np.array([1.0, 0.0, 0.0]))
     monkeypatch.setattr(artifacts, "SCENE", SimpleNamespace(load=lambda _: SimpleNamespace(poses_from_scene=world)))
     seen = {}
 
     def score_mesh(mesh, model, where, known_stem):
-        seen["vertices"], seen["model"] = artifacts.load_mesh(mesh.parent)[0], model
+        seen["vertices"], seen["model"] = artifacts.CLEAN_MESH.load(mesh.parent)[0], model
         return {"mean": 1.0}
 
     monkeypatch.setattr("stages.evaluation.protocols.known_object.score_mesh", score_mesh)
@@ -324,6 +324,7 @@ def test_the_mesh_is_scored_in_the_world_frame(here, monkeypatch):
     assert seen["model"] == here / "shared" / "sfm" / "model"
 
 
+@pytest.mark.slow
 def test_a_scene_without_sparse_points_trains(tmp_path):
     from rigs import scene_without_points
     from sphere_scene import ring_of_cameras, write_undistorted

@@ -99,6 +99,7 @@ def test_no_texel_is_claimed_twice(layout):
     assert (count == 1).mean() > 0.3
 
 
+@pytest.mark.slow
 def test_charts_keep_their_distance(layout):
     from scipy.ndimage import distance_transform_edt
 
@@ -208,7 +209,7 @@ def run_stage(tmp_path, mesh, **params):
     cleanup, out = tmp_path / "cleanup", tmp_path / "out"
     cleanup.mkdir()
     out.mkdir()
-    artifacts.save_mesh(cleanup, *mesh)
+    artifacts.CLEAN_MESH.save(cleanup, mesh)
     context = StageContext({"cleanup": cleanup}, {}, out, tmp_path, AtlasParams(**params))
     return ATLAS_STAGE.run(context), artifacts.ATLAS.load(out)
 

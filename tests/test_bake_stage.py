@@ -47,7 +47,7 @@ def context(tmp_path, monkeypatch) -> StageContext:
         64,
     )
     artifacts.ATLAS.save(folders["atlas"], atlas)
-    artifacts.save_mesh(folders["cleanup"], atlas.vertices + 0.05 * atlas.normals, atlas.faces, artifacts.FULL_MESH)
+    artifacts.CLEAN_FULL_MESH.save(folders["cleanup"], (atlas.vertices + 0.05 * atlas.normals, atlas.faces))
     up = np.array([0.0, 0, 1])
     views = [look_at(np.array([x, -2.5, 0.2]), np.zeros(3), up, 48, 40, 40) for x in (-0.5, 0.6)]
     cameras = PinholeCameras(
@@ -58,7 +58,7 @@ def context(tmp_path, monkeypatch) -> StageContext:
     )
     artifacts.SCENE.save(folders["undistort"], scene_without_points(cameras))
     for name in cameras.names:
-        path = artifacts.image_path(folders["undistort"], name)
+        path = artifacts.Pictures(folders["undistort"]).path(name)
         path.parent.mkdir(parents=True, exist_ok=True)
         write_png(path, np.broadcast_to(SKY, (40, 48, 3)).copy())
     return StageContext(
@@ -128,7 +128,7 @@ def test_each_photo_is_read_and_its_depths_drawn_once(context, monkeypatch):
 
 def test_a_mask_hides_what_lies_outside_it(context):
     for name in ("one.png", "sub/two.png"):
-        path = artifacts.mask_path(context.inputs["undistort"], name)
+        path = artifacts.Pictures(context.inputs["undistort"]).mask_path(name)
         path.parent.mkdir(parents=True, exist_ok=True)
         write_png(path, np.zeros((40, 48), np.uint8))
     _, mask = context.read(artifacts.PINHOLE_PHOTOS).masked("sub/two.png")
@@ -138,13 +138,13 @@ def test_a_mask_hides_what_lies_outside_it(context):
 
 
 def test_an_image_that_cannot_be_read_is_named(context):
-    artifacts.image_path(context.inputs["undistort"], "sub/two.png").write_bytes(b"")
+    artifacts.Pictures(context.inputs["undistort"]).path("sub/two.png").write_bytes(b"")
     with pytest.raises(WorkspaceError, match=r"sub/two\.png cannot be read"):
         BAKE.run(context)
 
 
 def test_a_mask_that_cannot_be_read_is_named_and_not_ignored(context):
-    path = artifacts.mask_path(context.inputs["undistort"], "one.png")
+    path = artifacts.Pictures(context.inputs["undistort"]).mask_path("one.png")
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(b"no mask")
     with pytest.raises(WorkspaceError, match=r"one\.png\.png cannot be read") as caught:
@@ -153,7 +153,7 @@ def test_a_mask_that_cannot_be_read_is_named_and_not_ignored(context):
 
 
 def test_an_image_of_the_wrong_size_is_explained(context):
-    write_png(artifacts.image_path(context.inputs["undistort"], "one.png"), np.zeros((10, 10, 3), np.uint8))
+    write_png(artifacts.Pictures(context.inputs["undistort"]).path("one.png"), np.zeros((10, 10, 3), np.uint8))
     with pytest.raises(ReconstructionError, match=r"photo one\.png: expected shape \(40, 48, 3\)"):
         BAKE.run(context)
 
@@ -161,7 +161,7 @@ def test_an_image_of_the_wrong_size_is_explained(context):
 def test_photos_that_were_held_out_are_not_in_the_texture(context):
     import cv2
 
-    path = artifacts.image_path(context.inputs["undistort"], "sub/two.png")
+    path = artifacts.Pictures(context.inputs["undistort"]).path("sub/two.png")
     write_png(path, np.broadcast_to(255 - SKY, (40, 48, 3)).copy())
     artifacts.HELD_OUT.save(context.inputs["train"], ["sub/two.png"])
     numbers = BAKE.run(context)

@@ -103,7 +103,7 @@ def test_a_scene_of_every_suite_comes_to_its_undistorted_photos_without_its_test
         in_poses = posed_scene.poses_from_scene.apply(posed_scene.cameras.centers[i])
         np.testing.assert_allclose(in_poses, true.centers[number], atol=1e-5)
     if suite == "nerf-synthetic":  # alpha is the mask
-        assert artifacts.load_mask(place / "undistort", posed_scene.cameras.names[0]) is not None
+        assert artifacts.Pictures(place / "undistort").mask(posed_scene.cameras.names[0]) is not None
 
 
 def test_one_json_a_run_with_settings_costs_and_scores(data: Path):
@@ -196,7 +196,7 @@ def test_a_mesh_is_scored_in_the_frame_of_its_poses_whatever_gps_made_of_the_wor
     artifacts.PLACE.save(workspace.stage_folder("place"), moved)
     artifacts.SCENE.save(workspace.stage_folder("undistort"), scene)
     corners = np.eye(3)
-    artifacts.save_mesh(workspace.stage_folder("cleanup"), corners, np.array([[0, 1, 2]]))
+    artifacts.CLEAN_MESH.save(workspace.stage_folder("cleanup"), (corners, np.array([[0, 1, 2]])))
     world = scene.world_from_scene(moved).apply(corners)
     ours = result_mesh(workspace, {"cleanup"}, tmp_path / "ours.ply")
     assert ours is not None

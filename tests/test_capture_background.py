@@ -111,8 +111,8 @@ def test_ingest_makes_masks_where_asked_and_leaves_out_the_odd_photo(tmp_path: P
     image_set, out, numbers = ingest(tmp_path / "photos", auto_mask="plain")
     assert numbers["masks"] == numbers["images"] == 11
     assert [(item.source, item.reason) for item in image_set.skipped] == [("011.png", "its background is not plain")]
-    assert not artifacts.image_path(out, "011.png").exists()
-    mask = artifacts.load_mask(out, "003.png")
+    assert not artifacts.Pictures(out).path("011.png").exists()
+    mask = artifacts.Pictures(out).mask("003.png")
     assert mask is not None
     assert iou(mask > 0, truths[3]) > OUTLINE
 

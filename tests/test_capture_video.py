@@ -112,7 +112,7 @@ def test_ingest_takes_videos_as_one_camera_each(tmp_path: Path, alone: bool):
     assert numbers["images"] == (5 if alone else 10)
     assert numbers["cameras"] == numbers["videos"] == (1 if alone else 2)
     assert all(record.name.startswith(("clip.mp4/", "other.mp4/")) for record in image_set.images)
-    assert all(artifacts.image_path(out, record.name).is_file() for record in image_set.images)
+    assert all(artifacts.Pictures(out).path(record.name).is_file() for record in image_set.images)
     assert [item.source for item in image_set.skipped] == ([] if alone else ["bad.mov"])
 
 

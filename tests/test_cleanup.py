@@ -47,12 +47,12 @@ def stage(tmp_path):
         cameras = three_rings()
         artifacts.SCENE.save(undistort, replace(scene_without_points(cameras), **(scene_extras or {})))
         artifacts.GIVEN_REGION.save(place, region)
-        artifacts.save_mesh(extract, vertices, faces)
+        artifacts.RAW_MESH.save(extract, (vertices, faces))
         if masks is not None:
             import cv2
 
             for index, mask in masks(cameras):
-                path = artifacts.mask_path(undistort, cameras.names[index])
+                path = artifacts.Pictures(undistort).mask_path(cameras.names[index])
                 path.parent.mkdir(exist_ok=True)
                 cv2.imwrite(str(path), mask.astype(np.uint8) * 255)
         context = StageContext(
@@ -62,7 +62,7 @@ def stage(tmp_path):
             scratch=tmp_path,
             params=CleanupParams(**params),
         )
-        return CLEANUP.run(context), *artifacts.load_mesh(out)
+        return CLEANUP.run(context), *artifacts.CLEAN_MESH.load(out)
 
     return run
 
@@ -362,6 +362,7 @@ def test_stage_removes_the_ground_on_request(stage, keep_closed):
     assert numbers["watertight"] == keep_closed
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("cut", "params"),
     [

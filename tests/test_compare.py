@@ -58,6 +58,7 @@ def test_the_command_tells_numbers_and_writes_the_map(tmp_path, monkeypatch, cap
     assert "F-score" in out
 
 
+@pytest.mark.slow
 def test_it_is_evaluate_mesh_by_another_name(tmp_path, monkeypatch, capsys):
     for name, radius in (("a.ply", 1.0), ("b.ply", 1.1)):
         trimesh.Trimesh(*sphere(radius), process=False).export(tmp_path / name)

@@ -23,7 +23,7 @@ from stages.engine.manifest import MANIFEST, Manifest, ManifestDamaged, OutputFi
 from stages.engine.resources import ResourceMeter
 from stages.engine.runner import StageOutcome, run_pipeline
 from stages.engine.stage import StageContext
-from stages.engine.status import pipeline_status
+from stages.engine.status import StageStatus, pipeline_status
 from stages.engine.workspace import FORMAT, Workspace
 from stages.errors import ConfigError, HineusError, InputError, SystemRequirementError, WorkspaceError
 
@@ -571,3 +571,9 @@ def test_a_workspace_of_the_first_version_goes_on(bench: Bench) -> None:
     for path in bench.photos.iterdir():
         path.write_text("other" + path.name)
     assert list(bench.ran()) == ["ingest", "sfm", "undistort"]
+
+
+def test_many_reasons_are_counted() -> None:
+    assert StageStatus("sfm", "stale", ("a", "b", "c")).reason == "a; b; c"
+    assert StageStatus("sfm", "stale", ("a", "b", "c", "d", "e")).reason == "a; b; c; and 2 more"
+    assert StageStatus("sfm", "fresh").reason == "nothing changed"

@@ -36,7 +36,7 @@ def stage(tmp_path, monkeypatch):
             params=ExtractParams(**params),
             progress=lambda done, total, note="": seen.append((done, total)),
         )
-        return EXTRACT.run(context), *artifacts.load_mesh(out), seen
+        return EXTRACT.run(context), *artifacts.RAW_MESH.load(out), seen
 
     return run
 

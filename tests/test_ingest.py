@@ -15,6 +15,7 @@ from configs.params import IngestParams
 from stages import artifacts
 from stages.artifacts import ImageSet
 from stages.capture.exif import DIAGONAL_35MM
+from stages.capture.inspection import inspect_file
 from stages.capture.photo_reading import register_formats
 from stages.engine.stage import StageContext
 from stages.errors import InputError
@@ -96,7 +97,7 @@ def test_plain_photo_is_copied_byte_for_byte_under_its_name(photos: Path, suffix
     assert [record.name for record in image_set.images] == [*names, f"left/{names[0]}"]
     assert numbers["images"] == 4
     for record in image_set.images:
-        assert artifacts.image_path(out, record.name).read_bytes() == (photos / record.source).read_bytes()
+        assert artifacts.Pictures(out).path(record.name).read_bytes() == (photos / record.source).read_bytes()
         assert (record.width, record.height) == SIZE
 
 
@@ -125,7 +126,7 @@ def test_exif_orientation_is_applied_and_gone(photos: Path, orientation: int):
     record = image_set.images[-1]
     assert record.name == "turned.jpg"
     assert (record.width, record.height) == SIZE
-    with Image.open(artifacts.image_path(out, record.name)) as written:
+    with Image.open(artifacts.Pictures(out).path(record.name)) as written:
         assert written.getexif().get(0x0112, 1) == 1
         difference = np.abs(np.asarray(written, dtype=int) - np.asarray(upright, dtype=int))
     assert difference.mean() < 4  # JPEG twice; a wrong turn differs by about 60
@@ -143,10 +144,10 @@ def test_formats_colmap_cannot_read_are_encoded_anew(photos: Path):
     names = {record.source: record.name for record in image_set.images}
     assert names["web.webp"] == "web.jpg"
     for record in image_set.images:
-        with Image.open(artifacts.image_path(out, record.name)) as written:
+        with Image.open(artifacts.Pictures(out).path(record.name)) as written:
             assert written.mode == "RGB"
             assert written.size == SIZE
-    with Image.open(artifacts.image_path(out, "deep.png")) as written:
+    with Image.open(artifacts.Pictures(out).path("deep.png")) as written:
         assert np.asarray(written).max() == 96 * 72 * 9 // 257  # scaled to 8 bits, not clipped
 
 
@@ -164,7 +165,7 @@ def test_formats_of_phones_are_read_upright_with_their_exif(photos: Path, suffix
     assert (record.name, record.width, record.height) == ("z.jpg", *SIZE)
     assert record.focal_px == pytest.approx(28 / DIAGONAL_35MM * 120)
     assert numbers["with_focal"] == 1
-    with Image.open(artifacts.image_path(out, record.name)) as written:
+    with Image.open(artifacts.Pictures(out).path(record.name)) as written:
         difference = np.abs(np.asarray(written, dtype=int) - np.asarray(upright, dtype=int))
     assert difference.mean() < 6
 
@@ -176,7 +177,7 @@ def test_another_format_under_the_name_of_a_jpeg_is_encoded_anew(photos: Path, k
     picture(7).save(photos / "z.jpg", format=kind)
     image_set, out, _ = ingest(photos)
     assert image_set.images[-1].name == "z.jpg"
-    with Image.open(artifacts.image_path(out, "z.jpg")) as written:
+    with Image.open(artifacts.Pictures(out).path("z.jpg")) as written:
         assert written.format == "JPEG"
 
 
@@ -192,7 +193,7 @@ def test_sixteen_bits_a_channel_become_eight(photos: Path):
     assert not image_set.skipped
     for name in ("deep.png", "deep.tif"):
         source = next(record for record in image_set.images if record.source == name)
-        with Image.open(artifacts.image_path(out, source.name)) as written:
+        with Image.open(artifacts.Pictures(out).path(source.name)) as written:
             assert written.mode == "RGB"
             shade = colours[:, ::-1] if name == "deep.tif" else colours
             assert np.abs(np.asarray(written, dtype=int) - shade).max() <= 1
@@ -233,7 +234,9 @@ def test_raw_files_are_developed_alike_and_upright(photos: Path):
     records = {record.source: record for record in image_set.images}
     assert (records["dark.dng"].width, records["dark.dng"].height) == (96, 128)
     assert records["bright.dng"].camera.startswith("Test Camera")
-    means = [np.asarray(Image.open(artifacts.image_path(out, f"{name}.png"))).mean() for name in ("bright", "dark")]
+    head = inspect_file(photos / "dark.dng", "dark.dng")  # undeveloped
+    assert (head.width, head.height, head.camera) == (96, 128, records["dark.dng"].camera)
+    means = [np.asarray(Image.open(artifacts.Pictures(out).path(f"{name}.png"))).mean() for name in ("bright", "dark")]
     assert means[0] / means[1] == pytest.approx(2 ** (1 / 2.222), rel=0.1)  # one stop apart: no automatic brightness
 
 
@@ -420,7 +423,7 @@ def test_masks_are_found_by_name(photos: Path, pattern: str, value: int):
     image_set, out, numbers = ingest(photos, masks)
     assert numbers["masks"] == 3
     assert all(record.has_mask for record in image_set.images)
-    written = np.asarray(Image.open(artifacts.mask_path(out, names[0])))
+    written = np.asarray(Image.open(artifacts.Pictures(out).mask_path(names[0])))
     np.testing.assert_array_equal(written, half_mask())
 
 
@@ -437,7 +440,7 @@ def test_mask_is_reduced_and_turned_with_its_photo(photos: Path):
     masks = write_masks(photos.parent / "masks", ["000.jpg", "001.jpg", "z.jpg"])  # drawn on the stored pixels
     image_set, out, _ = ingest(photos, masks, max_side=72)
     assert (image_set.images[-1].width, image_set.images[-1].height) == (54, 72)
-    written = np.asarray(Image.open(artifacts.mask_path(out, "z.jpg")))
+    written = np.asarray(Image.open(artifacts.Pictures(out).mask_path("z.jpg")))
     assert written.shape == (72, 54)
     assert written[:, -20:].min() == 255  # the stored top is the upright right
     assert written[:, :20].max() == 0
@@ -454,8 +457,8 @@ def test_alpha_channel_is_the_mask(photos: Path):
     image_set, out, numbers = ingest(photos)
     assert numbers["masks"] == 3
     assert [record.has_mask for record in image_set.images] == [True, True, True, False]
-    np.testing.assert_array_equal(np.asarray(Image.open(artifacts.mask_path(out, "0.png"))), half_mask())
-    assert Image.open(artifacts.image_path(out, "0.png")).mode == "RGB"
+    np.testing.assert_array_equal(np.asarray(Image.open(artifacts.Pictures(out).mask_path("0.png"))), half_mask())
+    assert Image.open(artifacts.Pictures(out).path("0.png")).mode == "RGB"
 
 
 def test_missing_masks(photos: Path):

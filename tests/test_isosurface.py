@@ -74,6 +74,7 @@ def test_topology(field, characteristic):
     assert euler(mesh) == characteristic
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("resolution", [80, 100])
 def test_blocks_of_any_size_give_the_same_mesh(resolution):
     meshes = [extract_isosurface(plane_and_ball, resolution, block=b) for b in (24, 64, 256)]

@@ -158,7 +158,7 @@ def bench_of(capture: Capture, root: Path) -> Workbench:
     """A workbench whose database is that of the capture; its photos are black."""
     names = [capture.truth.images[i].name for i in capture.ids]
     for name in names:
-        artifacts.write_png(artifacts.image_path(root, name), np.zeros((768, 1024), np.uint8))
+        artifacts.write_png(artifacts.Pictures(root).path(name), np.zeros((768, 1024), np.uint8))
     records = tuple(ImageRecord(name, name, 1024, 768, None, "camera", 1.0, False, name) for name in names)
     (root / "work").mkdir()
     bench = Workbench(

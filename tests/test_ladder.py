@@ -201,8 +201,8 @@ def workbench(tmp_path: Path, focal: float | None = None, **params: object):
     mask[:, :80] = 255
     for name in ("a b.png", "c.png", "d.png"):
         grey = noise.integers(0, 256, (30, 40), dtype=np.uint8)
-        artifacts.write_png(artifacts.image_path(tmp_path, name), cv2.resize(grey, (160, 120)))
-        artifacts.write_png(artifacts.mask_path(tmp_path, name), mask)
+        artifacts.write_png(artifacts.Pictures(tmp_path).path(name), cv2.resize(grey, (160, 120)))
+        artifacts.write_png(artifacts.Pictures(tmp_path).mask_path(name), mask)
         records.append(ImageRecord(name, name, 160, 120, focal, "camera", 1.0, True, name))
     work = tmp_path / "work"
     work.mkdir()

@@ -308,7 +308,7 @@ def test_nero(tmp_path: Path):
     assert_reprojects(poses, pinhole, [f"{i}.png" for i in range(NUM)])
     image_set = ingested(data, tmp_path / "out", masks=data, poses=data)
     assert [record.name for record in image_set.images] == [f"{i}.png" for i in range(NUM)]
-    mask = artifacts.load_mask(tmp_path / "out", "2.png")
+    mask = artifacts.Pictures(tmp_path / "out").mask("2.png")
     assert mask is not None
     expected = np.zeros((HEIGHT, WIDTH), np.uint8)
     expected[50:150, 60:160] = 255

@@ -11,14 +11,14 @@ import cv2
 import numpy as np
 import psutil
 import pytest
-from PIL import Image, ImageFilter
+from PIL import Image, ImageFile, ImageFilter
 from typer.testing import CliRunner, Result
 
 from configs.load import load_config
 from hineus_cli.app import app
 from stages import preflight as module
 from stages import reconstruct
-from stages.capture.preflight import Inspection, Video, glance, inspect
+from stages.capture.inspection import Inspection, Video, inspect, inspect_file
 from stages.preflight import GIB, estimate, preflight
 
 SIZE = (320, 240)
@@ -56,7 +56,7 @@ def check(*arguments: str) -> Result:
 
 
 def look(folder: Path) -> Inspection:
-    return inspect(folder, None, video_frames=80, workers=2)
+    return inspect(folder, None, video_frames=80, workers=2, decode=True)
 
 
 # ---------------------------------------------------------------- what is noticed
@@ -69,18 +69,18 @@ def test_good_photos_are_a_go(photos: Path):
 
 def test_blurred_photos_are_named(photos: Path):
     picture(30).filter(ImageFilter.GaussianBlur(2)).save(photos / "shaken.jpg")
-    assert look(photos).blurred == ("shaken.jpg",)
+    assert look(photos).oddities.blurred == ("shaken.jpg",)
 
 
 def test_dark_and_light_photos_are_named(photos: Path):
     picture(30, light=0.3).save(photos / "x_dark.jpg")
     picture(31, light=1.1).save(photos / "y_usual.jpg")
-    assert look(photos).badly_exposed == ("x_dark.jpg",)
+    assert look(photos).oddities.badly_exposed == ("x_dark.jpg",)
 
 
 def test_the_same_picture_twice_is_named_with_its_twin(photos: Path):
     picture(3).save(photos / "again.jpg", quality=60)
-    assert look(photos).alike == (("03.jpg", "again.jpg"),)
+    assert look(photos).oddities.alike == (("03.jpg", "again.jpg"),)
 
 
 def test_exif_and_size_are_those_of_the_upright_photo(photos: Path):
@@ -89,11 +89,11 @@ def test_exif_and_size_are_those_of_the_upright_photo(photos: Path):
     exif.get_ifd(0x8769)[0xA405] = 28
     large = picture(40).resize((2400, 1800))  # large enough to be decoded smaller
     large.save(photos / "z.jpg", exif=exif)
-    seen = glance(photos / "z.jpg", "z.jpg")
+    seen = inspect_file(photos / "z.jpg", "z.jpg")
     assert (seen.width, seen.height) == (1800, 2400)
     assert seen.camera == "Phone | 28 mm equivalent | 1800 x 2400"
     assert seen.has_focal
-    assert not glance(photos / "00.jpg", "00.jpg").has_focal
+    assert not inspect_file(photos / "00.jpg", "00.jpg").has_focal
 
 
 def test_damaged_files_are_told_with_the_reason_and_other_files_are_no_warning(photos: Path, capfd):
@@ -156,7 +156,7 @@ def test_missing_folder(photos: Path):
 # ---------------------------------------------------------------- what it needs
 def test_needs_grow_with_photos_as_measured():
     def of(count: int, side: int, workers: int = 2, **sets: object):
-        seen = Inspection((), (Video("clip.mp4", count, side, side),), (), (), (), (), False, 0)
+        seen = Inspection((), (Video("clip.mp4", count, side, side),), (), 0)
         config = load_config("cpu", sets=[f"{key}={value}" for key, value in sets.items()])
         return estimate(seen, config, "cpu", workers)
 
@@ -173,7 +173,7 @@ def test_needs_grow_with_photos_as_measured():
 
 
 def test_nothing_is_said_of_the_time_on_a_gpu(photos: Path):
-    done = preflight(photos, None, photos.parent, load_config("gpu"), "cuda", 2)
+    done = preflight(photos, None, photos.parent, load_config("gpu"), "cuda", 2, decode=False)
     assert done.needs.minutes is None
     assert "not measured" in dict(module.facts(done))["needs"]
 
@@ -189,3 +189,19 @@ def test_a_run_begins_with_it_in_short(photos: Path, monkeypatch: pytest.MonkeyP
     again = CliRunner().invoke(app, ["run", "photos", "--until", "ingest"])
     assert "25 photos, 1 camera" not in again.stderr
     shutil.rmtree(photos.parent / "photos_hineus")
+
+
+def test_a_run_decodes_each_photo_once(photos: Path, monkeypatch: pytest.MonkeyPatch):
+    picture(30).save(photos / "z.png")
+    monkeypatch.chdir(photos.parent)
+    decoded: list[str] = []
+    load = ImageFile.ImageFile.load
+
+    def counted(image: ImageFile.ImageFile):
+        if image.tile:  # what is still to be decoded
+            decoded.append(Path(image.filename).name)
+        return load(image)
+
+    monkeypatch.setattr(ImageFile.ImageFile, "load", counted)
+    assert CliRunner().invoke(app, ["run", "photos", "--until", "ingest"]).exit_code == 0
+    assert sorted(decoded) == sorted(file.name for file in photos.iterdir())

@@ -154,7 +154,7 @@ def test_a_report_from_almost_nothing(context):
 
 def test_damaged_inputs_are_left_out(full):
     full = replace(full, manifests={name: full.manifests[name] for name in full.manifests if name != "train"})
-    artifacts.image_path(full.inputs["ingest"], "c.png").write_text("not an image")
+    artifacts.Pictures(full.inputs["ingest"]).path("c.png").write_text("not an image")
     artifacts.PROVENANCE.load(full.inputs["bake"]).write_text("not an image")
     html = page(full)
     assert "<td>train</td>" not in html

@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from benchmarks.synthetic import capture, city, objects, scenes
+from benchmarks.synthetic import capture, city, objects, scenes, shapes
 from benchmarks.synthetic.capture import Order, develop, make
 from benchmarks.synthetic.check import check
 from benchmarks.synthetic.model import Ground, Part, Scene, plain
@@ -34,22 +34,22 @@ def _small_scene(rng, num_photos):
 # ---------------------------------------------------------------- shapes
 def test_distances_of_simple_shapes():
     points = np.array([[2.0, 0, 0], [0, 0.1, 0], [0, 0, 3.0]])
-    np.testing.assert_allclose(implicit.box(points, (0, 0, 0), (2, 2, 2)), [1.0, -0.9, 2.0])
+    np.testing.assert_allclose(shapes.box(points, (0, 0, 0), (2, 2, 2)), [1.0, -0.9, 2.0])
     np.testing.assert_allclose(implicit.tube(points, [(0, 0, 0), (0, 0, 2)], (0.5, 0.5)), [1.5, -0.4, 0.5])
-    np.testing.assert_allclose(implicit.cylinder(points, (0, 0, 0), 2, 1.0, 4.0), [1.0, -0.9, 1.0])
-    hollow = implicit.without(implicit.box(points, (0, 0, 0), (2, 2, 2)), implicit.box(points, (0, 0, 0), (1, 1, 1)))
+    np.testing.assert_allclose(shapes.cylinder(points, (0, 0, 0), 2, 1.0, 4.0), [1.0, -0.9, 1.0])
+    hollow = shapes.without(shapes.box(points, (0, 0, 0), (2, 2, 2)), shapes.box(points, (0, 0, 0), (1, 1, 1)))
     assert list(hollow > 0) == [True, True, True]
 
 
 def test_a_turned_profile_is_as_far_as_its_curve():
     angle = np.linspace(-np.pi / 2, np.pi / 2, 20)
-    sphere = implicit.profile(np.stack([np.cos(angle), np.sin(angle)], 1))
+    sphere = shapes.profile(np.stack([np.cos(angle), np.sin(angle)], 1))
     points = np.random.default_rng(0).uniform(-0.8, 0.8, (200, 3))
     np.testing.assert_allclose(sphere(points), np.abs(np.linalg.norm(points, axis=1) - 1), atol=5e-3)
 
 
 def test_meshes_face_outwards_and_have_the_shapes_normals():
-    vertices, faces, normals = implicit.mesh_of(
+    vertices, faces, normals = shapes.mesh_of(
         lambda points: np.linalg.norm(points, axis=1) - 0.4, (-0.5, -0.5, -0.5), (0.5, 0.5, 0.5), 0.05
     )
     np.testing.assert_allclose(np.linalg.norm(vertices, axis=1), 0.4, atol=2e-3)

@@ -104,7 +104,7 @@ def test_masks_for_some_photos_are_said_to_be_ignored(tmp_path, caplog):
     cameras = ring_of_cameras()
     write_undistorted(folder, cameras, masks=True)
     assert len(list(train._load_images(artifacts.Pictures(folder), cameras.names)[1])) == 8
-    artifacts.mask_path(folder, cameras.names[0]).unlink()
+    artifacts.Pictures(folder).mask_path(cameras.names[0]).unlink()
     assert train._load_images(artifacts.Pictures(folder), cameras.names)[1] is None
     assert "only 7 of 8 photos have a mask" in caplog.text
 

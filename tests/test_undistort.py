@@ -53,7 +53,7 @@ def test_points_appear_where_the_scene_cameras_project_them(
     assert scene.cameras.sizes.max() <= max_side
     np.testing.assert_allclose(world_from(scene, tmp_path).apply(scene.points.astype(float)), DOTS, atol=1e-5)
     for i, name in enumerate(scene.cameras.names):
-        photo = cv2.imread(str(artifacts.image_path(out, name)), cv2.IMREAD_GRAYSCALE)
+        photo = cv2.imread(str(artifacts.Pictures(out).path(name)), cv2.IMREAD_GRAYSCALE)
         assert photo.shape[::-1] == tuple(scene.cameras.sizes[i])
         pixels, depth = scene.cameras.project(i, scene.points)
         assert depth.min() > 0
@@ -68,10 +68,10 @@ def test_image_pixels_all_come_from_the_photo(tmp_path: Path):
     inputs = write_capture(tmp_path, *MODELS[1], masks=False)
     white = np.full((HEIGHT, WIDTH, 3), 255, np.uint8)
     for i in range(NUM_CAMERAS):
-        cv2.imwrite(str(artifacts.image_path(inputs["ingest"], f"photo_{i}.jpg")), white)
+        cv2.imwrite(str(artifacts.Pictures(inputs["ingest"]).path(f"photo_{i}.jpg")), white)
     scene, out, _ = undistort(inputs, tmp_path)
     for name in scene.cameras.names:
-        assert cv2.imread(str(artifacts.image_path(out, name))).min() == 255
+        assert cv2.imread(str(artifacts.Pictures(out).path(name))).min() == 255
 
 
 @pytest.mark.slow
@@ -84,7 +84,7 @@ def test_masks_are_warped_by_the_same_maps(tmp_path: Path, model_name: str, para
     center = world_from(scene, tmp_path).inverse().apply(CENTER)
     radius = BALL / world_from(scene, tmp_path).scale
     for i, name in enumerate(scene.cameras.names):
-        mask = cv2.imread(str(artifacts.mask_path(out, name)), cv2.IMREAD_UNCHANGED)
+        mask = cv2.imread(str(artifacts.Pictures(out).mask_path(name)), cv2.IMREAD_UNCHANGED)
         assert mask.shape[::-1] == tuple(scene.cameras.sizes[i])
         assert set(np.unique(mask)) == {0, 255}
         expected = ball_mask(scene.cameras, i, center, radius)
@@ -107,7 +107,7 @@ def test_masks_set_the_region_and_shrink_by_the_erosion(tmp_path: Path):
     assert 0.6 < BALL / world_from(scene, tmp_path).scale < 0.95
     assert np.linalg.norm(world_from(scene, tmp_path).inverse().apply(CENTER)) < 0.1
     i, name = 0, scene.cameras.names[0]
-    mask = cv2.imread(str(artifacts.mask_path(out, name)), cv2.IMREAD_UNCHANGED) > 0
+    mask = cv2.imread(str(artifacts.Pictures(out).mask_path(name)), cv2.IMREAD_UNCHANGED) > 0
     full = ball_mask(
         scene.cameras, i, world_from(scene, tmp_path).inverse().apply(CENTER), BALL / world_from(scene, tmp_path).scale
     )
@@ -256,7 +256,7 @@ def draw_markers(inputs: dict[str, Path], side: float) -> None:
         source = np.array([[0, 0], [280, 0], [280, 280], [0, 280.0]]) - 0.5
         H = cv2.getPerspectiveTransform(source.astype(np.float32), target.astype(np.float32))
         photo = cv2.warpPerspective(page, H, (WIDTH, HEIGHT), flags=cv2.INTER_AREA, borderValue=90)
-        assert cv2.imwrite(str(artifacts.image_path(inputs["ingest"], f"photo_{i}.jpg")), photo)
+        assert cv2.imwrite(str(artifacts.Pictures(inputs["ingest"]).path(f"photo_{i}.jpg")), photo)
 
 
 def test_a_marker_gives_the_scale_with_its_error(tmp_path: Path):

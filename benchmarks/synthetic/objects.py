@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from benchmarks.synthetic.model import Paint, Part, plain
+from benchmarks.synthetic.shapes import box, cylinder, mesh_of, profile, without
 from stages.scenes.figurine import make_figurine
-from stages.scenes.implicit import box, cylinder, ellipsoid, mesh_of, profile, tube, union, without
+from stages.scenes.implicit import ellipsoid, tube, union
 from stages.scenes.noise import ValueNoise
 
 CELL = 1 / 240  # of the grid that shapes are meshed from: about one and a half pixels of the photos

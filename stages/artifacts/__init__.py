@@ -10,8 +10,8 @@ from stages.artifacts.bake import BASE_COLOR, NORMAL_MAP, OCCLUSION, PROVENANCE,
 from stages.artifacts.export import ASSET, asset_path, collision_path, lod_path, obj_normal_map_path
 from stages.artifacts.ingest import IMAGE_SET, PHOTOS, ImageRecord, ImageSet, SkippedImage
 from stages.artifacts.json_files import read_json, write_json
-from stages.artifacts.mesh import CLEAN_FULL_MESH, CLEAN_MESH, FULL_MESH, MESH, RAW_MESH, load_mesh, save_mesh
-from stages.artifacts.pictures import IMAGES, MASKS, Pictures, image_path, load_image, load_mask, mask_path, write_png
+from stages.artifacts.mesh import CLEAN_FULL_MESH, CLEAN_MESH, RAW_MESH
+from stages.artifacts.pictures import IMAGES, MASKS, Pictures, write_png
 from stages.artifacts.place import GIVEN_REGION, PLACE
 from stages.artifacts.report import PAGE
 from stages.artifacts.sfm import GIVEN_POSES, MODEL, REGISTRATION, GivenPoses, KnownSphere, Registration, Unregistered

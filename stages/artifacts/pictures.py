@@ -18,11 +18,7 @@ IMAGES, MASKS = "images", "masks"
 
 @dataclass(frozen=True)
 class Pictures:
-    """Pictures of a stage and their masks, each read when asked for.
-
-    Attributes:
-        folder: of the stage.
-    """
+    """The pictures in a stage's folder and their masks, each read when asked for."""
 
     folder: Path
 
@@ -37,70 +33,54 @@ class Pictures:
         return self.folder / MASKS
 
     def path(self, name: str) -> Path:
-        return image_path(self.folder, name)
+        return self.images / name
 
     def mask_path(self, name: str) -> Path:
-        return mask_path(self.folder, name)
+        """Where the mask of image `name` lies; may not exist."""
+        return self.masks / f"{name}.png"
 
     def image(self, name: str) -> np.ndarray:
-        """See `load_image`."""
-        return load_image(self.folder, name)
+        """Image `name`: [H, W, 3] uint8 RGB.
+
+        Raises:
+            WorkspaceError: it cannot be read.
+        """
+        import cv2
+
+        # the pixels are upright already, whatever their EXIF says
+        pixels = self._read("image", self.path(name), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+        return cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB)
 
     def mask(self, name: str) -> np.ndarray | None:
-        """See `load_mask`."""
-        return load_mask(self.folder, name)
+        """The mask of image `name`: [H, W] uint8, 255 on the object; None where it has none.
+
+        Raises:
+            WorkspaceError: it is there but cannot be read.
+        """
+        import cv2
+
+        path = self.mask_path(name)
+        return self._read("mask", path, cv2.IMREAD_GRAYSCALE) if path.exists() else None
 
     def masked(self, name: str) -> tuple[np.ndarray, np.ndarray | None]:
         """Image [H, W, 3] uint8 RGB and its mask [H, W] bool, or None where there is no mask."""
         mask = self.mask(name)
         return self.image(name), None if mask is None else mask > 127
 
+    def _read(self, what: str, path: Path, flags: int) -> np.ndarray:
+        import cv2
+
+        pixels = cv2.imread(str(path), flags)
+        if pixels is None:
+            raise WorkspaceError(
+                f"The {what} {path} cannot be read.", f"Make it again: `hineus run PHOTOS --force {self.folder.name}`."
+            )
+        return pixels
+
 
 def pictures_of(stage: str) -> Artifact[Pictures]:
     """The pictures and masks that `stage` publishes."""
     return in_folder(stage, (f"{IMAGES}/*", f"{MASKS}/*"), Pictures)
-
-
-def image_path(folder: Path, name: str) -> Path:
-    """A stage's image `name` (ingest: upright photo, undistort: pinhole image)."""
-    return folder / IMAGES / name
-
-
-def mask_path(folder: Path, name: str) -> Path:
-    """The mask of image `name`: 8-bit PNG, 255 on the object, same size as the image. May not exist."""
-    return folder / MASKS / f"{name}.png"
-
-
-def load_image(folder: Path, name: str) -> np.ndarray:
-    """A stage's image `name`: [H, W, 3] uint8 RGB.
-
-    Raises:
-        WorkspaceError: it cannot be read.
-    """
-    import cv2
-
-    # the pixels are upright already, whatever their EXIF says
-    pixels = cv2.imread(str(image_path(folder, name)), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-    if pixels is None:
-        raise _unreadable("image", image_path(folder, name), folder)
-    return cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB)
-
-
-def load_mask(folder: Path, name: str) -> np.ndarray | None:
-    """The mask of image `name`: [H, W] uint8, 255 on the object; None where it has none.
-
-    Raises:
-        WorkspaceError: it is there but cannot be read.
-    """
-    import cv2
-
-    path = mask_path(folder, name)
-    if not path.exists():
-        return None
-    mask = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-    if mask is None:
-        raise _unreadable("mask", path, folder)
-    return mask
 
 
 def write_png(path: Path, pixels: np.ndarray, compression: int | None = None) -> None:
@@ -115,9 +95,3 @@ def write_png(path: Path, pixels: np.ndarray, compression: int | None = None) ->
     _, encoded = cv2.imencode(".png", data, options)
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(encoded.tobytes())
-
-
-def _unreadable(what: str, path: Path, folder: Path) -> WorkspaceError:
-    return WorkspaceError(
-        f"The {what} {path} cannot be read.", f"Make it again: `hineus run PHOTOS --force {folder.name}`."
-    )

@@ -18,6 +18,7 @@ NEAR = 8.0  # a border pixel this near to the background's colour belongs to it
 PLAIN_SHARE = 0.85  # cloth: 0.95 to 1.00 of the border is near; scenes: 0.01 to 0.61
 GRAIN_SCALE = 4.0  # grain is what differs from a blur of this many pixels
 MAX_GRAIN = 1.7  # its median; cloth: 0.84 to 1.11, carpet: 2.3 to 5.7
+PLAIN_PHOTOS = 0.9  # this part of the photos must have a plain background before masks are made from it
 TRIM, FITS = 0.8, 4  # each fit leaves out the fifth of the border that the last one met worst: the object, marks
 MIN_THRESHOLD, MAX_THRESHOLD = 6.0, 14.0  # of the distance that separates: noise of a phone; what a shadow may add
 SHADOW = 15.0  # the object's shadow is darker than the border by so much in L: black cloth's is as black as can be

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from stages.artifacts import SkippedImage
 from stages.capture.photo_reading import PHOTO_SUFFIXES, RAW_SUFFIXES
 from stages.errors import InputError
 
+NAMED = 4  # this many files are named in a sentence
 VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".avi", ".mkv", ".m4v", ".webm", ".mts", ".3gp"})
 
 
@@ -68,3 +70,17 @@ def _without_companions(
 
 def _stem(path: str) -> str:
     return str(Path(path).with_suffix("")).lower()
+
+
+def by_reason(skipped: Iterable[SkippedImage]) -> dict[str, list[str]]:
+    """Reason -> the files that were left out for it."""
+    sources: dict[str, list[str]] = {}
+    for item in skipped:
+        sources.setdefault(item.reason, []).append(item.source)
+    return sources
+
+
+def name_some(names: Sequence[str]) -> str:
+    """The first of these files and how many more there are, for a sentence."""
+    more = len(names) - NAMED
+    return ", ".join(names[:NAMED]) + (f" and {more} more" if more > 0 else "")

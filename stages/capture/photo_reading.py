@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,11 +22,25 @@ RAW_SUFFIXES = frozenset({".dng", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".rw2"
 LOSSY_FORMATS = frozenset({"JPEG", "MPO", "WEBP", "HEIF", "AVIF"})
 ANIMATED_FORMATS = frozenset({"WEBP", "AVIF"})  # a HEIF of several pictures is a burst; its first one counts
 
+TURNED = (5, 6, 7, 8)  # EXIF orientations that swap width and height
+PREVIEW_SIDE = 1000  # JPEG decodes at 1/2, 1/4 or 1/8 not below this; blur that matters still shows
 MIN_SIDE = 64  # a picture smaller than this is an icon or a thumbnail, not a photo
 
 
 class UnusableError(Exception):
     """This photo is left out, and why."""
+
+
+@dataclass(frozen=True)
+class Head:
+    """What a photo's file says before its pixels: Pillow's EXIF, and width and height as they are stored."""
+
+    exif: Any
+    stored_size: tuple[int, int]
+
+    @property
+    def upright_size(self) -> tuple[int, int]:
+        return self.stored_size[::-1] if self.exif.get(ORIENTATION) in TURNED else self.stored_size
 
 
 @dataclass(frozen=True)
@@ -63,25 +79,71 @@ def read_photo(file: Path) -> Photo:
     Raises:
         UnusableError: it is damaged, an animation, too small, or a raw file without rawpy.
     """
-    try:
-        photo = _develop(file) if file.suffix.lower() in RAW_SUFFIXES else _decode(file)
-    except (UnusableError, MemoryError):
-        raise
-    except Exception as error:  # decoders raise nearly anything on a damaged file
-        raise unreadable(error) from error
-    width, height = photo.rgb.size
-    if max(width, height) < MIN_SIDE:
-        raise UnusableError(f"only {width} x {height} pixels")
+    with _telling_damage():
+        photo = _develop(file) if _is_raw(file) else _decode(file)
+    _check_side(photo.rgb.size)
     return photo
 
 
-def unreadable(error: Exception) -> UnusableError:
+def read_head(file: Path) -> Head:
+    """As `read_photo`, of the file's head only: nothing is decoded.
+
+    Raises:
+        UnusableError: it is no photo as far as the head tells, too small, or a raw file without rawpy.
+    """
+    from PIL import Image
+
+    with _telling_damage():
+        if _is_raw(file):
+            with import_rawpy().imread(str(file)) as raw:
+                size, turned = (raw.sizes.width, raw.sizes.height), raw.sizes.flip in (5, 6)
+                head = Head(_raw_exif(file, raw), size[::-1] if turned else size)
+        else:
+            with Image.open(file) as stored:
+                # the PNG plug-in's own `getexif` would decode the pixels, to look behind them
+                head = Head(Image.Image.getexif(stored), stored.size)
+    _check_side(head.stored_size)
+    return head
+
+
+def read_preview(file: Path) -> np.ndarray:
+    """Pixels [H, W, 3] uint8 of the photo, not turned, and reduced where that makes decoding quick.
+
+    Raises:
+        UnusableError: it cannot be decoded, or is a raw file without rawpy.
+    """
+    from PIL import Image
+
+    with _telling_damage():
+        if _is_raw(file):  # half a second each; the previews in raw files have any size, or are not there
+            return np.asarray(_develop(file).rgb)
+        with Image.open(file) as stored:
+            stored.draft("RGB", (PREVIEW_SIDE, PREVIEW_SIDE))
+            return np.asarray(stored.convert("RGB"))
+
+
+def _is_raw(file: Path) -> bool:
+    return file.suffix.lower() in RAW_SUFFIXES
+
+
+def _check_side(size: tuple[int, int]) -> None:
+    if max(size) < MIN_SIDE:
+        raise UnusableError(f"only {size[0]} x {size[1]} pixels")
+
+
+@contextmanager
+def _telling_damage() -> Iterator[None]:
     """What a decoder says of a file, without the file's name: that is told beside it."""
     from PIL import UnidentifiedImageError
 
-    if isinstance(error, UnidentifiedImageError):
-        return UnusableError("no image, whatever its name says (empty, damaged, or another format)")
-    return UnusableError(f"cannot be read ({error})")
+    try:
+        yield
+    except (UnusableError, MemoryError):
+        raise
+    except UnidentifiedImageError as error:
+        raise UnusableError("no image, whatever its name says (empty, damaged, or another format)") from error
+    except Exception as error:  # decoders raise nearly anything on a damaged file
+        raise UnusableError(f"cannot be read ({error})") from error
 
 
 def _decode(file: Path) -> Photo:

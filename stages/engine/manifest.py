@@ -8,12 +8,12 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from datetime import datetime, timezone
 from functools import lru_cache
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 from stages.artifacts.artifact import Artifact
 from stages.engine.fingerprint import Identity, digest, file_sha256
+from stages.engine.system import installed_version
 
 MANIFEST = "manifest.json"
 
@@ -172,13 +172,8 @@ def describe_outputs(folder: Path) -> dict[str, OutputFile]:
 @lru_cache
 def current_versions() -> dict[str, str]:
     """Versions worth knowing when two machines give two results."""
-    versions = {"python": platform.python_version(), "platform": platform.platform()}
-    for package in RECORDED_PACKAGES:
-        try:
-            versions[package] = metadata.version(package)
-        except metadata.PackageNotFoundError:
-            versions[package] = "absent"
-    return versions
+    packages = {package: installed_version(package) or "absent" for package in RECORDED_PACKAGES}
+    return {"python": platform.python_version(), "platform": platform.platform(), **packages}
 
 
 def now() -> str:

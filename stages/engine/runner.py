@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-import difflib
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 from pydantic import BaseModel
 
 from stages.engine.fingerprint import Identity, SourceDigests
 from stages.engine.manifest import Manifest, current_versions, describe_outputs, jsonable, now
+from stages.engine.resources import ResourceMeter
 from stages.engine.stage import Stage, StageContext
 from stages.engine.status import StageStatus, stage_status
 from stages.engine.system import requirement_error
 from stages.engine.workspace import Workspace, disk_full_error, is_disk_full, storage_errors
-from stages.errors import ConfigError, HineusError, InputError
+from stages.errors import ConfigError, HineusError, InputError, did_you_mean
 
 log = logging.getLogger(__name__)
 
@@ -44,27 +44,14 @@ class StageOutcome:
     peak_rss: int = 0
 
 
-class Listener(Protocol):
-    """Told what the runner does. The console draws it."""
+class Listener:
+    """Told what the runner does, and ignores it. The console's draws it."""
 
     def stage_started(self, stage: Stage[Any], reason: str) -> None: ...
 
     def stage_progress(self, stage: Stage[Any], done: float, total: float, note: str) -> None: ...
 
     def stage_finished(self, stage: Stage[Any], outcome: StageOutcome) -> None: ...
-
-
-class Silent:
-    """The listener that ignores everything."""
-
-    def stage_started(self, stage: Stage[Any], reason: str) -> None:
-        """Ignored."""
-
-    def stage_progress(self, stage: Stage[Any], done: float, total: float, note: str) -> None:
-        """Ignored."""
-
-    def stage_finished(self, stage: Stage[Any], outcome: StageOutcome) -> None:
-        """Ignored."""
 
 
 def run_pipeline(
@@ -101,7 +88,7 @@ def run_pipeline(
     Raises:
         HineusError: a child by what the user can do. What earlier stages published stays.
     """
-    listener = listener or Silent()
+    listener = listener or Listener()
     selected, forced = _select(pipeline, from_stage, until, force)
     outcomes = []
     with workspace.lock():
@@ -114,12 +101,13 @@ def run_pipeline(
             with storage_errors(workspace.root, "keeping the photos' digests"):
                 digests.save()
             if status.state == "fresh" and stage.name not in forced:
-                outcome = _skipped(status)
+                assert status.manifest is not None  # a fresh stage has one
+                outcome = _outcome("skipped", status.reason, status.manifest)
             else:
                 reason = forced[stage.name] if status.state == "fresh" else status.reason
                 listener.stage_started(stage, reason)
                 manifest = _run_stage(stage, workspace, config, digests, status, device, workers, listener)
-                outcome = _outcome("ran", reason, stage.name, manifest)
+                outcome = _outcome("ran", reason, manifest)
                 status = StageStatus(stage.name, "fresh", (), manifest, manifest.identity)
             statuses[stage.name] = status
             log.debug("%s %s: %s", stage.name, outcome.action, outcome.reason)
@@ -133,16 +121,15 @@ def _select(
 ) -> tuple[Sequence[Stage[Any]], dict[str, str]]:
     """The stages up to `until`, and for each that must run even if fresh, the reason."""
     names = [stage.name for stage in pipeline]
-    for option, name in [("--from", from_stage), ("--until", until), *(("--force", name) for name in force)]:
+    asked = [("--from", from_stage), ("--until", until), *(("--force", name) for name in force)]
+    for option, name in asked:
         if name is not None and name not in names:
-            near = difflib.get_close_matches(name, names, 1)
-            guess = f"Did you mean `{option} {near[0]}`? " if near else ""
+            guess = did_you_mean(name, names, f"{option} {{}}")
             raise ConfigError(f"There is no stage '{name}' ({option}).", f"{guess}The stages are {', '.join(names)}.")
     last = names.index(until) if until else len(names) - 1
     first = names.index(from_stage) if from_stage else len(names)
-    late = [(option, name) for option, name in [("--from", from_stage), *(("--force", n) for n in force)] if name]
-    for option, name in late:
-        if names.index(name) > last:
+    for option, name in asked:
+        if name is not None and names.index(name) > last:
             raise ConfigError(
                 f"{option} {name} comes after --until {until}, so it would never run.", "Drop one of the two."
             )
@@ -161,8 +148,6 @@ def _run_stage(
     workers: int,
     listener: Listener,
 ) -> Manifest:
-    from stages.engine.resources import ResourceMeter
-
     identity = status.identity
     if identity is None:
         raise ValueError(f"stage {stage.name} was asked to run before the stages it needs: {status.reason}")
@@ -237,7 +222,9 @@ def _check_outputs(stage: Stage[Any], manifest: Manifest) -> None:
         raise ValueError(f"stage {stage.name} wrote {strange} without declaring it, and did not write {missing}")
 
 
-def _describe(identity: Identity, out: Path, numbers: Mapping[str, Any], meter: Any, workspace: Workspace) -> Manifest:
+def _describe(
+    identity: Identity, out: Path, numbers: Mapping[str, Any], meter: ResourceMeter, workspace: Workspace
+) -> Manifest:
     with storage_errors(workspace.root, f"reading back '{identity.stage}'"):
         outputs = describe_outputs(out)
     return Manifest(
@@ -252,10 +239,5 @@ def _describe(identity: Identity, out: Path, numbers: Mapping[str, Any], meter: 
     )
 
 
-def _skipped(status: StageStatus) -> StageOutcome:
-    assert status.manifest is not None  # a fresh stage has one
-    return _outcome("skipped", status.reason, status.name, status.manifest)
-
-
-def _outcome(action: Literal["ran", "skipped"], reason: str, name: str, manifest: Manifest) -> StageOutcome:
-    return StageOutcome(name, action, reason, manifest.numbers, manifest.wall_s, manifest.cpu_s, manifest.peak_rss)
+def _outcome(action: Literal["ran", "skipped"], reason: str, made: Manifest) -> StageOutcome:
+    return StageOutcome(made.identity.stage, action, reason, made.numbers, made.wall_s, made.cpu_s, made.peak_rss)

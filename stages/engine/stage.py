@@ -5,16 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
+
+from pydantic import BaseModel
 
 from stages.artifacts.artifact import Artifact
-
-if TYPE_CHECKING:  # pydantic takes a tenth of a second that `hineus --help` need not wait for
-    from pydantic import BaseModel
-
-    from stages.engine.fingerprint import FileDigests
-    from stages.engine.manifest import Manifest
-    from stages.engine.workspace import Record
+from stages.engine.fingerprint import FileDigests
+from stages.engine.manifest import Manifest
+from stages.engine.workspace import Record
 
 T = TypeVar("T")
 P = TypeVar("P")

@@ -14,6 +14,8 @@ from stages.engine.manifest import Manifest, ManifestDamaged, jsonable, output_p
 from stages.engine.stage import Stage
 from stages.engine.workspace import Workspace
 
+MAX_REASONS = 3
+
 
 @dataclass(frozen=True)
 class StageStatus:
@@ -36,7 +38,10 @@ class StageStatus:
 
     @property
     def reason(self) -> str:
-        return "; ".join(self.reasons) or "nothing changed"
+        """The reasons in one line; past the first few they are counted."""
+        more = len(self.reasons) - MAX_REASONS
+        named = self.reasons[:MAX_REASONS] + ((f"and {more} more",) if more > 0 else ())
+        return "; ".join(named) or "nothing changed"
 
 
 def stage_status(

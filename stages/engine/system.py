@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import re
+from importlib import metadata
 
 from stages.errors import SystemRequirementError
 
@@ -19,6 +20,14 @@ SYSTEM_LIBRARIES = {
 }
 
 _MISSING_LIBRARY = re.compile(r"(lib[\w+.-]+\.so[.\d]*): cannot open shared object file")
+
+
+def installed_version(package: str) -> str | None:
+    """The version of a Python package, by its name on PyPI; None where it is not installed."""
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return None
 
 
 def missing_libraries() -> list[str]:

@@ -23,9 +23,10 @@ import socket
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
-from importlib import metadata
 from pathlib import Path
 from typing import Any
+
+import psutil
 
 from stages.engine.manifest import (
     MANIFEST,
@@ -36,6 +37,7 @@ from stages.engine.manifest import (
     now,
     output_problem,
 )
+from stages.engine.system import installed_version
 from stages.errors import WorkspaceError
 
 FORMAT = 1
@@ -167,7 +169,7 @@ class Workspace:
         """Whether a process on this machine that took the lock is still there. Takes no lock, so it disturbs none."""
         try:
             data = json.loads((self.root / ".lock").read_bytes())
-            return data["host"] == socket.gethostname() and _is_running(int(data["pid"]))
+            return data["host"] == socket.gethostname() and bool(psutil.pid_exists(int(data["pid"])))
         except (OSError, ValueError, KeyError, TypeError):
             return False
 
@@ -307,7 +309,7 @@ def _busy_error(root: Path, holder: bytes) -> WorkspaceError:
             "Wait for it to end, or work in another folder with `--workspace DIR`.",
         )
     here = host == socket.gethostname()
-    if here and not _is_running(pid):
+    if here and not psutil.pid_exists(pid):
         return WorkspaceError(
             f"The workspace {root} is held by a left-over child of process {pid}, which has ended.",
             f"Find it with `fuser {root / '.lock'}` and end it, then try again.",
@@ -317,16 +319,6 @@ def _busy_error(root: Path, holder: bytes) -> WorkspaceError:
         f"The workspace {root} is in use by process {pid} on {host} since {since}.",
         f"Wait for it to end, stop it with {stop}, or work in another folder with `--workspace DIR`.",
     )
-
-
-def _is_running(pid: int) -> bool:
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:
-        return True
-    return True
 
 
 # ---------------------------------------------------------------- opening
@@ -373,10 +365,7 @@ def _parse_record(text: str, path: Path) -> Record:
 
 
 def _hineus_version() -> str:
-    try:
-        return metadata.version("hineus")
-    except metadata.PackageNotFoundError:
-        return "unknown"
+    return installed_version("hineus") or "unknown"
 
 
 # ---------------------------------------------------------------- files

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -33,41 +33,25 @@ def by_cameras(centers: Mapping[str, np.ndarray], true_centers: Mapping[str, np.
 def by_icp(predicted: Surface, truth: Surface, scaled: bool = False, keep: Keep | None = None) -> Similarity:
     """The rigid motion (`scaled`: similarity) that takes a surface nearest to the truth, from where it is.
 
-    See `icp`. A cloud without normals gets those of planes through 20 neighbours.
+    Trimmed point-to-plane ICP: Chen and Medioni 1992, with the worst pairs of each round left out. It finds the
+    nearest rest, so the two must lie about right to begin with. A cloud without normals gets those of planes through
+    20 neighbours.
 
     Args:
         keep: which points of the prediction are moved, as of `draw_points`.
     """
     target = Target(truth if truth.faces is not None or truth.normals is not None else _with_normals(truth))
-
-    def nearest(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        found = target.nearest(points)
-        assert found.normals is not None
-        return found.points, found.normals
-
-    return icp(draw_points(predicted, Sampling(ICP_SAMPLES), keep).points, nearest, scaled)
-
-
-def icp(
-    start: np.ndarray, nearest: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]], scaled: bool = False
-) -> Similarity:
-    """The rigid motion (`scaled`: similarity) that takes points [P, 3] nearest to a surface, from where they are.
-
-    Trimmed point-to-plane ICP: Chen and Medioni 1992, with the worst pairs of each round left out. It finds the
-    nearest rest, so the two must lie about right to begin with.
-
-    Args:
-        nearest: points [P, 3] -> the nearest on the surface [P, 3] and its normals there [P, 3].
-    """
+    start = draw_points(predicted, Sampling(ICP_SAMPLES), keep).points
     extent = float(np.ptp(start, axis=0).max())
     motion = Similarity.identity()
     moved = start
     for _ in range(ICP_ROUNDS):
-        places, normals = nearest(moved)
-        offsets = places - moved
+        found = target.nearest(moved)
+        assert found.normals is not None  # the target has some
+        offsets = found.points - moved
         apart = np.linalg.norm(offsets, axis=1)
         kept = apart <= np.quantile(apart, ICP_KEPT)
-        motion = plane_step(moved[kept], offsets[kept], normals[kept], scaled).compose(motion)
+        motion = plane_step(moved[kept], offsets[kept], found.normals[kept], scaled).compose(motion)
         before, moved = moved, motion.apply(start)
         if np.abs(moved - before).max() < ICP_STILL * extent:
             break

@@ -12,8 +12,7 @@ nearest triangle, the distance to a cloud that to its nearest point.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -43,16 +42,21 @@ class Surface:
     normals: np.ndarray | None = None
 
     @property
-    def extent(self) -> float:
-        """The largest side of the box around it; of a mesh, around its faces."""
+    def box(self) -> np.ndarray:
+        """[2, 3] lowest and highest corner of the box around it; of a mesh, around its faces."""
         used = self.points if self.faces is None else self.points[np.unique(self.faces)]
-        return float(np.ptp(used, axis=0).max())
+        return np.stack([used.min(0), used.max(0)])
+
+    @property
+    def extent(self) -> float:
+        """The largest side of its box."""
+        return float(np.ptp(self.box, axis=0).max())
 
     def moved(self, matrix: np.ndarray) -> Surface:
         """It in another frame, by a [4, 4] similarity."""
         turn = matrix[:3, :3] / np.cbrt(np.linalg.det(matrix[:3, :3]))
         normals = None if self.normals is None else self.normals @ turn.T
-        return Surface(self.points @ matrix[:3, :3].T + matrix[:3, 3], self.faces, normals)
+        return Surface(moved(self.points, matrix), self.faces, normals)
 
 
 @dataclass(frozen=True)
@@ -164,10 +168,6 @@ class SurfaceScores:
     accuracy_normals: Turning | None
     completeness_normals: Turning | None
 
-    def as_dict(self) -> dict[str, Any]:
-        """Plain values, for JSON."""
-        return asdict(self)
-
 
 class Target:
     """A surface to measure distances to."""
@@ -276,6 +276,11 @@ def turning(normals: np.ndarray | None, others: np.ndarray | None) -> Turning | 
     cosines = np.abs((normals * others).sum(1)).clip(0, 1)
     angles = np.degrees(np.arccos(cosines))
     return Turning(float(angles.mean()), float(np.median(angles)), float(cosines.mean()))
+
+
+def moved(points: np.ndarray, matrix: np.ndarray) -> np.ndarray:
+    """Points [P, 3] in another frame, by a [4, 4] matrix."""
+    return points @ matrix[:3, :3].T + matrix[:3, 3]
 
 
 def sample_faces(

@@ -58,7 +58,7 @@ def write_transforms(undistort: Path, sfm: Path, place: Path, out: Path) -> dict
             # OpenGL axes: y up, z backward
             "transform_matrix": (np.linalg.inv(cam_from_world) @ np.diag([1.0, -1.0, -1.0, 1.0])).tolist(),
         }
-        mask = artifacts.mask_path(out, name)
+        mask = artifacts.Pictures(out).mask_path(name)
         if mask.exists():
             frame["mask_path"] = mask.relative_to(out).as_posix()
         frames.append(frame)
@@ -71,11 +71,12 @@ def write_transforms(undistort: Path, sfm: Path, place: Path, out: Path) -> dict
 def _images_and_model(undistort: Path, sfm: Path, place: Place, out: Path) -> tuple[PosedScene, Any]:
     """Copy images and masks to `out`; the scene, and the pycolmap model of it."""
     scene = artifacts.SCENE.load(undistort)
+    ours, theirs = artifacts.Pictures(undistort), artifacts.Pictures(out)
     for name in scene.cameras.names:
-        for path_in in (artifacts.image_path, artifacts.mask_path):
-            if path_in(undistort, name).exists():
-                path_in(out, name).parent.mkdir(parents=True, exist_ok=True)
-                shutil.copyfile(path_in(undistort, name), path_in(out, name))
+        for source, target in ((ours.path(name), theirs.path(name)), (ours.mask_path(name), theirs.mask_path(name))):
+            if source.exists():
+                target.parent.mkdir(parents=True, exist_ok=True)
+                shutil.copyfile(source, target)
     return scene, undistorted_model(scene, place, sfm, out / artifacts.IMAGES)
 
 

@@ -31,26 +31,20 @@ def _blur_environment(environment: np.ndarray, sigma: float) -> np.ndarray:
 
 def _look_up(environment: np.ndarray, directions: np.ndarray) -> np.ndarray:
     """Radiance [P, 3] seen in unit directions [P, 3], bilinear."""
-    import cv2
-
     height, width = environment.shape[:2]
     row = np.arccos(np.clip(directions[:, 2], -1, 1)) / np.pi * height - 0.5
     column = np.arctan2(directions[:, 1], directions[:, 0]) % (2 * np.pi) / (2 * np.pi) * width - 0.5
-    return _remap(environment, column, row, cv2.BORDER_REPLICATE)
+    return _remap(environment, column, row)
 
 
-def _remap(image: np.ndarray, x: np.ndarray, y: np.ndarray, border: int) -> np.ndarray:
+def _remap(image: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Bilinear samples [P, C] of an image at pixel positions; folded because cv2 limits a side to 32767."""
     import cv2
 
-    count, row_length = len(x), 4096
-    padded = -(-count // row_length) * row_length
-    maps = []
-    for values in (x, y):
-        full = np.zeros(padded, np.float32)
-        full[:count] = values
-        maps.append(full.reshape(-1, row_length))
-    return cv2.remap(image, maps[0], maps[1], cv2.INTER_LINEAR, borderMode=border).reshape(padded, -1)[:count]
+    count, row = len(x), 4096
+    x, y = (np.pad(values.astype(np.float32), (0, -count % row)).reshape(-1, row) for values in (x, y))
+    samples = cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return samples.reshape(-1, image.shape[2])[:count]
 
 
 def _light_samples(environment: np.ndarray, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
@@ -111,21 +105,10 @@ class LitScene:
     soft: np.ndarray
 
 
-def _subdivide(faces: np.ndarray, attributes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Split every triangle in four; attributes [V, C] of new vertices are the mean of their edge's ends."""
-    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
-    unique, inverse = np.unique(edges[:, 0].astype(np.int64) << 32 | edges[:, 1], return_inverse=True)
-    ends = np.stack([unique >> 32, unique & 0xFFFFFFFF], 1)
-    middle = (len(attributes) + inverse).reshape(3, -1).T.astype(np.int32)
-    a, b, c = faces.T
-    ab, bc, ca = middle.T
-    split = np.concatenate([np.stack(t, 1) for t in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))])
-    return split, np.concatenate([attributes, attributes[ends].mean(1)])
-
-
 def light_scene(figurine: Figurine, seed: int, light_samples: int = 128, cloth_size: int = 2048) -> LitScene:
     """Paint the bird, print the cloth, and bake all light that does not depend on the view."""
     import cv2
+    from trimesh.remesh import subdivide
 
     rng = np.random.default_rng(seed)
     environment = make_environment(rng)
@@ -133,12 +116,9 @@ def light_scene(figurine: Figurine, seed: int, light_samples: int = 128, cloth_s
     coarse = raycaster(figurine.vertices, figurine.faces)
     light = _irradiance(coarse, figurine.vertices, figurine.normals, directions, weights)
 
-    faces, attributes = (
-        figurine.faces,
-        np.hstack([figurine.vertices, figurine.normals, figurine.design, light]),
-    )
-    for _ in range(2):
-        faces, attributes = _subdivide(faces, attributes)
+    faces, attributes = figurine.faces, np.hstack([figurine.vertices, figurine.normals, figurine.design, light])
+    for _ in range(2):  # what stands at a new vertex is the mean of its edge's ends
+        attributes, faces = subdivide(attributes, faces)
     vertices, normals, design, light = np.split(attributes, [3, 6, 9], axis=1)
     normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
     albedo, metalness, gloss = figurine_materials(design, rng)
@@ -171,11 +151,9 @@ def light_scene(figurine: Figurine, seed: int, light_samples: int = 128, cloth_s
 # ---------------------------------------------------------------- pictures
 def _ground_radiance(scene: LitScene, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Radiance [P, 3] of the cloth, or of the floor beyond it."""
-    import cv2
-
     size = scene.cloth.shape[0]
     column, row = (x / CLOTH_SIDE + 0.5) * size - 0.5, (y / CLOTH_SIDE + 0.5) * size - 0.5
-    color = _remap(scene.cloth, column, row, cv2.BORDER_REPLICATE)
+    color = _remap(scene.cloth, column, row)
     beyond = (np.abs(x) > CLOTH_SIDE / 2) | (np.abs(y) > CLOTH_SIDE / 2)
     color[beyond] = scene.floor
     return color

@@ -1,6 +1,6 @@
 """The peers that come as packages, each a program of its own, so that time and memory are theirs alone:
 
-python builtin_peers.py NAME PHOTOS MODEL OUT
+python builtin.py NAME PHOTOS MODEL OUT
 """
 
 from __future__ import annotations
@@ -45,6 +45,7 @@ def sparse_cloud(model: Path) -> Any:
 
 
 def poisson(photos: Path, model: Path, out: Path) -> None:
+    """Screened Poisson through the sparse points, by Open3D."""
     import open3d as o3d
 
     mesh, densities = o3d.geometry.TriangleMesh.create_from_point_cloud_poisson(sparse_cloud(model), depth=DEPTH)
@@ -53,12 +54,14 @@ def poisson(photos: Path, model: Path, out: Path) -> None:
 
 
 def pymeshlab_poisson(photos: Path, model: Path, out: Path) -> None:
+    """Screened Poisson through the sparse points, by pymeshlab."""
     meshes = _pymeshlab(sparse_cloud(model))
     meshes.generate_surface_reconstruction_screened_poisson(depth=DEPTH)
     meshes.save_current_mesh(str(out))
 
 
 def ball_pivoting(photos: Path, model: Path, out: Path) -> None:
+    """Ball pivoting of the sparse points, by pymeshlab."""
     meshes = _pymeshlab(sparse_cloud(model))
     meshes.generate_surface_reconstruction_ball_pivoting()
     meshes.save_current_mesh(str(out))
@@ -73,6 +76,7 @@ def _pymeshlab(cloud: Any) -> Any:
 
 
 def colmap_dense(photos: Path, model: Path, out: Path) -> None:
+    """COLMAP's patch-match stereo, fusion and Poisson; needs pycolmap with CUDA."""
     import pycolmap
 
     if not pycolmap.has_cuda:

@@ -24,16 +24,9 @@ import psutil
 from stages import artifacts
 from stages.errors import ConfigError, ReconstructionError
 from stages.evaluation.machine import machine
+from stages.evaluation.peers import builtin
 from stages.posing.exporting import SPARSE
 
-BUILT_IN = {
-    "poisson": "screened Poisson through the sparse points (Open3D)",
-    "pymeshlab-poisson": "screened Poisson through the sparse points (pymeshlab)",
-    "ball-pivoting": "ball pivoting of the sparse points (pymeshlab)",
-    "colmap-dense": "COLMAP's patch-match stereo, fusion and Poisson; needs pycolmap with CUDA",
-}
-PROGRAM = Path(__file__).with_name("builtin.py")
-PLACEHOLDERS = ("photos", "model", "masks", "out")
 MESH, LOG = "mesh.ply", "output.log"
 # Seconds between looks at its memory: many at first, for a command that soon ends.
 FIRST_SAMPLE_S, SAMPLE_EVERY_S = 0.002, 0.1
@@ -63,15 +56,15 @@ def parse_peer(text: str) -> Peer:
     """
     name, equals, command = (part.strip() for part in text.partition("="))
     if not equals:
-        if name not in BUILT_IN:
-            near = difflib.get_close_matches(name, BUILT_IN, 1)
+        if name not in builtin.PEERS:
+            near = difflib.get_close_matches(name, builtin.PEERS, 1)
             guess = f"Did you mean `--peer {near[0]}`? " if near else ""
             raise ConfigError(
                 f"There is no built-in peer '{name}'.",
-                f"{guess}Those are {', '.join(BUILT_IN)}; others by command: `--peer 'NAME=COMMAND {{out}}'`.",
+                f"{guess}Those are {', '.join(builtin.PEERS)}; others by command: `--peer 'NAME=COMMAND {{out}}'`.",
             )
         # isolated: the folder of the file would hide modules of the same names
-        return Peer(name, (sys.executable, "-I", str(PROGRAM), name, "{photos}", "{model}", "{out}"))
+        return Peer(name, (sys.executable, "-I", builtin.__file__, name, "{photos}", "{model}", "{out}"))
     try:
         words = tuple(shlex.split(command))
     except ValueError as error:
@@ -164,6 +157,6 @@ def _children_s() -> float:
 
 
 def _filled(word: str, places: dict[str, Path]) -> str:
-    for name in PLACEHOLDERS:
-        word = word.replace(f"{{{name}}}", str(places[name]))
+    for name, place in places.items():
+        word = word.replace(f"{{{name}}}", str(place))
     return word

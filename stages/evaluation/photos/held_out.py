@@ -46,14 +46,11 @@ def evaluate_views(workspace: Path, renders: Path | None = None, device: str = "
             f"Train without every 8th: `hineus run --workspace {workspace} --hold-out 8`.",
         )
     cameras = artifacts.SCENE.load(undistort).cameras
-    masked = 0
+    pinholes = artifacts.PINHOLE_PHOTOS.load(undistort)
+    masked = sum(pinholes.mask_path(name).exists() for name in held_out)
 
     def load(index: int) -> tuple[np.ndarray, np.ndarray | None]:
-        nonlocal masked
-        name = cameras.names[index]
-        mask = artifacts.load_mask(undistort, name)
-        masked += mask is not None
-        return artifacts.load_image(undistort, name), None if mask is None else mask > 127
+        return pinholes.masked(cameras.names[index])
 
     lpips, about_lpips = find_lpips()
     indices = [cameras.names.index(name) for name in held_out]

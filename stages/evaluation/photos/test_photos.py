@@ -10,9 +10,7 @@ import numpy as np
 
 from stages import artifacts
 from stages.engine.workspace import Workspace
-from stages.evaluation.photos.images import find_lpips
 from stages.evaluation.photos.regions import WHITE
-from stages.evaluation.photos.scoring import score_photos
 from stages.geometry.cameras import PinholeCameras
 from stages.geometry.normalisation import into_frame
 from stages.ingest import find_masks, read_mask_file
@@ -100,16 +98,3 @@ def _read(file: Path, on_white: bool) -> tuple[np.ndarray, np.ndarray | None]:
     alpha = values[..., 3:] / WHITE
     pixels = values[..., :3] * alpha + WHITE * (1 - alpha) if on_white else values[..., :3]
     return np.rint(pixels).astype(np.uint8), np.where(values[..., 3] > OPAQUE, 255, 0).astype(np.uint8)
-
-
-def score_test_views(photos: TestPhotos, workspace: Workspace, fresh: set[str], device: str) -> dict[str, Any]:
-    """Every test photo against drawings of the trained field and, where it is up to date, of the textured mesh.
-
-    Returns:
-        How many were "counted", and photos and means as of `score_photos`.
-    """
-    indices = range(len(photos.cameras))
-    found = score_photos(
-        workspace, photos.cameras, indices, photos.load, device, textured="bake" in fresh, lpips=find_lpips()[0]
-    )
-    return {"counted": len(indices), **found}

@@ -6,6 +6,7 @@ are parts of the true surface's extent, as its scenes have no unit.
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +32,7 @@ def evaluate_blended(predicted: Path, data: Path) -> dict[str, Any]:
         ValueError: the mesh has no area.
     """
     scores = blended_score(read_surface(predicted), Surface(true_points(data)))
-    return {**scores.as_dict(), "chamfer_percent": 100 * scores.chamfer / scores.extent}
+    return {**asdict(scores), "chamfer_percent": 100 * scores.chamfer / scores.extent}
 
 
 def blended_score(predicted: Surface, truth: Surface, sampling: Sampling | None = None) -> SurfaceScores:

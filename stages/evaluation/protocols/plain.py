@@ -6,7 +6,7 @@ comes back are plain values: the numbers, and under "done" what a reader must kn
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -52,7 +52,7 @@ class MeshOptions:
 
     thresholds: tuple[float, ...] = ()
     threshold_parts: tuple[float, ...] = ()
-    samples: int | None = None
+    samples: int = SAMPLES
     spacing: float | None = None
     seed: int = 0
     matrix: Path | None = None
@@ -83,7 +83,7 @@ def evaluate_mesh(predicted: Path, truth: Path, options: MeshOptions) -> dict[st
     try:
         ours, matrix = _aligned(ours, true, predicted, options, cameras, done)
         selections = [_selection(each, true, options, cameras) for each in (ours, true)]
-        sampling = Sampling(options.samples or SAMPLES, options.spacing, options.seed)
+        sampling = Sampling(options.samples, options.spacing, options.seed)
         thresholds = [*(part * true.extent for part in options.threshold_parts), *options.thresholds]
         found = measure(ours, true, thresholds or None, sampling, *selections)
     except ValueError as error:
@@ -98,7 +98,7 @@ def evaluate_mesh(predicted: Path, truth: Path, options: MeshOptions) -> dict[st
         "predicted": str(path),
         "truth": str(truth),
         "unit": "the truth's",
-        **found.as_dict(),
+        **asdict(found),
         "matrix": matrix.tolist(),
         "done": done,
     }
@@ -158,9 +158,8 @@ def _box(true: Surface, options: MeshOptions) -> np.ndarray | None:
         return np.array(options.box, dtype=np.float64).reshape(2, 3)
     if options.box_margin is None:
         return None
-    used = true.points if true.faces is None else true.points[np.unique(true.faces)]
     margin = options.box_margin * true.extent
-    return np.stack([used.min(0) - margin, used.max(0) + margin])
+    return true.box + np.array([[-margin], [margin]])
 
 
 def _said(options: MeshOptions, cameras: Cameras | None, sampling: Sampling, ours: Surface, true: Surface) -> list[str]:

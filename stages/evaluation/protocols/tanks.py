@@ -13,7 +13,7 @@ import numpy as np
 from stages.errors import InputError
 from stages.evaluation.alignment import by_cameras
 from stages.evaluation.reading import Cameras, own_cameras, read_matrix, read_prediction, read_surface
-from stages.evaluation.surfaces import Sampling, Surface, Target, draw_points, score_at
+from stages.evaluation.surfaces import Sampling, Surface, Target, draw_points, moved, score_at
 from stages.evaluation.thinning import one_a_cube
 from stages.surface.triangle_mesh import face_normals
 
@@ -106,7 +106,7 @@ def tanks_score(
     true = _cropped(true_points, crop, "scanned")
     if refine:
         step = refined(points, true, crop, tau)
-        points, matrix = _moved(points, step), step @ matrix
+        points, matrix = moved(points, step), step @ matrix
     ours = one_a_cube(_cropped(points, crop, "predicted"), tau / 2)
     true = one_a_cube(true, tau / 2)
     to_truth = Target(Surface(true)).nearest(ours).distances
@@ -123,7 +123,7 @@ def refined(points: np.ndarray, true_points: np.ndarray, crop: CropVolume, tau: 
     matrix = np.eye(4)
     for cube, reach in ROUNDS:
         sides = []
-        for cloud in (_cropped(_moved(points, matrix), crop, "predicted"), true_points):
+        for cloud in (_cropped(moved(points, matrix), crop, "predicted"), true_points):
             thinned = (
                 cloud[:: max(1, round(len(cloud) / LAST_ROUND_POINTS))]
                 if cube is None
@@ -151,10 +151,6 @@ def _points_on(mesh: Surface, crop: CropVolume, tau: float, seed: int) -> np.nda
     part = Surface(mesh.points, mesh.faces[near])
     area = 0.5 * np.linalg.norm(face_normals(part.points, mesh.faces[near]), axis=1).sum()
     return draw_points(part, Sampling(min(int(area / (tau / 4) ** 2) + 1, MOST_POINTS), seed=seed)).points
-
-
-def _moved(points: np.ndarray, matrix: np.ndarray) -> np.ndarray:
-    return points @ matrix[:3, :3].T + matrix[:3, 3]
 
 
 def _cropped(points: np.ndarray, crop: CropVolume, what: str) -> np.ndarray:
@@ -272,8 +268,7 @@ def read_tanks(data: Path) -> TanksTruth:
     log, trans = data / f"{scene}_COLMAP_SfM.log", data / f"{scene}_trans.txt"
     centers = None
     if log.is_file() and trans.is_file():
-        matrix = read_matrix(trans)
-        centers = _trajectory(log) @ matrix[:3, :3].T + matrix[:3, 3]
+        centers = moved(_trajectory(log), read_matrix(trans))
     return TanksTruth(scene, read_surface(scan).points, _crop_volume(crop), centers)
 
 

@@ -25,28 +25,24 @@ def find_scenes(folder: Path, wanted: Wanted) -> list[SuiteScene]:
 def _published(place: Path, wanted: Wanted) -> SuiteScene:
     photos = place / mvsnet.IMAGES[0]
     names = [name for name in photo_names(photos) if MASKED not in name]
-    views = every_nth(photos, names, place / mvsnet.CAMERAS, wanted.hold_out)
     depth = (place / DEPTHS).is_dir()
     return SuiteScene(
         name=place.name,
         photos=photos,
         poses=place / mvsnet.CAMERAS,
-        left_out=views.names if views else (),
-        views=views,
+        views=every_nth(photos, names, place / mvsnet.CAMERAS, wanted.hold_out),
         truth=Truth("depth maps", place) if depth else None,
         lacking=() if depth else (f"no distance: {place.name} has no {DEPTHS}",),
     )
 
 
 def _prepared(place: Path, poses: Path, wanted: Wanted) -> SuiteScene:
-    photos, masks = place / neus.IMAGES, place / neus.MASKS
-    views = every_nth(photos, photo_names(photos), poses, wanted.hold_out)
+    photos = place / neus.IMAGES
     return SuiteScene(
         name=place.name,
         photos=photos,
         poses=poses,
-        masks=masks if wanted.masks and masks.is_dir() else None,
-        left_out=views.names if views else (),
-        views=views,
+        masks=wanted.masks_in(place / neus.MASKS),
+        views=every_nth(photos, photo_names(photos), poses, wanted.hold_out),
         lacking=(f"no distance: {place.name} comes without a surface in this layout",),
     )

@@ -22,7 +22,7 @@ def find_scenes(folder: Path, wanted: Wanted) -> list[SuiteScene]:
 
 
 def _scene(place: Path, number: int, wanted: Wanted) -> SuiteScene:
-    photos, poses, masks = place / neus.IMAGES, place / neus.FILES[0], place / neus.MASKS
+    photos, poses = place / neus.IMAGES, place / neus.FILES[0]
     views = every_nth(photos, photo_names(photos), poses, wanted.hold_out)
     data = evaluation_data([wanted.truth, place.parent, place.parent.parent], number)
     lacking = []
@@ -37,8 +37,7 @@ def _scene(place: Path, number: int, wanted: Wanted) -> SuiteScene:
         name=str(number),
         photos=photos,
         poses=poses,
-        masks=masks if wanted.masks and masks.is_dir() else None,
-        left_out=views.names if views else (),
+        masks=wanted.masks_in(place / neus.MASKS),
         views=views,
         truth=None if data is None else Truth("dtu", data, number),
         lacking=tuple(lacking),

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from stages.evaluation.suites.scene import SuiteScene, Truth, Wanted, every_nth
+from stages.evaluation.suites.scene import SuiteScene, Truth, Wanted, every_nth, places_in
 from stages.posing import nero
 
 SPLIT = "synthetic_split_128.pkl"
@@ -17,15 +17,13 @@ SPLIT = "synthetic_split_128.pkl"
 
 def find_scenes(folder: Path, wanted: Wanted) -> list[SuiteScene]:
     """Scenes in `folder`, or `folder` itself if it is one."""
-    places = [folder, *sorted(path for path in folder.iterdir() if path.is_dir())]
-    return [_scene(place, wanted) for place in places if nero.has_cameras(place)]
+    return [_scene(place, wanted) for place in places_in(folder) if nero.has_cameras(place)]
 
 
 def _scene(place: Path, wanted: Wanted) -> SuiteScene:
     cameras = sorted(place.glob(f"*{nero.CAMERA}"), key=lambda path: (len(path.name), path.name))
     names = [f"{path.name.removesuffix(nero.CAMERA)}.png" for path in cameras]
     depth = all((place / name.replace(".png", nero.DEPTH)).is_file() for name in names)
-    views = every_nth(place, names, place, wanted.hold_out)
     split = next((p / SPLIT for p in (wanted.truth, place.parent) if p is not None and (p / SPLIT).is_file()), None)
     lacking = []
     if not depth:
@@ -37,8 +35,7 @@ def _scene(place: Path, wanted: Wanted) -> SuiteScene:
         photos=place,
         poses=place,
         masks=place if wanted.masks and depth else None,
-        left_out=views.names if views else (),
-        views=views,
+        views=every_nth(place, names, place, wanted.hold_out),
         truth=Truth("glossy", place, split=split) if depth else None,
         lacking=tuple(lacking),
     )

@@ -21,14 +21,13 @@ def find_scenes(folder: Path, wanted: Wanted) -> list[SuiteScene]:
 
 
 def _scene(place: Path, wanted: Wanted) -> SuiteScene:
-    photos, masks = place / IMAGES, place / MASKS
+    photos = place / IMAGES
     views = every_nth(photos, photo_names(photos), place / TRUTH_CAMERAS, wanted.hold_out)
     return SuiteScene(
         name=place.name,
         photos=photos,
         poses=None if views is None else views.poses,
-        masks=masks if wanted.masks and masks.is_dir() else None,
-        left_out=views.names if views else (),
+        masks=wanted.masks_in(place / MASKS),
         views=views,
         truth=Truth("known", place),
     )

@@ -25,6 +25,4 @@ def _scene(place: Path) -> SuiteScene:
     photos = next((folder for folder in (published, *others) if folder.is_dir()), published)
     views = every_nth(photos, photo_names(photos), place / MODEL, EVERY) if photos.is_dir() else None
     lacking = (f"photos of {photos.name}: the papers' figures are of {sizes[0]}",) if photos != published else ()
-    return SuiteScene(
-        place.name, photos, place / MODEL, left_out=views.names if views else (), views=views, lacking=lacking
-    )
+    return SuiteScene(place.name, photos, place / MODEL, views=views, lacking=lacking)

@@ -13,7 +13,7 @@ import json
 import logging
 import shutil
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from glob import escape
 from pathlib import Path
 from typing import Any
@@ -83,15 +83,15 @@ def run_bench(
     scenes = find_scenes(request.suite, request.data, request.wanted, request.scenes)
     if request.out.resolve() == request.data.resolve():
         raise InputError("Results would lie among the data.", "Name another folder with `--out`.")
-    preset = request.preset or default_preset()
+    request = replace(request, preset=request.preset or default_preset())
     for scene in scenes:
         folder = request.out / request.suite.name / scene.name
         for sentence in scene.lacking:
             log.warning("%s: %s", scene.name, sentence)
         for seed in range(request.seeds):
             log.info("%s %s, seed %d", request.suite.title, scene.name, seed)
-            yield _run(request, pipeline, listener, scene, preset, folder, seed)
-        yield from _run_peers(request, scene, preset, folder)
+            yield _run(request, pipeline, listener, scene, folder, seed)
+        yield from _run_peers(request, scene, folder)
 
 
 # ---------------------------------------------------------------- ours
@@ -100,17 +100,16 @@ def _run(
     pipeline: Sequence[Stage],
     listener: Listener | None,
     scene: SuiteScene,
-    preset: str,
     folder: Path,
     seed: int,
 ) -> dict[str, Any]:
-    place = folder / f"{preset}-seed{seed}"
+    place = folder / f"{request.preset}-seed{seed}"
     file = place.with_name(f"{place.name}.json")
-    result = {**_heading(request, scene, OURS, preset), "seed": seed}
+    result = {**_heading(request, scene, OURS), "seed": seed}
     try:
         if seed:
-            _share_poses(folder / f"{preset}-seed0", place)
-        done = reconstruct(_ask(request, scene, preset, place, seed), pipeline, listener)
+            _share_poses(folder / f"{request.preset}-seed0", place)
+        done = reconstruct(_ask(request, scene, place, seed), pipeline, listener)
         fresh = {outcome.name for outcome in done.outcomes}
         made_from = {"scoring": SCORING, **_fingerprints(done.workspace, fresh)}
         known = _load(file)
@@ -127,7 +126,7 @@ def _run(
     return result
 
 
-def _ask(request: BenchRequest, scene: SuiteScene, preset: str, place: Path, seed: int) -> Request:
+def _ask(request: BenchRequest, scene: SuiteScene, place: Path, seed: int) -> Request:
     """The run of one scene; test photos are kept from every stage."""
     left_out = json.dumps([escape(name) for name in scene.left_out])
     return Request(
@@ -137,7 +136,7 @@ def _ask(request: BenchRequest, scene: SuiteScene, preset: str, place: Path, see
         no_masks=scene.masks is None,
         poses=scene.poses,
         no_poses=scene.poses is None,
-        preset=preset,
+        preset=request.preset,
         sets=[*request.sets, f"train.seed={seed}", *([f"ingest.leave_out={left_out}"] if scene.left_out else [])],
         until=request.until,
         device=request.device,
@@ -195,16 +194,17 @@ def _fingerprints(workspace: Workspace, stages: Iterable[str]) -> dict[str, str]
 
 
 # ---------------------------------------------------------------- peers
-def _run_peers(request: BenchRequest, scene: SuiteScene, preset: str, folder: Path) -> Iterator[dict[str, Any]]:
+def _run_peers(request: BenchRequest, scene: SuiteScene, folder: Path) -> Iterator[dict[str, Any]]:
     """The peers on the photos and poses of the first seed, which are written out once."""
-    given = folder / "peers" / f"{preset}-photos"
+    given = folder / "peers" / f"{request.preset}-photos"
     shutil.rmtree(given, ignore_errors=True)  # those of an earlier call may be of other poses
     for peer in request.peers:
         log.info("%s %s, peer %s", request.suite.title, scene.name, peer.name)
-        result = _heading(request, scene, peer.name, preset)
-        file = folder / f"{preset}-peer-{peer.name}.json"
+        result = _heading(request, scene, peer.name)
+        file = folder / f"{request.preset}-peer-{peer.name}.json"
+        made = folder / "peers" / f"{request.preset}-{peer.name}"
         try:
-            workspace = Workspace.open(folder / f"{preset}-seed0")
+            workspace = Workspace.open(folder / f"{request.preset}-seed0")
             made_from = {"scoring": SCORING, "command": list(peer.given), **_fingerprints(workspace, POSED)}
             known = _load(file)
             if known and _is_current(known, made_from, result):
@@ -212,8 +212,8 @@ def _run_peers(request: BenchRequest, scene: SuiteScene, preset: str, folder: Pa
                 continue
             if not given.exists():
                 export_poses(workspace.root, given, write_colmap)
-            result |= run_peer(peer, given, folder / "peers" / f"{preset}-{peer.name}")
-            mesh = posed_mesh(workspace, folder / "peers" / f"{preset}-{peer.name}" / MESH, file.with_suffix(".ply"))
+            result |= run_peer(peer, given, made)
+            mesh = posed_mesh(workspace, made / MESH, file.with_suffix(".ply"))
             result["scores"] = score_result(scene, workspace, mesh, set(), "cpu")
             result["made_from"] = made_from
         except HineusError as error:
@@ -224,12 +224,12 @@ def _run_peers(request: BenchRequest, scene: SuiteScene, preset: str, folder: Pa
 
 
 # ---------------------------------------------------------------- results
-def _heading(request: BenchRequest, scene: SuiteScene, method: str, preset: str) -> dict[str, Any]:
+def _heading(request: BenchRequest, scene: SuiteScene, method: str) -> dict[str, Any]:
     return {
         "suite": request.suite.name,
         "scene": scene.name,
         "method": method,
-        "preset": preset,
+        "preset": request.preset,
         "asked": dict(text.partition("=")[::2] for text in request.sets) if method == OURS else {},
         "masks": scene.masks is not None,
         "known_poses": scene.poses is not None,

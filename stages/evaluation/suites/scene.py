@@ -25,6 +25,10 @@ class Wanted:
     hold_out: int = 0
     truth: Path | None = None
 
+    def masks_in(self, folder: Path) -> Path | None:
+        """A scene's folder of masks, if it is there and to be used."""
+        return folder if self.masks and folder.is_dir() else None
+
 
 @dataclass(frozen=True)
 class Truth:
@@ -50,7 +54,6 @@ class SuiteScene:
     Attributes:
         name: as the paper's tables call it, for those they have.
         photos: folder. poses, masks: None where they are found or not used.
-        left_out: photos (relative to `photos`) that no stage sees.
         views, truth: what can be scored.
         lacking: what cannot be scored and why, a sentence each.
     """
@@ -59,10 +62,14 @@ class SuiteScene:
     photos: Path
     poses: Path | None = None
     masks: Path | None = None
-    left_out: tuple[str, ...] = ()
     views: TestViews | None = None
     truth: Truth | None = None
     lacking: tuple[str, ...] = ()
+
+    @property
+    def left_out(self) -> tuple[str, ...]:
+        """Test photos that lie among `photos`: no stage may see them."""
+        return self.views.names if self.views is not None and self.views.folder == self.photos else ()
 
 
 def photo_names(folder: Path) -> list[str]:
@@ -79,8 +86,12 @@ def every_nth(folder: Path, names: list[str], poses: Path, every: int) -> TestVi
     return TestViews(folder, tuple(names[::every]), poses) if every else None
 
 
+def places_in(folder: Path) -> list[Path]:
+    """`folder` itself and the folders in it, by name: each may be a scene."""
+    return [folder, *sorted(path for path in folder.iterdir() if path.is_dir())]
+
+
 def folders_with(folder: Path, *needed: str) -> list[Path]:
     """`folder` itself where it has all of the files or folders `needed`, else those of its folders that have."""
-    places = [folder, *sorted(path for path in folder.iterdir() if path.is_dir())]
-    found = [place for place in places if all((place / name).exists() for name in needed)]
+    found = [place for place in places_in(folder) if all((place / name).exists() for name in needed)]
     return found[:1] if folder in found else found

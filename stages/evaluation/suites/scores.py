@@ -9,7 +9,9 @@ import numpy as np
 
 from stages import artifacts
 from stages.engine.workspace import Workspace
-from stages.evaluation.photos.test_photos import TestPhotos, score_test_views
+from stages.evaluation.photos.images import find_lpips
+from stages.evaluation.photos.scoring import score_photos
+from stages.evaluation.photos.test_photos import TestPhotos
 from stages.evaluation.protocols.blendedmvs import evaluate_blended
 from stages.evaluation.protocols.dtu import evaluate_dtu
 from stages.evaluation.protocols.glossy import evaluate_glossy
@@ -37,7 +39,11 @@ def score_result(
         scores["mesh"] = score_surface(scene.truth, mesh, workspace)
     if scene.views is not None and "train" in fresh:
         photos = TestPhotos(scene.views, workspace, scene.masks)
-        scores["views"] = score_test_views(photos, workspace, fresh, device)
+        indices = range(len(photos.cameras))
+        found = score_photos(
+            workspace, photos.cameras, indices, photos.load, device, textured="bake" in fresh, lpips=find_lpips()[0]
+        )
+        scores["views"] = {"counted": len(indices), **found}
     return scores
 
 
@@ -50,7 +56,7 @@ def result_mesh(workspace: Workspace, fresh: set[str], out: Path) -> Path | None
     """
     if "cleanup" not in fresh:
         return None
-    vertices, faces = artifacts.load_mesh(workspace.stage_folder("cleanup"))
+    vertices, faces = artifacts.CLEAN_MESH.load(workspace.stage_folder("cleanup"))
     scene = artifacts.SCENE.load(workspace.stage_folder("undistort"))
     _write(scene.poses_from_scene, (vertices, faces), out)
     return out

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from stages.evaluation.suites.scene import SuiteScene, TestViews, Wanted, every_nth, photo_names
+from stages.evaluation.suites.scene import SuiteScene, TestViews, Wanted, every_nth, photo_names, places_in
 from stages.posing import colmap_model, meganerf
 
 PHOTOS = ("photos", "images", "Photos", "Images", "")
@@ -18,7 +18,7 @@ NO_DISTANCE = "no distance: its scans are for its own evaluation program"
 
 def find_scenes(folder: Path, wanted: Wanted) -> list[SuiteScene]:
     """Scenes in `folder`, or `folder` itself if it is one."""
-    places = [folder, *sorted(path for path in folder.iterdir() if path.is_dir())]
+    places = places_in(folder)
     refined = [_refined(place) for place in places if meganerf.has_metadata(place / "train")]
     if refined and refined[0].photos.parent.parent == folder:
         return refined
@@ -44,9 +44,7 @@ def _raw(place: Path, photos: Path, wanted: Wanted) -> SuiteScene:
     views = every_nth(photos, photo_names(photos), poses, wanted.hold_out) if poses else None
     if poses is None:
         lacking.append("no view synthesis: without poses nothing says where test photos were taken from")
-    return SuiteScene(
-        place.name, photos, poses, left_out=views.names if views else (), views=views, lacking=tuple(lacking)
-    )
+    return SuiteScene(place.name, photos, poses, views=views, lacking=tuple(lacking))
 
 
 def _photos(place: Path) -> Path | None:

@@ -1,0 +1,121 @@
+"""A look at a folder of photos before the work: what their files say and, where wanted, how they look."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from stages.artifacts import SkippedImage
+from stages.capture.background import PLAIN_PHOTOS, find_background
+from stages.capture.exif import camera_key, focal_px
+from stages.capture.listing import list_captures
+from stages.capture.photo_reading import UnusableError, read_head, read_preview, register_formats
+from stages.capture.quality import Appearance, Oddities, appearance, find_oddities
+from stages.capture.video import video_size
+
+
+@dataclass(frozen=True)
+class PhotoFile:
+    """What the head of one photo's file says.
+
+    Attributes:
+        source: path relative to the photo folder.
+        width, height: upright size in pixels.
+        camera: photos with the same value share one camera's intrinsics.
+        has_focal: whether EXIF gives the focal length.
+    """
+
+    source: str
+    width: int
+    height: int
+    camera: str
+    has_focal: bool
+
+
+@dataclass(frozen=True)
+class Video:
+    """A video among the photos: how many frames of which size it may give."""
+
+    source: str
+    frames: int
+    width: int
+    height: int
+
+
+@dataclass(frozen=True)
+class Inspection:
+    """All that was seen.
+
+    Attributes:
+        num_bytes: size of all the files.
+        oddities: none where the photos were not decoded.
+        plain: whether nearly all backgrounds are plain; False where the photos were not decoded.
+    """
+
+    photos: tuple[PhotoFile, ...]
+    videos: tuple[Video, ...]
+    skipped: tuple[SkippedImage, ...]
+    num_bytes: int
+    oddities: Oddities = field(default_factory=Oddities)
+    plain: bool = False
+
+    @property
+    def sizes(self) -> list[tuple[int, int]]:
+        """Width and height of each photo and of each frame that a video may give."""
+        frames = [(video.width, video.height) for video in self.videos for _ in range(video.frames)]
+        return [(photo.width, photo.height) for photo in self.photos] + frames
+
+
+def inspect(source: Path, masks_folder: Path | None, video_frames: int, workers: int, decode: bool) -> Inspection:
+    """Look at all photos of `source` (see `list_captures`); `video_frames`: how many a video gives at most.
+
+    `decode`: also at their pixels, of reduced copies. Damage behind a sound head shows only then.
+
+    Raises:
+        InputError: see `list_captures`.
+    """
+    photos, videos, skipped = list_captures(source, masks_folder)
+    folder = source if source.is_dir() else source.parent
+    register_formats()
+
+    def look(path: str) -> tuple[PhotoFile, Appearance | None, bool] | Video | SkippedImage:
+        try:
+            if path in videos:
+                frames, width, height = video_size(folder / path)
+                return Video(path, min(frames, video_frames), width, height)
+            photo = inspect_file(folder / path, path)
+            if not decode:
+                return photo, None, False
+            pixels = read_preview(folder / path)
+            return photo, appearance(path, pixels), find_background(pixels).is_plain
+        except UnusableError as reason:
+            return SkippedImage(path, str(reason))
+
+    with ThreadPoolExecutor(max_workers=max(1, workers)) as pool:
+        seen = list(pool.map(look, [*photos, *videos]))
+    looked_at = [item for item in seen if isinstance(item, tuple)]
+    return Inspection(
+        photos=tuple(photo for photo, _, _ in looked_at),
+        videos=tuple(item for item in seen if isinstance(item, Video)),
+        skipped=tuple([*skipped, *(item for item in seen if isinstance(item, SkippedImage))]),
+        num_bytes=sum((folder / path).stat().st_size for path in [*photos, *videos]),
+        oddities=find_oddities([look for _, look, _ in looked_at if look is not None]),
+        plain=bool(looked_at) and sum(plain for _, _, plain in looked_at) >= PLAIN_PHOTOS * len(looked_at),
+    )
+
+
+def inspect_file(file: Path, source: str) -> PhotoFile:
+    """What the head of a photo's file says; `register_formats` must have been called for HEIC.
+
+    Raises:
+        UnusableError: it cannot be read or is too small to be a photo.
+    """
+    head = read_head(file)
+    return PhotoFile(
+        source=source,
+        width=head.upright_size[0],
+        height=head.upright_size[1],
+        camera=camera_key(head.exif, head.upright_size, source),
+        has_focal=focal_px(head.exif, head.stored_size) is not None,
+    )
