@@ -283,8 +283,7 @@ class Workbench:
         )
 
     def _matching(self) -> dict[str, Any]:
-        flags = self._guided, self.verified, self._stationary
-        return match_options(self.params, self.threads, self.cuda, *flags)
+        return match_options(self.params, self.threads, self.cuda, self._guided, self.verified, self._stationary)
 
     @property
     def verified(self) -> int:
