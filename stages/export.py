@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -46,15 +46,15 @@ class Asset:
     note: str
     out: Path
 
-    def in_world(self, mesh: artifacts.AtlasMesh) -> tuple[np.ndarray, np.ndarray]:
-        """Vertices and unit normals [V, 3] of a mesh of the scene frame."""
+    def in_world(self, mesh: artifacts.AtlasMesh) -> artifacts.AtlasMesh:
+        """A mesh of the scene frame in the world, its vertices and normals as float64 and the normals unit."""
         normals = unit_normals(mesh.vertices, mesh.normals, mesh.faces) @ self.world_from_scene.rotation.T
-        return self.world_from_scene.apply(mesh.vertices.astype(np.float64)), normals
+        return replace(mesh, vertices=self.world_from_scene.apply(mesh.vertices.astype(np.float64)), normals=normals)
 
-    def in_gltf(self, mesh: artifacts.AtlasMesh) -> tuple[np.ndarray, np.ndarray]:
+    def in_gltf(self, mesh: artifacts.AtlasMesh) -> artifacts.AtlasMesh:
         """The same with Y up."""
-        vertices, normals = self.in_world(mesh)
-        return vertices @ self.gltf_from_world.T, normals @ self.gltf_from_world.T
+        world, turn = self.in_world(mesh), self.gltf_from_world.T
+        return replace(world, vertices=world.vertices @ turn, normals=world.normals @ turn)
 
 
 def run(context: StageContext[ExportParams]) -> dict[str, Any]:
@@ -81,8 +81,8 @@ def run(context: StageContext[ExportParams]) -> dict[str, Any]:
     }
     writers = {"glb": _write_glb, "usdz": _write_usdz, "obj": _write_obj, "ply": _write_ply, "stl": _write_stl}
     try:
-        vertices, _ = asset.in_world(asset.mesh)
-        numbers["extent"] = [round(float(side), 6) for side in np.ptp(vertices, axis=0)]
+        extent = np.ptp(asset.in_world(asset.mesh).vertices, axis=0)
+        numbers["extent"] = [round(float(side), 6) for side in extent]
         sizes: dict[str, int] = {name: write(asset) for name, write in writers.items() if name in params.formats}
         for level, (faces, size) in enumerate(_write_levels(asset, params.lods), 1):
             numbers.setdefault("lod_faces", []).append(faces)
@@ -103,8 +103,7 @@ def _write_glb(asset: Asset) -> int:
 def _textured_glb(asset: Asset, mesh: artifacts.AtlasMesh, extras: dict[str, Any]) -> bytes:
     from stages.files.glb import glb_bytes
 
-    vertices, normals = asset.in_gltf(mesh)
-    return glb_bytes(vertices, normals, mesh.uvs, mesh.faces, asset.textures, generator=generator(), extras=extras)
+    return glb_bytes(asset.in_gltf(mesh), asset.textures, generator=generator(), extras=extras)
 
 
 def _write_levels(asset: Asset, count: int) -> Iterator[tuple[int, int]]:
@@ -141,10 +140,8 @@ def _write_usdz(asset: Asset) -> int:
     """Lengths without a known unit are taken for metres, as glTF does with all."""
     from stages.files.usd import usdz_bytes
 
-    vertices, normals = asset.in_gltf(asset.mesh)
-    uvs, faces = asset.mesh.uvs, asset.mesh.faces
     try:
-        data = usdz_bytes(vertices, normals, uvs, faces, asset.textures, extras=asset.extras)
+        data = usdz_bytes(asset.in_gltf(asset.mesh), asset.textures, asset.extras)
     except ImportError as error:
         raise SystemRequirementError(
             f"USDZ files are written with usd-core, which cannot be imported: {error}.",
@@ -165,23 +162,24 @@ def _write_obj(asset: Asset) -> int:
         normal_map_path.write_bytes(asset.textures.normal)
         normal_map_name = normal_map_path.name
     mtl.write_text(mtl_text(texture_path.name, normal_map_name), encoding="utf-8")
-    text = obj_text(*asset.in_world(asset.mesh), asset.mesh.uvs, asset.mesh.faces, mtl.name, asset.note)
+    text = obj_text(asset.in_world(asset.mesh), mtl.name, asset.note)
     return artifacts.asset_path(asset.out, "obj").write_text(text, encoding="utf-8")
 
 
 def _write_ply(asset: Asset) -> int:
     from stages.files.ply_stl import ply_bytes
 
-    colors = vertex_colors(asset.textures.base_color, asset.mesh.uvs)
-    data = ply_bytes(*asset.in_world(asset.mesh), colors, asset.mesh.faces, asset.note)
+    mesh = asset.in_world(asset.mesh)
+    colors = vertex_colors(asset.textures.base_color, mesh.uvs)
+    data = ply_bytes(mesh.vertices, mesh.normals, colors, mesh.faces, asset.note)
     return artifacts.asset_path(asset.out, "ply").write_bytes(data)
 
 
 def _write_stl(asset: Asset) -> int:
     from stages.files.ply_stl import stl_bytes
 
-    vertices, _ = asset.in_world(asset.mesh)
-    return artifacts.asset_path(asset.out, "stl").write_bytes(stl_bytes(vertices, asset.mesh.faces, asset.note))
+    mesh = asset.in_world(asset.mesh)
+    return artifacts.asset_path(asset.out, "stl").write_bytes(stl_bytes(mesh.vertices, mesh.faces, asset.note))
 
 
 def load_textures(context: StageContext[ExportParams]) -> Textures:

@@ -27,11 +27,11 @@ from stages.artifacts import (
     KnownSphere,
     write_png,
 )
+from stages.drawing.overview import overview_svg
 from stages.engine.stage import Stage, StageContext
 from stages.errors import ReconstructionError
 from stages.geometry.cameras import PinholeCameras, PosedScene
 from stages.geometry.normalisation import into_frame, scene_frame
-from stages.geometry.overview import overview_svg
 from stages.geometry.place import GivenRegion
 from stages.geometry.plane import Plane, find_ground
 from stages.geometry.region import RegionOfInterest, find_region, grown_alone

@@ -21,11 +21,11 @@ from stages.artifacts import (
     VertexQuality,
     write_png,
 )
+from stages.drawing.overview import overview_svg
 from stages.engine.fingerprint import Identity
 from stages.engine.manifest import Manifest
 from stages.engine.stage import StageContext
 from stages.geometry.cameras import PinholeCameras
-from stages.geometry.overview import overview_svg
 from stages.geometry.place import Place, given_region
 from stages.geometry.plane import Plane
 from stages.geometry.similarity import Similarity

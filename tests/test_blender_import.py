@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from benchmarks import blender_import
+from stages.artifacts import AtlasMesh
 from stages.files.contents import Textures
 from stages.files.glb import glb_bytes, shapes_glb_bytes
 
@@ -23,7 +24,7 @@ def model(tmp_path: Path) -> Path:
     png = cv2.imencode(".png", np.full((4, 4, 3), 128, np.uint8))[1].tobytes()
     normals = np.tile([0.0, 0.0, 1.0], (4, 1))
     path = tmp_path / "model.glb"
-    path.write_bytes(glb_bytes(CORNERS, normals, CORNERS[:, :2], FACES, Textures(png, png, png)))
+    path.write_bytes(glb_bytes(AtlasMesh(CORNERS, normals, CORNERS[:, :2], FACES, 4), Textures(png, png, png)))
     return path
 
 

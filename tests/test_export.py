@@ -497,11 +497,11 @@ def test_normals_without_length_are_mended():
 def test_wrong_arrays_are_refused():
     atlas, _ = tetrahedron()
     with pytest.raises(ValueError, match="unit normals"):
-        glb_bytes(atlas.vertices, atlas.normals * 2, atlas.uvs, atlas.faces, Textures(b""))
+        glb_bytes(replace(atlas, normals=atlas.normals * 2), Textures(b""))
     with pytest.raises(ValueError, match=r"vertices in \[0, 12\)"):
-        obj_text(atlas.vertices, atlas.normals, atlas.uvs, atlas.faces + 5, "m.mtl")
+        obj_text(replace(atlas, faces=atlas.faces + 5), "m.mtl")
     with pytest.raises(ValueError, match="finite"):
-        glb_bytes(atlas.vertices * np.nan, atlas.normals, atlas.uvs, atlas.faces, Textures(b""))
+        glb_bytes(replace(atlas, vertices=atlas.vertices * np.nan), Textures(b""))
 
 
 def test_ply_header_counts():

@@ -86,6 +86,7 @@ def test_the_command_fails_when_a_figure_left_its_bounds(found, code, tmp_path, 
 def test_a_glb_is_read_back_into_the_frame_it_came_from(tmp_path):
     from PIL import Image
 
+    from stages.artifacts import AtlasMesh
     from stages.files.contents import Textures
     from stages.files.glb import glb_bytes
 
@@ -104,7 +105,8 @@ def test_a_glb_is_read_back_into_the_frame_it_came_from(tmp_path):
     path = tmp_path / "model.glb"
     extras = {"gltf_from_world_rotation": turn.tolist(), "world_from_scene": world_from_scene.tolist()}
     normals = np.tile([0, 1.0, 0], (4, 1))
-    path.write_bytes(glb_bytes(world @ turn.T, normals, uvs, faces, Textures(png.getvalue()), extras=extras))
+    turned = AtlasMesh(world @ turn.T, normals, uvs, faces, 8)
+    path.write_bytes(glb_bytes(turned, Textures(png.getvalue()), extras=extras))
     mesh, read_texture = smoke.read_glb(path)
     np.testing.assert_allclose(mesh.vertices, vertices, atol=1e-5)
     np.testing.assert_allclose(mesh.uvs, uvs, atol=1e-6)

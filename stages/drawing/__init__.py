@@ -1,1 +1,1 @@
-"""Meshes to pixels: rasteriser, pictures, and how they meet photos. Arrays in, arrays out."""
+"""Pictures: meshes to pixels, how these meet photos, and the capture from above. Arrays in, arrays out."""

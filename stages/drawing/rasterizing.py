@@ -131,11 +131,6 @@ def depth_map(
     return rasterize(xy, inverse_depth, faces, width, height)
 
 
-def texel_positions(uvs: np.ndarray, size: int) -> np.ndarray:
-    """Pixel coordinates [V, 2] in a texture of `size`² of UVs [V, 2] with their origin at the bottom-left."""
-    return np.stack([uvs[:, 0] * size, (1.0 - uvs[:, 1]) * size], 1)
-
-
 @dataclass(frozen=True)
 class Texels:
     """The texels of a square texture whose centres lie in a chart.
@@ -172,7 +167,7 @@ def rasterize_atlas(uvs: np.ndarray, faces: np.ndarray, size: int) -> Texels:
         faces: [F, 3].
         size: side of the texture in texels.
     """
-    xy = texel_positions(uvs, size)
+    xy = np.stack([uvs[:, 0] * size, (1.0 - uvs[:, 1]) * size], 1)
     ones = np.ones(len(xy))
     face_map = rasterize(xy, ones, faces, size, size)[0].ravel()
     index = np.flatnonzero(face_map != NO_FACE)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+
+from stages.artifacts import AtlasMesh
 
 ROUGHNESS = 0.9
 
@@ -24,19 +26,23 @@ class Textures:
     occlusion: bytes | None = None
 
 
-def checked_mesh(
-    vertices: np.ndarray, normals: np.ndarray, uvs: np.ndarray, faces: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """The arrays as float32 and uint32; wrong ones are refused."""
-    num = len(vertices)
-    if normals.shape != (num, 3) or uvs.shape != (num, 2):
-        raise ValueError(f"expected normals [{num}, 3] and uvs [{num}, 2], got {normals.shape} and {uvs.shape}")
+def checked_mesh(mesh: AtlasMesh) -> AtlasMesh:
+    """The mesh with arrays of float32 and uint32.
+
+    Raises:
+        ValueError: an index is out of range, a normal is not unit or a number is not finite.
+    """
+    num, faces = len(mesh.vertices), mesh.faces
+    if mesh.normals.shape != (num, 3) or mesh.uvs.shape != (num, 2):
+        shapes = f"{mesh.normals.shape} and {mesh.uvs.shape}"
+        raise ValueError(f"expected normals [{num}, 3] and uvs [{num}, 2], got {shapes}")
     if not len(faces) or faces.min() < 0 or faces.max() >= num:
         raise ValueError(f"expected at least one face with vertices in [0, {num}), got {faces.shape[0]} faces")
-    arrays = [np.ascontiguousarray(array, dtype=np.float32) for array in (vertices, normals, uvs)]
+    arrays = [np.ascontiguousarray(array, dtype=np.float32) for array in (mesh.vertices, mesh.normals, mesh.uvs)]
     if not all(np.isfinite(array).all() for array in arrays):
         raise ValueError("expected finite vertices, normals and uvs")
     lengths = np.linalg.norm(arrays[1], axis=1)
     if np.abs(lengths - 1).max() > 1e-3:
         raise ValueError(f"expected unit normals, got lengths in [{lengths.min():.3g}, {lengths.max():.3g}]")
-    return arrays[0], arrays[1], arrays[2], np.ascontiguousarray(faces, dtype=np.uint32)
+    vertices, normals, uvs = arrays
+    return replace(mesh, vertices=vertices, normals=normals, uvs=uvs, faces=np.ascontiguousarray(faces, np.uint32))

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from stages.artifacts import AtlasMesh
 from stages.files.contents import ROUGHNESS, Textures, checked_mesh
 from stages.texture.tangents import vertex_tangents
 
@@ -19,10 +20,7 @@ _SAMPLER = {"magFilter": 9729, "minFilter": 9987, "wrapS": 33071, "wrapT": 33071
 
 
 def glb_bytes(
-    vertices: np.ndarray,
-    normals: np.ndarray,
-    uvs: np.ndarray,
-    faces: np.ndarray,
+    mesh: AtlasMesh,
     textures: Textures,
     generator: str = "hineus",
     extras: dict[str, Any] | None = None,
@@ -34,17 +32,15 @@ def glb_bytes(
     goes the frame it was baked for, as TANGENT.
 
     Args:
-        vertices: [V, 3] in a right-handed, Y-up frame.
-        normals: [V, 3] unit.
-        uvs: [V, 2], origin at the bottom-left (turned to glTF's top-left here).
-        faces: [F, 3], counter-clockwise seen from outside.
+        mesh: in a right-handed, Y-up frame. Its UVs are turned to glTF's top-left origin here.
         textures: of the material.
         extras: JSON-able, kept in the asset's extras.
 
     Raises:
-        ValueError: an index is out of range, a normal is not unit or a number is not finite.
+        ValueError: see `checked_mesh`.
     """
-    vertices, normals, uvs, faces = checked_mesh(vertices, normals, uvs, faces)
+    mesh = checked_mesh(mesh)
+    vertices, normals, uvs, faces = mesh.vertices, mesh.normals, mesh.uvs, mesh.faces
     flipped = uvs.copy()
     flipped[:, 1] = 1 - flipped[:, 1]
     bounds = {"min": vertices.min(0).tolist(), "max": vertices.max(0).tolist()}

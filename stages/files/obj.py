@@ -4,26 +4,20 @@ from __future__ import annotations
 
 import numpy as np
 
+from stages.artifacts import AtlasMesh
 from stages.files.contents import ROUGHNESS, checked_mesh
 
 
-def obj_text(
-    vertices: np.ndarray,
-    normals: np.ndarray,
-    uvs: np.ndarray,
-    faces: np.ndarray,
-    mtl_name: str,
-    comment: str = "",
-) -> str:
+def obj_text(mesh: AtlasMesh, mtl_name: str, comment: str = "") -> str:
     """An OBJ with positions, UVs (bottom-left origin), normals, the material "textured" of `mtl_name`, a comment."""
-    vertices, normals, uvs, faces = checked_mesh(vertices, normals, uvs, faces)
+    mesh = checked_mesh(mesh)
     lines = [f"# {comment}"] if comment else []
     lines += [f"mtllib {mtl_name}", "o model"]
-    lines += [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in vertices.tolist()]
-    lines += [f"vt {u:.7g} {v:.7g}" for u, v in uvs.tolist()]
-    lines += [f"vn {x:.6g} {y:.6g} {z:.6g}" for x, y, z in normals.tolist()]
+    lines += [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in mesh.vertices.tolist()]
+    lines += [f"vt {u:.7g} {v:.7g}" for u, v in mesh.uvs.tolist()]
+    lines += [f"vn {x:.6g} {y:.6g} {z:.6g}" for x, y, z in mesh.normals.tolist()]
     lines.append("usemtl textured")
-    lines += [f"f {a}/{a}/{a} {b}/{b}/{b} {c}/{c}/{c}" for a, b, c in (faces.astype(np.int64) + 1).tolist()]
+    lines += [f"f {a}/{a}/{a} {b}/{b}/{b} {c}/{c}/{c}" for a, b, c in (mesh.faces.astype(np.int64) + 1).tolist()]
     return "\n".join(lines) + "\n"
 
 

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from stages.artifacts import AtlasMesh
 from stages.files.contents import ROUGHNESS, Textures, checked_mesh
 
 ROOT = "/model"
@@ -20,31 +21,21 @@ ROOT_LAYER = "model.usdc"  # AR viewers want the binary form, and first in the p
 ALIGNMENT, PADDING_FIELD = 64, 0x1986
 
 
-def usdz_bytes(
-    vertices: np.ndarray,
-    normals: np.ndarray,
-    uvs: np.ndarray,
-    faces: np.ndarray,
-    textures: Textures,
-    extras: dict[str, Any] | None = None,
-) -> bytes:
+def usdz_bytes(mesh: AtlasMesh, textures: Textures, extras: dict[str, Any] | None = None) -> bytes:
     """A USDZ package of one mesh with one UsdPreviewSurface, as ARKit asks for it.
 
     Args:
-        vertices: [V, 3] in a right-handed, Y-up frame; metres, as in glTF.
-        normals: [V, 3] unit.
-        uvs: [V, 2], origin at the bottom-left, as in USD.
-        faces: [F, 3], counter-clockwise seen from outside.
+        mesh: in a right-handed, Y-up frame; metres, as in glTF.
         textures: of the material.
         extras: JSON-able, kept as text under "hineus" in the layer's own data.
 
     Raises:
         ImportError: there is no usd-core.
-        ValueError: an index is out of range, a normal is not unit or a number is not finite.
+        ValueError: see `checked_mesh`.
     """
     from pxr import Usd
 
-    vertices, normals, uvs, faces = checked_mesh(vertices, normals, uvs, faces)
+    mesh = checked_mesh(mesh)
     optional = {"normal.png": textures.normal, "occlusion.png": textures.occlusion}
     images = {"base_color.png": textures.base_color}
     images |= {file: png for file, png in optional.items() if png is not None}
@@ -53,7 +44,7 @@ def usdz_bytes(
         layer = Path(folder) / ROOT_LAYER
         stage = Usd.Stage.CreateNew(str(layer))
         _describe(stage, extras)
-        _add_material(stage, _add_mesh(stage, vertices, normals, uvs, faces), set(images))
+        _add_material(stage, _add_mesh(stage, mesh), set(images))
         stage.GetRootLayer().Save()
         return _packed({ROOT_LAYER: layer.read_bytes(), **images})
 
@@ -84,21 +75,21 @@ def _describe(stage: Any, extras: dict[str, Any] | None) -> None:
         stage.GetRootLayer().customLayerData = {"hineus": json.dumps(extras)}
 
 
-def _add_mesh(stage: Any, vertices: np.ndarray, normals: np.ndarray, uvs: np.ndarray, faces: np.ndarray) -> Any:
+def _add_mesh(stage: Any, mesh: AtlasMesh) -> Any:
     from pxr import Sdf, UsdGeom, Vt
 
-    mesh = UsdGeom.Mesh.Define(stage, f"{ROOT}/mesh")
-    points = Vt.Vec3fArray.FromNumpy(vertices)
-    mesh.CreatePointsAttr(points)
-    mesh.CreateExtentAttr(UsdGeom.PointBased.ComputeExtent(points))
-    mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(faces), 3, dtype=np.int32)))
-    mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(faces.astype(np.int32).ravel()))
-    mesh.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(normals))
-    mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
-    mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
-    st = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar("st", Sdf.ValueTypeNames.TexCoord2fArray, UsdGeom.Tokens.vertex)
-    st.Set(Vt.Vec2fArray.FromNumpy(uvs))
-    return mesh
+    made = UsdGeom.Mesh.Define(stage, f"{ROOT}/mesh")
+    points = Vt.Vec3fArray.FromNumpy(mesh.vertices)
+    made.CreatePointsAttr(points)
+    made.CreateExtentAttr(UsdGeom.PointBased.ComputeExtent(points))
+    made.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(mesh.faces), 3, dtype=np.int32)))
+    made.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(mesh.faces.astype(np.int32).ravel()))
+    made.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(mesh.normals))
+    made.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
+    made.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+    st = UsdGeom.PrimvarsAPI(made).CreatePrimvar("st", Sdf.ValueTypeNames.TexCoord2fArray, UsdGeom.Tokens.vertex)
+    st.Set(Vt.Vec2fArray.FromNumpy(mesh.uvs))
+    return made
 
 
 def _add_material(stage: Any, mesh: Any, files: set[str]) -> None:

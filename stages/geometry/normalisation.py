@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -42,4 +43,4 @@ def into_frame(cameras: PinholeCameras, old_from_new: Similarity) -> PinholeCame
     extrinsics = np.empty_like(cameras.extrinsics)
     extrinsics[:, :, :3] = rotation @ old_from_new.rotation
     extrinsics[:, :, 3] = (rotation @ old_from_new.translation + translation) / old_from_new.scale
-    return PinholeCameras(cameras.names, cameras.sizes, cameras.intrinsics, extrinsics)
+    return replace(cameras, extrinsics=extrinsics)

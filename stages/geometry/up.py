@@ -28,10 +28,12 @@ MAX_SLOPE_DEG = 10.0
 
 @dataclass(frozen=True)
 class Up:
-    """Attributes:
-    direction: unit.
-    source: what it was found from, in words.
-    sure: whether the cameras were held level in enough directions to tell (of the cameras' estimate).
+    """Which way is up.
+
+    Attributes:
+        direction: unit.
+        source: what it was found from, in words.
+        sure: whether the cameras were held level in enough directions to tell (of the cameras' estimate).
     """
 
     direction: Float[np.ndarray, " 3"]

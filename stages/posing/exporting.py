@@ -38,7 +38,10 @@ def write_colmap(undistort: Path, sfm: Path, place: Path, out: Path) -> dict[str
 
 
 def write_transforms(undistort: Path, sfm: Path, place: Path, out: Path) -> dict[str, Any]:
-    """Write images/, masks/ (where there are any), transforms.json, a PLY of the sparse points; as `write_colmap`."""
+    """Write images/, masks/ (where there are any), transforms.json and a PLY of the sparse points.
+
+    Arguments and numbers are those of `write_colmap`.
+    """
     in_world = artifacts.PLACE.load(place)
     scene, model = _images_and_model(undistort, sfm, in_world, out)
     model.export_PLY(str(out / POINTS))

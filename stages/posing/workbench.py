@@ -12,6 +12,7 @@ import tempfile
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -112,8 +113,12 @@ class Workbench:
             self._rung_of(f"{self.matcher} matching", self.first),
             self._rung_of("all pairs", self.all_pairs, lambda best: self.matcher != "exhaustive"),
             self._rung_of("no focal priors", self.no_focal_priors, self.priors_are_doubtful),
-            self._rung_of("features inside the masks", self.inside_masks, lambda best: masked),
-            self._rung_of("affine features", self.affine_features),
+            # On the object only: its surroundings may move.
+            self._rung_of("features inside the masks", partial(self.other_features, masked=True), lambda best: masked),
+            # Features that follow tilted surfaces, and fainter ones. On two views of carpet 50 degrees apart 57 matches
+            # became of 11, in 1.2 times the seconds. Pooling over sizes makes it 111, but takes 2.5 times the seconds,
+            # and placed no photo that this did not.
+            self._rung_of("affine features", partial(self.other_features, affine=True)),
             self._rung_of("guided matching", self.guided_matching),
             self._rung_of(f"{self._other} mapper", self.other_mapper),
             self._rung_of(RELAXED, self.relaxed_thresholds),
@@ -152,19 +157,9 @@ class Workbench:
         self._verify_again(base)
         return self._solve(base, self.params.mapper)
 
-    def inside_masks(self, best: Solution | None) -> Solution | None:
-        """Features on the object only: its surroundings may move."""
-        base = replace(self._base_of(best), masked=True)
-        self._features_and_matches(base, best)
-        return self._solve(base, self.params.mapper)
-
-    def affine_features(self, best: Solution | None) -> Solution | None:
-        """Features that follow tilted surfaces, and fainter ones.
-
-        On two views of carpet 50 degrees apart 57 matches became of 11, in 1.2 times the seconds. Pooling over sizes
-        makes it 111, but takes 2.5 times the seconds, and placed no photo that this did not.
-        """
-        base = replace(self._base_of(best), affine=True)
+    def other_features(self, best: Solution | None, **changes: bool) -> Solution | None:
+        """Features of another `Base`, that of the best solution with these changes."""
+        base = replace(self._base_of(best), **changes)
         self._features_and_matches(base, best)
         return self._solve(base, self.params.mapper)
 
@@ -288,8 +283,7 @@ class Workbench:
         )
 
     def _matching(self) -> dict[str, Any]:
-        flags = self._guided, self.verified, self._stationary
-        return match_options(self.params, self.threads, self.cuda, *flags)
+        return match_options(self.params, self.threads, self.cuda, self._guided, self.verified, self._stationary)
 
     @property
     def verified(self) -> int:

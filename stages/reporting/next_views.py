@@ -99,7 +99,7 @@ def suggest_views(
         needs: [V] 0..1, see `vertex_needs`.
         scene: its cameras, up, ground and kind.
     """
-    areas = _vertex_areas(vertices, faces)
+    areas = sum_around(faces, face_areas(vertices, faces)[:, None] / 3, len(vertices))[:, 0]
     if scene.ground is not None:  # nobody looks up through the table
         areas = np.where(scene.ground.heights(vertices) < -UNDER_GROUND, 0, areas)
     weighed = areas * needs
@@ -245,7 +245,7 @@ def _degrees(angle: float) -> int:
     return 5 * round(abs(float(angle)) / 5)
 
 
-# ---------------------------------------------------------------- angles and areas
+# ---------------------------------------------------------------- angles and heights
 def _azimuths(directions: np.ndarray, reference: np.ndarray, up: np.ndarray) -> np.ndarray:
     """Degrees [N] that directions [N, 3] lie counter-clockwise of a reference [3], seen from above; -180..180."""
     flat = reference - (reference @ up) * up
@@ -269,8 +269,3 @@ def _extent(vertices: np.ndarray, scene: PosedScene) -> tuple[float, float]:
     """Coordinates along up of the object's foot (the ground, where it is known) and top."""
     heights = vertices @ scene.up
     return float(heights.min() if scene.ground is None else scene.ground.offset), float(heights.max())
-
-
-def _vertex_areas(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """A third of the area of the faces around each vertex [V]."""
-    return sum_around(faces, face_areas(vertices, faces)[:, None] / 3, len(vertices))[:, 0]

@@ -59,14 +59,10 @@ def convex_pieces(vertices: np.ndarray, faces: np.ndarray, count: int) -> list[t
 
 def hull(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The convex hull of points [P, 3]: its corners [C, 3] and faces [D, 3], counter-clockwise seen from outside."""
-    from scipy.spatial import ConvexHull
+    import trimesh
 
-    found = ConvexHull(points)
-    a, b, c = points[found.simplices].transpose(1, 0, 2)
-    inwards = (np.cross(b - a, c - a) * found.equations[:, :3]).sum(1) < 0
-    faces = np.where(inwards[:, None], found.simplices[:, ::-1], found.simplices)
-    corners, index = np.unique(faces, return_inverse=True)
-    return points[corners], index.reshape(-1, 3).astype(np.int32)
+    found = trimesh.convex.convex_hull(points, qhull_options="Qt")
+    return np.asarray(found.vertices), np.asarray(found.faces, dtype=np.int32)
 
 
 def _without_holes(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -126,7 +126,8 @@ def bake_texture(
             listener(next(done), total, note)
 
     with ThreadPoolExecutor(max_workers=max(1, workers)) as pool:
-        prepare = _Prepare(atlas, cameras, load_photo, _texel_side(atlas, num_texels))
+        texel_side = float(np.sqrt(face_areas(atlas.vertices, atlas.faces).sum() / num_texels))  # mean, scene units
+        prepare = _Prepare(atlas, cameras, load_photo, texel_side)
         gains, sharpness = _compare(atlas, texels, _prefetch(pool, prepare, num_views, workers), num_views, tell)
         if not gain:
             gains = np.ones((num_views, 3))
@@ -165,11 +166,6 @@ def bake_texture(
             "blurred_photos": int((sharpness < BLURRED).sum()),
         },
     )
-
-
-def _texel_side(atlas: AtlasMesh, count: int) -> float:
-    """Mean side of a texel on the surface, scene units."""
-    return float(np.sqrt(face_areas(atlas.vertices, atlas.faces).sum() / count))
 
 
 class _Prepare:

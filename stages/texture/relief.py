@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
@@ -69,7 +70,7 @@ def bake_normals(
 
 
 def _normals_near(
-    scene: object, full_normals: np.ndarray, faces: np.ndarray, points: np.ndarray, normals: np.ndarray,
+    scene: Any, full_normals: np.ndarray, faces: np.ndarray, points: np.ndarray, normals: np.ndarray,
     reach: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Whether the full mesh is within `reach` [T] along the normals both ways [T] bool, and its normals [T, 3]."""
@@ -81,7 +82,7 @@ def _normals_near(
     for side in (1.0, -1.0):
         direction = (side * normals).astype(np.float32)
         rays = np.concatenate([points - back * direction, direction], axis=1).astype(np.float32)
-        hit = scene.cast_rays(o3d.core.Tensor(rays))  # type: ignore[attr-defined]
+        hit = scene.cast_rays(o3d.core.Tensor(rays))
         distance = np.abs(hit["t_hit"].numpy() - back[:, 0])
         rows = np.flatnonzero(distance < np.minimum(reach, nearest))
         u, v = hit["primitive_uvs"].numpy()[rows].T

@@ -2,15 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from stages.geometry.cameras import PosedScene
 from stages.geometry.place import BOX_EDGES
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
 
 SIDE = 360  # of each view, drawing units
 MAX_POINTS = 2500
@@ -19,11 +14,11 @@ MIN_REACH, MAX_REACH, AIR = 1.3, 12.0, 1.08
 COLORS = {"point": "#8a94a3", "inside": "#3c8d5a", "camera": "#2f6fb0", "region": "#d9822b", "ground": "#a0522d"}
 
 
-def overview_svg(scene: PosedScene, box_corners: Float[np.ndarray, "8 3"] | None = None) -> str:
+def overview_svg(scene: PosedScene, box_corners: np.ndarray | None = None) -> str:
     """An SVG with two views of the scene frame side by side: from above (x right, y up), from the side (x, z).
 
     Args:
-        box_corners: scene frame, of the box that the mesh is cropped to; see `GivenRegion.box_corners`.
+        box_corners: [8, 3] scene frame, of the box that the mesh is cropped to; see `GivenRegion.box_corners`.
     """
     centers = scene.cameras.centers
     reach = float(np.clip(AIR * np.abs(centers).max(), MIN_REACH, MAX_REACH))
@@ -47,12 +42,12 @@ def overview_svg(scene: PosedScene, box_corners: Float[np.ndarray, "8 3"] | None
     )
 
 
-def _on_page(points: Float[np.ndarray, "p 3"], axis: int, reach: float) -> Float[np.ndarray, "p 2"]:
-    """Drawing positions of scene points: x to the right, coordinate `axis` up."""
+def _on_page(points: np.ndarray, axis: int, reach: float) -> np.ndarray:
+    """Drawing positions [P, 2] of scene points [P, 3]: x to the right, coordinate `axis` up."""
     return SIDE / 2 * (1 + points[:, (0, axis)] / reach * (1, -1))
 
 
-def _points(points: Float[np.ndarray, "p 3"], axis: int, reach: float) -> str:
+def _points(points: np.ndarray, axis: int, reach: float) -> str:
     """Dots, those inside the region in their own colour; each set is one path of short strokes."""
     inside = np.linalg.norm(points, axis=1) < 1
     paths = []
@@ -64,7 +59,7 @@ def _points(points: Float[np.ndarray, "p 3"], axis: int, reach: float) -> str:
     return "".join(paths)
 
 
-def _region(box_corners: Float[np.ndarray, "8 3"] | None, axis: int, reach: float) -> str:
+def _region(box_corners: np.ndarray | None, axis: int, reach: float) -> str:
     """The unit sphere, and the box where there is one."""
     middle, stroke = SIDE / 2, f'fill="none" stroke="{COLORS["region"]}" stroke-width="1.5"'
     shapes = f'<circle cx="{middle}" cy="{middle}" r="{SIDE / 2 / reach:.1f}" {stroke}/>'
@@ -89,8 +84,8 @@ def _ground(scene: PosedScene, reach: float) -> str:
     )
 
 
-def _cameras(centers: Float[np.ndarray, "n 3"], forward: Float[np.ndarray, "n 3"], axis: int, reach: float) -> str:
-    """A dot for each camera with a stroke to where it looks."""
+def _cameras(centers: np.ndarray, forward: np.ndarray, axis: int, reach: float) -> str:
+    """A dot for each camera, of `centers` [N, 3], with a stroke to where it looks, unit directions [N, 3]."""
     start, end = (_on_page(points, axis, reach) for points in (centers, centers + 0.08 * reach * forward))
     shapes = [
         f'<circle cx="{x:.1f}" cy="{y:.1f}" r="2.5"/><path d="M{x:.1f} {y:.1f}L{u:.1f} {v:.1f}"/>'
