@@ -18,9 +18,9 @@ from stages.artifacts import GIVEN_POSES, GIVEN_REGION, IMAGE_SET, MODEL, PHOTOS
 from stages.engine.stage import Stage, StageContext
 from stages.errors import ConfigError, InputError
 from stages.geometry.cameras import PinholeCameras
-from stages.geometry.markers import MarkerScale, detect_markers, measure_markers
 from stages.geometry.place import GivenRegion, Located, Place, given_region, locate
 from stages.geometry.similarity import Similarity
+from stages.posing.markers import MarkerScale, detect_markers, measure_markers
 from stages.posing.undistortion import plan_warp, posed_cameras, registered_photos
 
 log = logging.getLogger(__name__)
@@ -58,7 +58,7 @@ def run(context: StageContext[PlaceParams]) -> dict[str, Any]:
         "scale_from": place.scale_from or "nothing",
         "scale_error_percent": place.scale_error and round(100 * place.scale_error, 3),
         "gps_residual_m": place.gps_residual and round(place.gps_residual, 3),
-        "up_from": up_from,
+        **({"up_from": up_from} if up_from else {}),
     }
 
 

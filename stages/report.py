@@ -50,11 +50,11 @@ REPLAY_WORKSPACE = "again_hineus"
 
 
 def run(context: StageContext[ReportParams]) -> dict[str, Any]:
-    """Write report.html. Returns its size in bytes, and how the final mesh meets photos that were kept back."""
+    """Write report.html. Returns its size in bytes, and how the final mesh meets held-out photos."""
     import jinja2
 
     from stages.reporting import curves, numbers, photo_table, pictures
-    from stages.reporting.kept_back import compare_held_out
+    from stages.reporting.held_out_photos import compare_held_out
 
     place, atlas, texture = context.read(PLACE), context.read(ATLAS), pictures.read_rgb(context.read(BASE_COLOR))
     scene = context.read(SCENE)
@@ -68,7 +68,7 @@ def run(context: StageContext[ReportParams]) -> dict[str, Any]:
         "texture": pictures.jpeg_uri(pictures.shrink(texture, pictures.PICTURE_SIDE)),
         "provenance": pictures.describe_provenance(context.read(PROVENANCE)),
     }
-    context.progress(1, steps, "comparing with photos that were kept back")
+    context.progress(1, steps, "comparing with held-out photos")
     page["held_out"] = compare_held_out(
         atlas, texture, scene.cameras, lambda index: pinholes.masked(scene.cameras.names[index]), held_out
     )

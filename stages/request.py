@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-HOLD_OUT = "train.hold_out"  # the setting that keeps every n-th photo back
+HOLD_OUT = "train.hold_out"  # the setting that holds out every n-th photo
 
 
 @dataclass(frozen=True)

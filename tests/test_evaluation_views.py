@@ -1,4 +1,4 @@
-"""Photos held back against drawings: closed forms of the scores, a field drawn whole, and the command."""
+"""Held-out photos against drawings: closed forms of the scores, a field drawn whole, and the command."""
 
 from __future__ import annotations
 
@@ -185,7 +185,7 @@ def publish(workspace: Workspace, stage: str, write, params: dict | None = None)
 
 @pytest.fixture
 def workspace(tmp_path: Path) -> Workspace:
-    """A ball that was not trained: the field it starts from, and a grey texture; two photos are held back."""
+    """A ball that was not trained: the field it starts from, and a grey texture; two photos are held out."""
     cameras = ring_of_cameras()
     opened = Workspace.open(tmp_path / "run", create=True)
     with opened.lock():
@@ -239,7 +239,7 @@ def test_what_is_missing_or_stale_is_explained(workspace, tmp_path):
     publish(workspace, "bake", lambda out: artifacts.write_png(artifacts.BASE_COLOR.load(out), gray))
     code, refused = evaluate(workspace.root)
     assert code == 3
-    assert "holds no photos back" in refused["error"]["message"]
+    assert "holds out no photos" in refused["error"]["message"]
     assert "--hold-out 8" in refused["error"]["hint"]
     code, refused = evaluate(tmp_path)
     assert code == 5

@@ -1,4 +1,4 @@
-"""The table of photos held back."""
+"""The table of held-out photos."""
 
 from __future__ import annotations
 

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from rigs import UP, capture, flight, look_at, ring
 
-from stages.geometry.markers import detect_markers, measure_markers
 from stages.geometry.normalisation import into_frame, rotation_onto
 from stages.geometry.place import Place, east_north_up, given_region, locate
 from stages.geometry.similarity import Similarity
 from stages.geometry.up import angle_deg
+from stages.posing.markers import detect_markers, measure_markers
 
 HOME = (47.3769, 8.5417, 408.0)
 # metres from the model's frame

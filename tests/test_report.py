@@ -79,7 +79,7 @@ def test_the_page_says_it_all_and_refers_to_nothing_outside(full):
     for text in (
         "only 3 matches",
         "2 of 3 photos were placed",
-        "1 were kept back",
+        "1 were held out",
         "b &lt;odd&gt;.png",
         "notes.txt: not an image",
         "1 min 15 s",
@@ -94,7 +94,7 @@ def test_the_page_says_it_all_and_refers_to_nothing_outside(full):
         "The ground (dashed) holds 50 %",
         "has a radius of 1 m, from",
         "from the side</text>",
-        "Photos kept back, and the final mesh drawn from there",
+        "Held-out photos, and the final mesh drawn from there",
         "a.png: photo, then mesh. PSNR",
         "Where to stand for the next photos",
         "From a side that no photo shows",
@@ -148,7 +148,7 @@ def test_a_report_from_almost_nothing(context):
     assert "<h2>Photos</h2>" not in html
     assert "<h2>Training</h2>" not in html
     assert "<h2>Where to stand" not in html
-    assert "<h2>Photos kept back" not in html
+    assert "<h2>Held-out photos" not in html
     assert "Run it again" not in html
 
 

@@ -79,7 +79,7 @@ def test_a_photo_is_shown_in_the_view_and_photos_are_filtered(full):
     assert options[0] == "camera-0"
     assert "next-0" in options
     assert re.search(r'<b id="card-name">a\.png</b>', html)
-    assert "kept back from training and texture" in html
+    assert "held out from training and texture" in html
     states = re.findall(r'<figure [^>]*data-state="(\w+)"[^>]*?( hidden="")?>', html)
     assert [state for state, hidden in states if not hidden] == ["out"]
 

@@ -17,7 +17,7 @@ from stages.errors import ConfigError
 
 evaluate_app = typer.Typer(
     no_args_is_help=True,
-    help="How good a result is: against a true surface, by a benchmark's protocol, or against photos held back.",
+    help="How good a result is: against a true surface, by a benchmark's protocol, or against held-out photos.",
 )
 
 Predicted = Annotated[
@@ -191,7 +191,7 @@ def evaluate_views(
     device: Device = "auto",
     as_json: Json = False,
 ) -> None:
-    """Photos held back from training, against drawings of the field and of the textured mesh."""
+    """Held-out photos against drawings of the field and of the textured mesh."""
     from stages.evaluation.photos.held_out import evaluate_views as score
 
     _run(context, lambda: score(workspace, renders, device), _show_views)

@@ -48,7 +48,7 @@ class FieldDrawing:
 class FieldDrawer:
     """Draws a trained field at the end of its schedules; the same camera always gives the same picture.
 
-    Exposure gains of single photos are left out: photos that were held back have none.
+    Exposure gains of single photos are left out: held-out photos have none.
     """
 
     def __init__(self, fields: Fields, params: TrainParams, device: torch.device | str) -> None:

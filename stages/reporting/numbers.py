@@ -20,7 +20,7 @@ def generator(manifests: Mapping[str, Manifest]) -> str:
 def headline(
     scene: PosedScene, atlas: AtlasMesh, manifests: Mapping[str, Manifest], held_out: dict[str, Any] | None
 ) -> list[dict[str, str]]:
-    """The few numbers on top of the page; `held_out` as `kept_back.compare_held_out` gives it."""
+    """The few numbers on top of the page; `held_out` as `held_out_photos.compare_held_out` gives it."""
     numbers = [
         ("faces", f"{len(atlas.faces):,}"),
         ("texture", f"{atlas.texture_size}²"),
@@ -36,7 +36,7 @@ def headline(
     if "psnr" in train:
         numbers.append(("training PSNR", f"{train['psnr']:.1f} dB"))
     if held_out:
-        numbers.append(("final mesh in photos kept back", f"{held_out['psnr']:.1f} dB"))
+        numbers.append(("final mesh in held-out photos", f"{held_out['psnr']:.1f} dB"))
     if "seen_share" in baked:
         numbers.append(("texture from photos", f"{100 * baked['seen_share']:.0f} %"))
     total = total_row(list(manifests.values()))

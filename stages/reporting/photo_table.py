@@ -1,4 +1,4 @@
-"""What became of each photo: placed, left out or held back, its fit to the sparse points, its thumbnail."""
+"""What became of each photo: placed, left out or held out, its fit to the sparse points, its thumbnail."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class PhotoResult:
         reason: why it has no pose, empty where it has one.
         fit: to the sparse points, where it has a pose and the model can be read.
         camera: its number among the scene's cameras, or None.
-        held_out: whether it was kept back from training and texture.
+        held_out: whether it was held out from training and texture.
     """
 
     record: ImageRecord
@@ -50,7 +50,7 @@ def photo_results(
     Args:
         model: folder of the COLMAP model.
         cameras: names of the scene's cameras: the photos' with `.png`.
-        held_out: those of them that were kept back.
+        held_out: those of them that were held out.
     """
     if image_set is None:
         return []
@@ -65,9 +65,9 @@ def photo_results(
     for record in sorted(image_set.images, key=lambda record: record.name):
         short = PurePosixPath(record.name).with_suffix(".png").as_posix()
         camera = next((numbers[name] for name in (f"{record.name}.png", short) if name in numbers), None)
-        kept_back = camera is not None and cameras[camera] in held_out
+        is_held_out = camera is not None and cameras[camera] in held_out
         reason = reasons.get(record.name, "")
-        results.append(PhotoResult(record, reason, fits.get(record.name), None if reason else camera, kept_back))
+        results.append(PhotoResult(record, reason, fits.get(record.name), None if reason else camera, is_held_out))
     return results
 
 
@@ -97,7 +97,7 @@ def describe_photos(
     placed = sum(result.state != "out" for result in results)
     summary = f"{placed} of {len(results)} photos were placed."
     if held := sum(result.held_out for result in results):
-        summary += f" {held} were kept back from training and texture."
+        summary += f" {held} were held out from training and texture."
     attempts = [f"{step['rung']} {step['registered']}" for step in (registration.ladder if registration else ())]
     if len(attempts) > 1:
         summary += f" Attempts, with the photos each placed: {', '.join(attempts)}."

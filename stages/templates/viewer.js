@@ -162,7 +162,7 @@
   const describe = (marker) => {
     if (marker.sentence) return marker.sentence;
     const fit = marker.error === null ? "" : `reprojection error ${marker.error.toFixed(2)} px, ${marker.points} points`;
-    return [marker.held_out ? "kept back from training and texture" : "used", fit].filter(Boolean).join("; ");
+    return [marker.held_out ? "held out from training and texture" : "used", fit].filter(Boolean).join("; ");
   };
   const choose = (key) => {
     current = markers.find((marker) => marker.key === key) || null;

@@ -8,7 +8,6 @@ a folder of its own, and is timed.
 from __future__ import annotations
 
 import contextlib
-import difflib
 import resource
 import shlex
 import shutil
@@ -22,7 +21,7 @@ from typing import Any
 import psutil
 
 from stages import artifacts
-from stages.errors import ConfigError, ReconstructionError
+from stages.errors import ConfigError, ReconstructionError, did_you_mean
 from stages.evaluation.machine import machine
 from stages.evaluation.peers import builtin
 from stages.posing.exporting import SPARSE
@@ -57,8 +56,7 @@ def parse_peer(text: str) -> Peer:
     name, equals, command = (part.strip() for part in text.partition("="))
     if not equals:
         if name not in builtin.PEERS:
-            near = difflib.get_close_matches(name, builtin.PEERS, 1)
-            guess = f"Did you mean `--peer {near[0]}`? " if near else ""
+            guess = did_you_mean(name, builtin.PEERS, "--peer {}")
             raise ConfigError(
                 f"There is no built-in peer '{name}'.",
                 f"{guess}Those are {', '.join(builtin.PEERS)}; others by command: `--peer 'NAME=COMMAND {{out}}'`.",

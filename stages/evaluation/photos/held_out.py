@@ -1,4 +1,4 @@
-"""`hineus evaluate views`: photos that a workspace held back, against drawings of its field and of its final mesh."""
+"""`hineus evaluate views`: photos that a workspace held out, against drawings of its field and of its final mesh."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ DRAWN_FROM = (UNDISTORT, TRAIN, ATLAS_STAGE, BAKE)
 
 
 def evaluate_views(workspace: Path, renders: Path | None = None, device: str = "auto") -> dict[str, Any]:
-    """The photos that a workspace held back, against drawings of its field and of its final mesh.
+    """The photos that a workspace held out, against drawings of its field and of its final mesh.
 
     Args:
         renders: folder for the pictures, `photo/`, `field/` and `mesh/`; None: none are written.
@@ -34,7 +34,7 @@ def evaluate_views(workspace: Path, renders: Path | None = None, device: str = "
         Photos and means as of `score_photos`, and under "done" how they were scored.
 
     Raises:
-        InputError: the workspace holds no photos back.
+        InputError: the workspace holds out no photos.
         WorkspaceError: a stage is missing, or is of another run than those after it.
     """
     opened = _whole(workspace)
@@ -42,7 +42,7 @@ def evaluate_views(workspace: Path, renders: Path | None = None, device: str = "
     held_out = artifacts.HELD_OUT.load(opened.stage_folder("train"))
     if not held_out:
         raise InputError(
-            f"{workspace} holds no photos back: all were trained on.",
+            f"{workspace} holds out no photos: all were trained on.",
             f"Train without every 8th: `hineus run --workspace {workspace} --hold-out 8`.",
         )
     cameras = artifacts.SCENE.load(undistort).cameras
@@ -60,7 +60,7 @@ def evaluate_views(workspace: Path, renders: Path | None = None, device: str = "
         **found,
         "renders": None if renders is None else str(renders),
         "done": [
-            f"photos: {len(held_out)} of {len(cameras)}, held back from training and texture by `--hold-out`",
+            f"photos: {len(held_out)} of {len(cameras)}, held out from training and texture by `--hold-out`",
             f"object: the photo's mask in {masked} photos, the mesh's silhouette in {len(held_out) - masked}",
             "whole: the photo as it is for a field with a background; else masked photo and drawing on white",
             f"lpips: {about_lpips}",

@@ -34,7 +34,7 @@ def _scene(place: Path, number: int, wanted: Wanted) -> SuiteScene:
             "beside the scans; name its folder with --truth"
         )
     if views is None:
-        lacking.append("no view synthesis: all photos train, as in the papers; --hold-out 8 keeps every 8th back")
+        lacking.append("no view synthesis: all photos train, as in the papers; --hold-out 8 holds out every 8th")
     return SuiteScene(
         name=str(number),
         photos=photos,

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from stages.errors import InputError
+from stages.errors import InputError, did_you_mean
 from stages.evaluation.suites import blendedmvs, dtu, glossy, known, mipnerf360, nerf_synthetic, urbanscene3d
 from stages.evaluation.suites.scene import SuiteScene, Wanted
 
@@ -84,8 +83,7 @@ def find_suite(name: str) -> Suite:
         InputError: there is none.
     """
     if name not in SUITES:
-        near = difflib.get_close_matches(name, SUITES, 1)
-        guess = f"Did you mean `hineus bench {near[0]}`? " if near else ""
+        guess = did_you_mean(name, SUITES, "hineus bench {}")
         raise InputError(f"There is no suite '{name}'.", f"{guess}The suites are {', '.join(SUITES)}.")
     return SUITES[name]
 

@@ -17,7 +17,7 @@ class Wanted:
     Attributes:
         masks: whether to use the masks that come with the photos; most papers' figures are without. An alpha channel
             is a mask in any case.
-        hold_out: keep every n-th photo back where the suite has no test photos of its own; 0: none.
+        hold_out: hold out every n-th photo where the suite has no test photos of its own; 0: none.
         truth: folder of the evaluation data, where it does not lie with the photos.
     """
 

@@ -1,4 +1,4 @@
-"""Photos that were kept back, beside drawings of the final mesh from where they were taken."""
+"""Held-out photos, beside drawings of the final mesh from where they were taken."""
 
 from __future__ import annotations
 
