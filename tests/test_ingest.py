@@ -15,8 +15,7 @@ from configs.params import IngestParams
 from stages import artifacts
 from stages.artifacts import ImageSet
 from stages.capture.exif import DIAGONAL_35MM
-from stages.capture.inspection import inspect_file
-from stages.capture.photo_reading import register_formats
+from stages.capture.photo_reading import read_head, register_formats
 from stages.engine.stage import StageContext
 from stages.errors import InputError
 from stages.ingest import INGEST
@@ -234,7 +233,7 @@ def test_raw_files_are_developed_alike_and_upright(photos: Path):
     records = {record.source: record for record in image_set.images}
     assert (records["dark.dng"].width, records["dark.dng"].height) == (96, 128)
     assert records["bright.dng"].camera.startswith("Test Camera")
-    head = inspect_file(photos / "dark.dng", "dark.dng")  # undeveloped
+    head = read_head(photos / "dark.dng", "dark.dng")  # undeveloped
     assert (head.width, head.height, head.camera) == (96, 128, records["dark.dng"].camera)
     means = [np.asarray(Image.open(artifacts.Pictures(out).path(f"{name}.png"))).mean() for name in ("bright", "dark")]
     assert means[0] / means[1] == pytest.approx(2 ** (1 / 2.222), rel=0.1)  # one stop apart: no automatic brightness

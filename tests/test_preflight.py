@@ -18,7 +18,8 @@ from configs.load import load_config
 from hineus_cli.app import app
 from stages import preflight as module
 from stages import reconstruct
-from stages.capture.inspection import Inspection, Video, inspect, inspect_file
+from stages.capture.inspection import Inspection, Video, inspect
+from stages.capture.photo_reading import read_head
 from stages.preflight import GIB, estimate, preflight
 
 SIZE = (320, 240)
@@ -89,11 +90,11 @@ def test_exif_and_size_are_those_of_the_upright_photo(photos: Path):
     exif.get_ifd(0x8769)[0xA405] = 28
     large = picture(40).resize((2400, 1800))  # large enough to be decoded smaller
     large.save(photos / "z.jpg", exif=exif)
-    seen = inspect_file(photos / "z.jpg", "z.jpg")
+    seen = read_head(photos / "z.jpg", "z.jpg")
     assert (seen.width, seen.height) == (1800, 2400)
     assert seen.camera == "Phone | 28 mm equivalent | 1800 x 2400"
     assert seen.has_focal
-    assert not inspect_file(photos / "00.jpg", "00.jpg").has_focal
+    assert not read_head(photos / "00.jpg", "00.jpg").has_focal
 
 
 def test_damaged_files_are_told_with_the_reason_and_other_files_are_no_warning(photos: Path, capfd):

@@ -8,29 +8,10 @@ from pathlib import Path
 
 from stages.artifacts import SkippedImage
 from stages.capture.background import PLAIN_PHOTOS, find_background
-from stages.capture.exif import camera_key, focal_px
 from stages.capture.listing import list_captures
-from stages.capture.photo_reading import UnusableError, read_head, read_preview, register_formats
+from stages.capture.photo_reading import PhotoFile, UnusableError, read_head, read_preview, register_formats
 from stages.capture.quality import Appearance, Oddities, appearance, find_oddities
 from stages.capture.video import video_size
-
-
-@dataclass(frozen=True)
-class PhotoFile:
-    """What the head of one photo's file says.
-
-    Attributes:
-        source: path relative to the photo folder.
-        width, height: upright size in pixels.
-        camera: photos with the same value share one camera's intrinsics.
-        has_focal: whether EXIF gives the focal length.
-    """
-
-    source: str
-    width: int
-    height: int
-    camera: str
-    has_focal: bool
 
 
 @dataclass(frozen=True)
@@ -84,7 +65,7 @@ def inspect(source: Path, masks_folder: Path | None, video_frames: int, workers:
             if path in videos:
                 frames, width, height = video_size(folder / path)
                 return Video(path, min(frames, video_frames), width, height)
-            photo = inspect_file(folder / path, path)
+            photo = read_head(folder / path, path)
             if not decode:
                 return photo, None, False
             pixels = read_preview(folder / path)
@@ -102,20 +83,4 @@ def inspect(source: Path, masks_folder: Path | None, video_frames: int, workers:
         num_bytes=sum((folder / path).stat().st_size for path in [*photos, *videos]),
         oddities=find_oddities([look for _, look, _ in looked_at if look is not None]),
         plain=bool(looked_at) and sum(plain for _, _, plain in looked_at) >= PLAIN_PHOTOS * len(looked_at),
-    )
-
-
-def inspect_file(file: Path, source: str) -> PhotoFile:
-    """What the head of a photo's file says; `register_formats` must have been called for HEIC.
-
-    Raises:
-        UnusableError: it cannot be read or is too small to be a photo.
-    """
-    head = read_head(file)
-    return PhotoFile(
-        source=source,
-        width=head.upright_size[0],
-        height=head.upright_size[1],
-        camera=camera_key(head.exif, head.upright_size, source),
-        has_focal=focal_px(head.exif, head.stored_size) is not None,
     )

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from stages.capture.exif import ORIENTATION
+from stages.capture.exif import ORIENTATION, camera_key, focal_px
 
 # What COLMAP's reader takes as it is; the rest is re-encoded.
 COLMAP_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"})
@@ -22,7 +22,7 @@ RAW_SUFFIXES = frozenset({".dng", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".rw2"
 LOSSY_FORMATS = frozenset({"JPEG", "MPO", "WEBP", "HEIF", "AVIF"})
 ANIMATED_FORMATS = frozenset({"WEBP", "AVIF"})  # a HEIF of several pictures is a burst; its first one counts
 
-TURNED = (5, 6, 7, 8)  # EXIF orientations that swap width and height
+TURNED, RAW_TURNED = (5, 6, 7, 8), (5, 6)  # EXIF orientations, and LibRaw's flips, that swap width and height
 PREVIEW_SIDE = 1000  # JPEG decodes at 1/2, 1/4 or 1/8 not below this; blur that matters still shows
 MIN_SIDE = 64  # a picture smaller than this is an icon or a thumbnail, not a photo
 
@@ -32,15 +32,21 @@ class UnusableError(Exception):
 
 
 @dataclass(frozen=True)
-class Head:
-    """What a photo's file says before its pixels: Pillow's EXIF, and width and height as they are stored."""
+class PhotoFile:
+    """What the head of one photo's file says.
 
-    exif: Any
-    stored_size: tuple[int, int]
+    Attributes:
+        source: path relative to the photo folder.
+        width, height: upright size in pixels.
+        camera: photos with the same value share one camera's intrinsics.
+        has_focal: whether EXIF gives the focal length.
+    """
 
-    @property
-    def upright_size(self) -> tuple[int, int]:
-        return self.stored_size[::-1] if self.exif.get(ORIENTATION) in TURNED else self.stored_size
+    source: str
+    width: int
+    height: int
+    camera: str
+    has_focal: bool
 
 
 @dataclass(frozen=True)
@@ -85,7 +91,7 @@ def read_photo(file: Path) -> Photo:
     return photo
 
 
-def read_head(file: Path) -> Head:
+def read_head(file: Path, source: str) -> PhotoFile:
     """As `read_photo`, of the file's head only: nothing is decoded.
 
     Raises:
@@ -96,14 +102,16 @@ def read_head(file: Path) -> Head:
     with _telling_damage():
         if _is_raw(file):
             with import_rawpy().imread(str(file)) as raw:
-                size, turned = (raw.sizes.width, raw.sizes.height), raw.sizes.flip in (5, 6)
-                head = Head(_raw_exif(file, raw), size[::-1] if turned else size)
+                exif, size = _raw_exif(file, raw), (raw.sizes.width, raw.sizes.height)
+                size = size[::-1] if raw.sizes.flip in RAW_TURNED else size
         else:
             with Image.open(file) as stored:
                 # the PNG plug-in's own `getexif` would decode the pixels, to look behind them
-                head = Head(Image.Image.getexif(stored), stored.size)
-    _check_side(head.stored_size)
-    return head
+                exif, size = Image.Image.getexif(stored), stored.size
+    _check_side(size)
+    width, height = size[::-1] if exif.get(ORIENTATION) in TURNED else size
+    camera = camera_key(exif, (width, height), source)
+    return PhotoFile(source, width, height, camera, has_focal=focal_px(exif, size) is not None)
 
 
 def read_preview(file: Path) -> np.ndarray:
