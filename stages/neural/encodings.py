@@ -46,33 +46,40 @@ Vjp = Callable[[Tensor], Tensor]
 class EncodingKernels(Protocol):
     """What `encode` asks of the kernels of a hash grid on a device: `encoding_cpu` (numba), `encoding_cuda` (Triton).
 
-    Tensors are float32; N points, C channels. The Jacobian lies in memory as the kernels please.
+    Tensors are float32. The Jacobian lies in memory as the kernels please.
     """
 
     def forward(
-        self, points: Tensor, table: Tensor, grid: HashGrid, active_levels: int, with_jacobian: bool
-    ) -> tuple[Tensor, Tensor | None]:
-        """Features [N, C] and, where it is asked for, their Jacobian."""
+        self,
+        points: Float[Tensor, "n 3"],
+        table: Float[Tensor, "rows f"],
+        grid: HashGrid,
+        active_levels: int,
+        with_jacobian: bool,
+    ) -> tuple[Float[Tensor, "n c"], Tensor | None]:
+        """Features and, where it is asked for, their Jacobian."""
 
     def backward(
         self,
-        points: Tensor,
+        points: Float[Tensor, "n 3"],
         grid: HashGrid,
         active_levels: int,
-        grad_features: Tensor | None,
-        grad_jacobian: tuple[Tensor, Tensor] | None,
-        grad_table: Tensor,
+        grad_features: Float[Tensor, "n c"] | None,
+        grad_jacobian: tuple[Float[Tensor, "n 3"], Float[Tensor, "n c"]] | None,
+        grad_table: Float[Tensor, "rows f"],
     ) -> None:
-        """Add d loss / d table to grad_table [rows, F], given the gradients of features [N, C] and of the Jacobian.
+        """Add d loss / d table to grad_table, given the gradients of features and of the Jacobian, or one of them.
 
-        The latter is of rank one and given by its factors g [N, 3] and u [N, C]. At least one of the two is given.
+        The Jacobian's is of rank one and given by its factors g and u.
         """
 
-    def vjp_forward(self, jacobian: Tensor, cotangent: Tensor) -> Tensor:
-        """The Jacobian times cotangent [N, C] -> [N, 3]."""
+    def vjp_forward(self, jacobian: Tensor, cotangent: Float[Tensor, "n c"]) -> Float[Tensor, "n 3"]:
+        """The Jacobian times cotangent."""
 
-    def vjp_backward(self, jacobian: Tensor, grad_gradients: Tensor, channels: int) -> Tensor:
-        """The transposed Jacobian times grad_gradients [N, 3] -> [N, C], C = channels."""
+    def vjp_backward(
+        self, jacobian: Tensor, grad_gradients: Float[Tensor, "n 3"], channels: int
+    ) -> Float[Tensor, "n {channels}"]:
+        """The transposed Jacobian times grad_gradients."""
 
 
 def encode(
