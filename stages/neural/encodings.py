@@ -114,6 +114,7 @@ def encode_features(
 def _encode_frequencies(
     points: Float[Tensor, "n 3"], encoding: Frequencies, active_levels: int
 ) -> tuple[Float[Tensor, "n c"], Vjp]:
+    """`encode` by sines and cosines: plain torch, on every device."""
     frequencies = math.pi * 2.0 ** torch.arange(active_levels, device=points.device, dtype=points.dtype)
     angles = points[:, None] * frequencies[:, None]  # [N, levels, 3]
     sines, cosines = torch.sin(angles), torch.cos(angles)
@@ -129,7 +130,10 @@ def _encode_frequencies(
 
 # ---------------------------------------------------------------- which kernels
 def kernels_for(points: Float[Tensor, "n 3"], grid: HashGrid) -> EncodingKernels | None:
-    """The kernels that take these points, or None where the reference does: float64, no kernels."""
+    """The kernels that take these points, or None where the reference does: float64, no kernels.
+
+    Those of the CPU are written for 4 features a level, those of CUDA for powers of two.
+    """
     if grid.features == 4 and takes_kernel(points):
         from stages.neural import encoding_cpu
 

@@ -23,9 +23,9 @@ if TYPE_CHECKING:
 EVEN_SHARE = 0.15
 # And this much weight in any case, so that a ray that meets nothing has samples too.
 _EVEN_FLOOR = 1e-4
-# Even bins of a ray in which the cache is read.
+# The cache is read at the edges of so many even bins of a ray.
 _NUM_BINS = 64
-# Nothing nearer is looked at by a camera inside the sphere, scene units.
+# A ray enters the sphere no nearer than this, scene units: a camera may stand inside.
 _NEAR = 0.02
 # Part of the grid that a refresh near the surface takes on CUDA: a band of 4 cells to either side of a sphere that
 # fills the region has a fifth of a grid of 96 cells a side, and less of a finer one.
@@ -145,11 +145,7 @@ class SdfCache:
 
 @torch.no_grad()
 def importance_distances(
-    cache: SdfCache,
-    rays: Rays,
-    num_samples: int,
-    scale: float,
-    generator: torch.Generator | None,
+    cache: SdfCache, rays: Rays, num_samples: int, scale: float, generator: torch.Generator | None
 ) -> Float[Tensor, "r {num_samples}"]:
     """Sorted sample distances, drawn by inverse CDF from the cache's rendering weights.
 
