@@ -129,7 +129,8 @@ def big_training() -> tuple[float, int]:
     from benchmarks import ball_heap
     from configs.training import TrainParams
     from stages.geometry.cameras import PinholeCameras
-    from stages.neural.trainer import Sightings, Trainer
+    from stages.neural.sightings import Sightings
+    from stages.neural.trainer import Trainer
     from stages.neural.training_photos import Photos
 
     heap = ball_heap.dome_of_cameras()

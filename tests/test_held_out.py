@@ -128,7 +128,8 @@ def test_the_stage_reports_the_photos_left_out_and_trains_on_the_others(tmp_path
 
 
 def test_judging_leaves_the_random_state_alone():
-    from stages.neural.trainer import Sightings, Trainer
+    from stages.neural.sightings import Sightings
+    from stages.neural.trainer import Trainer
 
     photos = make_photos()
     trainer = Trainer(photos, Sightings.from_scene(sphere_scene(ring_of_cameras()), "cpu"), TINY, "cpu")

@@ -103,7 +103,7 @@ def test_composite_is_the_weighted_sum():
 def test_unit_sphere_hits_misses_and_cameras_inside():
     origins = torch.tensor([[0.0, 0, -3], [0, 2, -3], [0, 0, 0], [0, 0, 3]])
     directions = torch.tensor([[0.0, 0, 1]] * 4)
-    entry, leave, hit = intersect_unit_sphere(origins, directions, near=0.02)
+    entry, leave, hit = intersect_unit_sphere(origins, directions)
     assert hit.tolist() == [True, False, True, False]
     assert (entry[0].item(), leave[0].item()) == (pytest.approx(2), pytest.approx(4))
     assert (entry[2].item(), leave[2].item()) == (pytest.approx(0.02), pytest.approx(1))
@@ -176,7 +176,7 @@ def test_the_sampling_kernel_agrees_with_the_reference(scale):
         places = stratified(len(rays[0]), 16, second, torch.device("cpu"))
         # In float64: a grazing ray's weights are near the rounding error of its transmittance in float32.
         rays64 = Rays(*(tensor.double() for tensor in rays))
-        expected = importance_distances_reference(cache64, rays64, places.double(), max(scale, 0.5 * cache.cell), 64)
+        expected = importance_distances_reference(cache64, rays64, places.double(), max(scale, 0.5 * cache.cell))
         torch.testing.assert_close(got.double(), expected, rtol=0, atol=1e-4)
         assert (got - expected).abs().median() < 1e-6
 

@@ -1,20 +1,22 @@
 """The hash encoding's kernels on the CPU, tensors in and out: the numba kernels of `stages.neural.kernels`.
 
-What each function computes: `stages.neural.encodings.EncodingKernels`. The Jacobian is held as [N, 3, C].
+What each function computes, and the shapes: `stages.neural.encodings.EncodingKernels`. The Jacobian is held as
+[N, 3, C].
 """
 
 from __future__ import annotations
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from stages.neural import kernels
 from stages.neural.encoding_shapes import HashGrid
 
 
 def forward(
-    points: torch.Tensor, table: torch.Tensor, grid: HashGrid, active_levels: int, with_jacobian: bool
-) -> tuple[torch.Tensor, torch.Tensor | None]:
+    points: Tensor, table: Tensor, grid: HashGrid, active_levels: int, with_jacobian: bool
+) -> tuple[Tensor, Tensor | None]:
     features = torch.empty(len(points), grid.channels)
     jacobian = torch.empty(len(points), 3, grid.channels) if with_jacobian else None
     kernels.encode_forward(
@@ -25,12 +27,12 @@ def forward(
 
 
 def backward(
-    points: torch.Tensor,
+    points: Tensor,
     grid: HashGrid,
     active_levels: int,
-    grad_features: torch.Tensor | None,
-    grad_jacobian: tuple[torch.Tensor, torch.Tensor] | None,
-    grad_table: torch.Tensor,
+    grad_features: Tensor | None,
+    grad_jacobian: tuple[Tensor, Tensor] | None,
+    grad_table: Tensor,
 ) -> None:
     grad_gradients, cotangent = grad_jacobian or (None, None)
     kernels.encode_backward(
@@ -39,18 +41,18 @@ def backward(
     )  # fmt: skip
 
 
-def vjp_forward(jacobian: torch.Tensor, cotangent: torch.Tensor) -> torch.Tensor:
+def vjp_forward(jacobian: Tensor, cotangent: Tensor) -> Tensor:
     gradients = torch.empty(len(jacobian), 3)
     kernels.vjp_forward(jacobian.numpy(), _array(cotangent.detach()), gradients.numpy())
     return gradients
 
 
-def vjp_backward(jacobian: torch.Tensor, grad_gradients: torch.Tensor, channels: int) -> torch.Tensor:
+def vjp_backward(jacobian: Tensor, grad_gradients: Tensor, channels: int) -> Tensor:
     grad_cotangent = torch.empty(len(jacobian), channels)
     kernels.vjp_backward(jacobian.numpy(), _array(grad_gradients), grad_cotangent.numpy())
     return grad_cotangent
 
 
-def _array(tensor: torch.Tensor | None) -> np.ndarray | None:
+def _array(tensor: Tensor | None) -> np.ndarray | None:
     """Row by row in memory: numba compiles for that alone."""
     return None if tensor is None else tensor.contiguous().numpy()

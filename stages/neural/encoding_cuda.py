@@ -1,6 +1,7 @@
 """The hash encoding's kernels on CUDA, tensors in and out (Triton).
 
-What each function computes: `stages.neural.encodings.EncodingKernels`. The arithmetic is that of the CPU kernels.
+What each function computes, and the shapes: `stages.neural.encodings.EncodingKernels`. The arithmetic is that of the
+CPU kernels.
 
 A program takes one level of `BLOCK` points. Levels are the slower axis of the launch, so that about one level's rows
 are in use at a time and stay in the L2 cache. Features and Jacobian lie channel by channel in memory, [C, N] and
@@ -18,6 +19,7 @@ import numpy as np
 import torch
 import triton
 import triton.language as tl
+from torch import Tensor
 
 from stages.neural.encoding_shapes import HashGrid
 
@@ -174,8 +176,8 @@ def _vjp_gradient(jacobian, grad_gradients, grad_cotangent, num_points, axis, BL
 
 # ---------------------------------------------------------------- tensors in and out
 def forward(
-    points: torch.Tensor, table: torch.Tensor, grid: HashGrid, active_levels: int, with_jacobian: bool
-) -> tuple[torch.Tensor, torch.Tensor | None]:
+    points: Tensor, table: Tensor, grid: HashGrid, active_levels: int, with_jacobian: bool
+) -> tuple[Tensor, Tensor | None]:
     features, active = torch.empty(grid.channels, len(points), device=points.device), active_levels * grid.features
     jacobian = torch.empty(3, active, len(points), device=points.device) if with_jacobian else None
     features[active:].zero_()
@@ -188,12 +190,12 @@ def forward(
 
 
 def backward(
-    points: torch.Tensor,
+    points: Tensor,
     grid: HashGrid,
     active_levels: int,
-    grad_features: torch.Tensor | None,
-    grad_jacobian: tuple[torch.Tensor, torch.Tensor] | None,
-    grad_table: torch.Tensor,
+    grad_features: Tensor | None,
+    grad_jacobian: tuple[Tensor, Tensor] | None,
+    grad_table: Tensor,
 ) -> None:
     grad_gradients, cotangent = grad_jacobian or (None, None)
     _add_gradient[_programs(points, active_levels)](
@@ -206,7 +208,7 @@ def backward(
     )  # fmt: skip
 
 
-def vjp_forward(jacobian: torch.Tensor, cotangent: torch.Tensor) -> torch.Tensor:
+def vjp_forward(jacobian: Tensor, cotangent: Tensor) -> Tensor:
     _, active, num_points = jacobian.shape
     gradients = torch.empty(num_points, 3, device=jacobian.device)
     _vjp[(triton.cdiv(num_points, BLOCK),)](
@@ -216,7 +218,7 @@ def vjp_forward(jacobian: torch.Tensor, cotangent: torch.Tensor) -> torch.Tensor
     return gradients
 
 
-def vjp_backward(jacobian: torch.Tensor, grad_gradients: torch.Tensor, channels: int) -> torch.Tensor:
+def vjp_backward(jacobian: Tensor, grad_gradients: Tensor, channels: int) -> Tensor:
     _, active, num_points = jacobian.shape
     grad_cotangent = torch.empty(channels, num_points, device=jacobian.device)
     grad_cotangent[active:].zero_()
@@ -226,12 +228,12 @@ def vjp_backward(jacobian: torch.Tensor, grad_gradients: torch.Tensor, channels:
     return grad_cotangent.T
 
 
-def _programs(points: torch.Tensor, active_levels: int) -> tuple[int, int]:
+def _programs(points: Tensor, active_levels: int) -> tuple[int, int]:
     return triton.cdiv(len(points), BLOCK), active_levels
 
 
 @cache
-def _levels_of(grid: HashGrid, device: torch.device) -> torch.Tensor:
+def _levels_of(grid: HashGrid, device: torch.device) -> Tensor:
     """[L, 3] int32 on the device: cells along a side, first row, whether it is dense. Kept: an upload waits."""
     levels = np.stack([grid.resolutions, grid.offsets[:-1], grid.dense], 1).astype(np.int32)
     return torch.from_numpy(levels).to(device)

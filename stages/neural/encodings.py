@@ -46,33 +46,40 @@ Vjp = Callable[[Tensor], Tensor]
 class EncodingKernels(Protocol):
     """What `encode` asks of the kernels of a hash grid on a device: `encoding_cpu` (numba), `encoding_cuda` (Triton).
 
-    Tensors are float32; N points, C channels. The Jacobian lies in memory as the kernels please.
+    Tensors are float32. The Jacobian lies in memory as the kernels please.
     """
 
     def forward(
-        self, points: Tensor, table: Tensor, grid: HashGrid, active_levels: int, with_jacobian: bool
-    ) -> tuple[Tensor, Tensor | None]:
-        """Features [N, C] and, where it is asked for, their Jacobian."""
+        self,
+        points: Float[Tensor, "n 3"],
+        table: Float[Tensor, "rows f"],
+        grid: HashGrid,
+        active_levels: int,
+        with_jacobian: bool,
+    ) -> tuple[Float[Tensor, "n c"], Tensor | None]:
+        """Features and, where it is asked for, their Jacobian."""
 
     def backward(
         self,
-        points: Tensor,
+        points: Float[Tensor, "n 3"],
         grid: HashGrid,
         active_levels: int,
-        grad_features: Tensor | None,
-        grad_jacobian: tuple[Tensor, Tensor] | None,
-        grad_table: Tensor,
+        grad_features: Float[Tensor, "n c"] | None,
+        grad_jacobian: tuple[Float[Tensor, "n 3"], Float[Tensor, "n c"]] | None,
+        grad_table: Float[Tensor, "rows f"],
     ) -> None:
-        """Add d loss / d table to grad_table [rows, F], given the gradients of features [N, C] and of the Jacobian.
+        """Add d loss / d table to grad_table, given the gradients of features and of the Jacobian, or one of them.
 
-        The latter is of rank one and given by its factors g [N, 3] and u [N, C]. At least one of the two is given.
+        The Jacobian's is of rank one and given by its factors g and u.
         """
 
-    def vjp_forward(self, jacobian: Tensor, cotangent: Tensor) -> Tensor:
-        """The Jacobian times cotangent [N, C] -> [N, 3]."""
+    def vjp_forward(self, jacobian: Tensor, cotangent: Float[Tensor, "n c"]) -> Float[Tensor, "n 3"]:
+        """The Jacobian times cotangent."""
 
-    def vjp_backward(self, jacobian: Tensor, grad_gradients: Tensor, channels: int) -> Tensor:
-        """The transposed Jacobian times grad_gradients [N, 3] -> [N, C], C = channels."""
+    def vjp_backward(
+        self, jacobian: Tensor, grad_gradients: Float[Tensor, "n 3"], channels: int
+    ) -> Float[Tensor, "n {channels}"]:
+        """The transposed Jacobian times grad_gradients."""
 
 
 def encode(
@@ -107,6 +114,7 @@ def encode_features(
 def _encode_frequencies(
     points: Float[Tensor, "n 3"], encoding: Frequencies, active_levels: int
 ) -> tuple[Float[Tensor, "n c"], Vjp]:
+    """`encode` by sines and cosines: plain torch, on every device."""
     frequencies = math.pi * 2.0 ** torch.arange(active_levels, device=points.device, dtype=points.dtype)
     angles = points[:, None] * frequencies[:, None]  # [N, levels, 3]
     sines, cosines = torch.sin(angles), torch.cos(angles)
@@ -122,7 +130,10 @@ def _encode_frequencies(
 
 # ---------------------------------------------------------------- which kernels
 def kernels_for(points: Float[Tensor, "n 3"], grid: HashGrid) -> EncodingKernels | None:
-    """The kernels that take these points, or None where the reference does: float64, no kernels."""
+    """The kernels that take these points, or None where the reference does: float64, no kernels.
+
+    Those of the CPU are written for 4 features a level, those of CUDA for powers of two.
+    """
     if grid.features == 4 and takes_kernel(points):
         from stages.neural import encoding_cpu
 

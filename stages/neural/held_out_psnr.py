@@ -1,7 +1,4 @@
-"""How well photos that were left out of the training are met.
-
-Shapes: I photos, R rays.
-"""
+"""How well photos that were left out of the training are met."""
 
 from __future__ import annotations
 

@@ -137,7 +137,7 @@ class Renderer:
             return (transmittance * shining)[:, None] * color
         behind = torch.nonzero(shining).squeeze(1)
         color = self.background_color(background, batch.origins[behind], batch.directions[behind], generator)
-        nothing = torch.zeros(len(batch.leave), 3, device=transmittance.device)
+        nothing = torch.zeros(len(batch), 3, device=transmittance.device)
         return nothing.index_add(0, behind, transmittance[behind, None] * color)
 
     def background_color(

@@ -23,6 +23,10 @@ if TYPE_CHECKING:
 EVEN_SHARE = 0.15
 # And this much weight in any case, so that a ray that meets nothing has samples too.
 _EVEN_FLOOR = 1e-4
+# The cache is read at the edges of so many even bins of a ray.
+_NUM_BINS = 64
+# A ray enters the sphere no nearer than this, scene units: a camera may stand inside.
+_NEAR = 0.02
 # Part of the grid that a refresh near the surface takes on CUDA: a band of 4 cells to either side of a sphere that
 # fills the region has a fifth of a grid of 96 cells a side, and less of a finer one.
 _NEAREST_SHARE = 0.25
@@ -51,17 +55,14 @@ class Rays:
 
 
 def intersect_unit_sphere(
-    origins: Float[Tensor, "r 3"], directions: Float[Tensor, "r 3"], near: float = 0.02
+    origins: Float[Tensor, "r 3"], directions: Float[Tensor, "r 3"]
 ) -> tuple[Float[Tensor, " r"], Float[Tensor, " r"], Bool[Tensor, " r"]]:
-    """Entry and exit distances of rays through the unit sphere, and whether they hit it.
-
-    Entry is at least `near` (a camera may stand inside the sphere).
-    """
+    """Entry and exit distances of rays through the unit sphere, and whether they hit it."""
     middle = -(origins * directions).sum(1)
     closest = origins + middle[:, None] * directions
     half_squared = 1 - (closest * closest).sum(1)
     half = half_squared.clamp(min=0).sqrt()
-    entry, leave = (middle - half).clamp(min=near), middle + half
+    entry, leave = (middle - half).clamp(min=_NEAR), middle + half
     return entry, leave, (half_squared > 1e-4) & (leave > entry + 1e-3)
 
 
@@ -144,12 +145,7 @@ class SdfCache:
 
 @torch.no_grad()
 def importance_distances(
-    cache: SdfCache,
-    rays: Rays,
-    num_samples: int,
-    scale: float,
-    generator: torch.Generator | None,
-    num_bins: int = 64,
+    cache: SdfCache, rays: Rays, num_samples: int, scale: float, generator: torch.Generator | None
 ) -> Float[Tensor, "r {num_samples}"]:
     """Sorted sample distances, drawn by inverse CDF from the cache's rendering weights.
 
@@ -159,33 +155,33 @@ def importance_distances(
     places = stratified(len(rays), num_samples, generator, rays.origins.device)
     scale = max(scale, 0.5 * cache.cell)
     if not takes_kernel(rays.origins):
-        return importance_distances_reference(cache, rays, places, scale, num_bins)
+        return importance_distances_reference(cache, rays, places, scale)
     from stages.neural import kernels
 
     distances = torch.empty(places.shape)
     given = (each.contiguous().numpy() for each in (rays.origins, rays.directions, rays.entry, rays.leave, places))
     kernels.importance_distances(
-        cache.values[0, 0].numpy(), *given, scale, FLAT, EVEN_SHARE, _EVEN_FLOOR, num_bins, distances.numpy()
+        cache.values[0, 0].numpy(), *given, scale, FLAT, EVEN_SHARE, _EVEN_FLOOR, _NUM_BINS, distances.numpy()
     )
     return distances
 
 
 @torch.no_grad()
 def importance_distances_reference(
-    cache: SdfCache, rays: Rays, places: Float[Tensor, "r k"], scale: float, num_bins: int
+    cache: SdfCache, rays: Rays, places: Float[Tensor, "r k"], scale: float
 ) -> Float[Tensor, "r k"]:
     """Distances at places in [0, 1) of the weights' CDF, in plain torch.
 
     The reference of the kernel behind `importance_distances`, and the path on CUDA.
     """
-    edges = torch.linspace(0, 1, num_bins + 1, device=places.device)
+    edges = torch.linspace(0, 1, _NUM_BINS + 1, device=places.device)
     length = (rays.leave - rays.entry)[:, None]
     distances = rays.entry[:, None] + length * edges
     sdf = cache.lookup_reference(rays.at(distances))
-    delta = length / num_bins
+    delta = length / _NUM_BINS
     tau = section_optical_depth(sdf[:, :-1], sdf[:, 1:], delta, scale)
     weights, _ = weights_from_optical_depth(tau)
-    weights = weights + (EVEN_SHARE * weights.sum(1, keepdim=True) + _EVEN_FLOOR) / num_bins
+    weights = weights + (EVEN_SHARE * weights.sum(1, keepdim=True) + _EVEN_FLOOR) / _NUM_BINS
     return invert_cdf(distances, weights, places)
 
 

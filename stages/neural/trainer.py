@@ -1,7 +1,4 @@
-"""Training: one step is one page, and the losses meet in one visible sum.
-
-Shapes: R rays, K samples a ray, N = R K points, P sparse points, I photos.
-"""
+"""Training: one step is one page, and the losses meet in one visible sum."""
 
 from __future__ import annotations
 

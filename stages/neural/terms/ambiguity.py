@@ -117,7 +117,7 @@ class Ambiguity(Term):
         params, batch = self.params.terms.ambiguity, rendered.batch
         if params.form == "off" or (params.form == "stable" and moment.progress < params.start):
             return None
-        weights = torch.ones(len(batch.leave), device=self.device)  # no doubt where no surface was met
+        weights = torch.ones(len(batch), device=self.device)  # no doubt where no surface was met
         met = rendered.opacity.detach() > OPAQUE
         hit = torch.nonzero(met if batch.masks is None else met & (batch.masks > 0.5)).squeeze(1)
         colors, seen = self._views(hit, rendered, moment)
