@@ -217,13 +217,9 @@ def contact_sheet(workspace: Path, path: Path) -> None:
     texture = read_rgb(artifacts.BASE_COLOR.load(workspace / "bake"))
     grey = np.full((1, 1, 3), 200, np.uint8)
     rows = []
-    for colors, normals in ((texture, None), (grey, atlas.normals)):
+    for colors, shaded in ((texture, False), (grey, True)):
         views = turntable(atlas.vertices, scene.up)
-        rows.append(
-            np.hstack(
-                [render_textured(atlas.vertices, atlas.faces, atlas.uvs, colors, view, normals) for view in views]
-            )
-        )
+        rows.append(np.hstack([render_textured(atlas, colors, view, shaded) for view in views]))
     Image.fromarray(np.vstack(rows)).save(path)
 
 

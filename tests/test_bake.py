@@ -480,7 +480,7 @@ def test_the_smooth_fill_lies_between_the_charts_colours():
 def test_renderer_shows_the_texture(capture, baked):
     mesh, cameras, photos = capture
     one = PinholeCameras(*(getattr(cameras, k)[:1] for k in cameras.__dataclass_fields__))
-    picture = render_textured(mesh.vertices, mesh.faces, mesh.uvs, baked.base_color, one, background=(255, 0, 255))
+    picture = render_textured(mesh, baked.base_color, one, background=(255, 0, 255))
     assert np.median(np.abs(picture.astype(int) - photos[0])) <= 2
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from stages.artifacts import AtlasMesh
 from stages.drawing.rasterizing import NO_FACE, corner_weights, projected, rasterize
 from stages.geometry.cameras import PinholeCameras
 from stages.geometry.normalisation import perpendicular
@@ -65,45 +66,41 @@ def sample_texture(texture: np.ndarray, uvs: np.ndarray) -> np.ndarray:
 
 
 def render_textured(
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    uvs: np.ndarray,
+    mesh: AtlasMesh,
     texture: np.ndarray,
     camera: PinholeCameras,
-    normals: np.ndarray | None = None,
+    shaded: bool = False,
     supersample: int = 2,
     background: tuple[int, int, int] = BACKGROUND,
 ) -> np.ndarray:
     """Draw a textured mesh.
 
     Args:
-        vertices, faces, uvs: [V, 3], [F, 3], [V, 2].
-        texture: [S, S, 3] uint8, row 0 at v = 1. A [1, 1, 3] texture with `normals` gives a plain shaded
-            view.
+        texture: [S, S, 3] uint8, row 0 at v = 1; a [1, 1, 3] one, shaded, shows the shape alone.
         camera: one camera (the first is used).
-        normals: [V, 3]; where given, a headlight shades the colours. Otherwise the texture is shown as it is.
+        shaded: a headlight shades the colours; else the texture is shown as it is.
         supersample: samples along a pixel's side.
 
     Returns:
         [H, W, 3] uint8.
     """
     width, height = (int(side) * supersample for side in camera.sizes[0])
-    xy, inverse_depth = projected(camera, 0, vertices)
+    xy, inverse_depth = projected(camera, 0, mesh.vertices)
     xy = xy * supersample
-    face_map, _ = rasterize(xy, inverse_depth, faces, width, height)
+    face_map, _ = rasterize(xy, inverse_depth, mesh.faces, width, height)
     image = np.empty((height * width, 3), dtype=np.float32)
     image[:] = background
     hit = np.flatnonzero(face_map.ravel() != NO_FACE)
     if len(hit):
         face_ids = face_map.ravel()[hit]
         centers = np.stack([hit % width, hit // width], 1) + 0.5
-        weights = corner_weights(xy, inverse_depth, faces, face_ids, centers)
-        corners = faces[face_ids]
-        colors = sample_texture(texture, np.einsum("pc,pcd->pd", weights, uvs[corners]))
-        if normals is not None:
-            shading = np.einsum("pc,pcd->pd", weights, normals[corners])
+        weights = corner_weights(xy, inverse_depth, mesh.faces, face_ids, centers)
+        corners = mesh.faces[face_ids]
+        colors = sample_texture(texture, np.einsum("pc,pcd->pd", weights, mesh.uvs[corners]))
+        if shaded:
+            shading = np.einsum("pc,pcd->pd", weights, mesh.normals[corners])
             shading /= np.maximum(np.linalg.norm(shading, axis=1, keepdims=True), 1e-12)
-            towards = camera.centers[0] - np.einsum("pc,pcd->pd", weights, vertices[corners])
+            towards = camera.centers[0] - np.einsum("pc,pcd->pd", weights, mesh.vertices[corners])
             towards /= np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-12)
             facing = np.abs((shading * towards).sum(1, keepdims=True))
             colors = colors * (0.35 + 0.65 * facing)

@@ -86,7 +86,7 @@ def draw_view(atlas: AtlasMesh, texture: np.ndarray, cameras: PinholeCameras, in
         texture: [S, S, 3] uint8 sRGB, row 0 at v = 1.
     """
     camera = cameras.select([index])
-    return render_textured(atlas.vertices, atlas.faces, atlas.uvs, texture, camera, supersample=SUPERSAMPLE)
+    return render_textured(atlas, texture, camera, supersample=SUPERSAMPLE)
 
 
 def score_views(

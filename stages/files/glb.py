@@ -40,19 +40,18 @@ def glb_bytes(
         ValueError: see `checked_mesh`.
     """
     mesh = checked_mesh(mesh)
-    vertices, normals, uvs, faces = mesh.vertices, mesh.normals, mesh.uvs, mesh.faces
-    flipped = uvs.copy()
+    vertices, flipped = mesh.vertices, mesh.uvs.copy()
     flipped[:, 1] = 1 - flipped[:, 1]
     bounds = {"min": vertices.min(0).tolist(), "max": vertices.max(0).tolist()}
     buffer = _GlbBuffer()
     attributes = {
         "POSITION": buffer.add_numbers(vertices, "VEC3", **bounds),
-        "NORMAL": buffer.add_numbers(normals, "VEC3"),
+        "NORMAL": buffer.add_numbers(mesh.normals, "VEC3"),
         "TEXCOORD_0": buffer.add_numbers(flipped, "VEC2"),
     }
     if textures.normal is not None:
-        attributes["TANGENT"] = buffer.add_numbers(vertex_tangents(vertices, normals, uvs, faces), "VEC4")
-    indices = buffer.add_numbers(faces.ravel(), "SCALAR", _ELEMENT_ARRAY_BUFFER)
+        attributes["TANGENT"] = buffer.add_numbers(vertex_tangents(mesh), "VEC4")
+    indices = buffer.add_numbers(mesh.faces.ravel(), "SCALAR", _ELEMENT_ARRAY_BUFFER)
     material: dict[str, Any] = {
         "name": NAME,
         "pbrMetallicRoughness": {

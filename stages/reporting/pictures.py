@@ -53,9 +53,8 @@ def draw_stills(atlas: AtlasMesh, texture: np.ndarray, up: np.ndarray) -> list[n
 
     views = turntable(atlas.vertices, up, 4, STILL_SIDE, STILL_SIDE)
     grey = np.full((1, 1, 3), 205, dtype=np.uint8)
-    return [render_textured(atlas.vertices, atlas.faces, atlas.uvs, texture, view) for view in views] + [
-        render_textured(atlas.vertices, atlas.faces, atlas.uvs, grey, view, normals=atlas.normals) for view in views
-    ]
+    looks = ((texture, False), (grey, True))
+    return [render_textured(atlas, colors, view, shaded) for colors, shaded in looks for view in views]
 
 
 def describe_provenance(path: Path) -> dict[str, Any] | None:

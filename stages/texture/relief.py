@@ -49,7 +49,7 @@ def bake_normals(
         the share of the charts' texels that met the full mesh.
     """
     tell = listener or (lambda done, total: None)
-    tangents = vertex_tangents(atlas.vertices, atlas.normals, atlas.uvs, atlas.faces)
+    tangents = vertex_tangents(atlas)
     corners = atlas.vertices[atlas.faces]
     reach = REACH * np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(1)
     scene, full_normals = raycaster(vertices, faces), vertex_normals(vertices, faces).astype(np.float32)

@@ -4,41 +4,38 @@ from __future__ import annotations
 
 import numpy as np
 
+from stages.artifacts import AtlasMesh
+
 # Squared lengths and areas below this count as none: a face or chart without extent says nothing of directions.
 _TINY = 1e-20
 
 
-def vertex_tangents(vertices: np.ndarray, normals: np.ndarray, uvs: np.ndarray, faces: np.ndarray) -> np.ndarray:
+def vertex_tangents(mesh: AtlasMesh) -> np.ndarray:
     """Tangents as MikkTSpace makes them, for vertices that are split along the seams of the charts.
 
     A face's tangent is the direction in which u grows, dp/du. At each corner it is turned into the vertex's tangent
     plane and counts by the corner's angle there (MikkTSpace, as glTF 2.0, section 3.7.2.1, asks for). A vertex that
     faces with mirrored and unmirrored UVs share, which MikkTSpace would split, takes the side with the larger angle.
 
-    Args:
-        vertices, normals: [V, 3], unit normals.
-        uvs: [V, 2], v growing upwards.
-        faces: [F, 3].
-
     Returns:
         [V, 4] float32: unit tangent at right angles to the normal, and the sign w of the bitangent w * n x t, which
         points to where v grows. A vertex without a direction of u gets any tangent and w = 1.
     """
-    normals = normals.astype(np.float64)
-    corners, flat = vertices[faces].astype(np.float64), uvs[faces].astype(np.float64)
+    normals, faces, count = mesh.normals.astype(np.float64), mesh.faces, len(mesh.vertices)
+    corners, flat = mesh.vertices[faces].astype(np.float64), mesh.uvs[faces].astype(np.float64)
     edges, flat_edges = corners[:, 1:] - corners[:, :1], flat[:, 1:] - flat[:, :1]
     area = flat_edges[:, 0, 0] * flat_edges[:, 1, 1] - flat_edges[:, 0, 1] * flat_edges[:, 1, 0]
     # dp/du times |area|, whose sign is that of the chart
     along_u = np.sign(area)[:, None] * (flat_edges[:, 1, 1:] * edges[:, 0] - flat_edges[:, 0, 1:] * edges[:, 1])
-    total, votes = np.zeros((len(vertices), 3)), np.zeros(len(vertices))
+    total, votes = np.zeros((count, 3)), np.zeros(count)
     for k in range(3):
         ids = faces[:, k]
         to_next, to_last = (_in_plane(corners[:, (k + j) % 3] - corners[:, k], normals[ids]) for j in (1, 2))
         angles = np.arccos(np.clip((to_next * to_last).sum(1), -1, 1)) * (np.abs(area) > _TINY)
         weighted = angles[:, None] * _in_plane(along_u, normals[ids])
         for axis in range(3):
-            total[:, axis] += np.bincount(ids, weighted[:, axis], minlength=len(vertices))
-        votes += np.bincount(ids, angles * np.sign(area), minlength=len(vertices))
+            total[:, axis] += np.bincount(ids, weighted[:, axis], minlength=count)
+        votes += np.bincount(ids, angles * np.sign(area), minlength=count)
     tangents = _in_plane(total, normals)
     lost = np.linalg.norm(tangents, axis=1) < 0.5
     if lost.any():
