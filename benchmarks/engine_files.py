@@ -38,7 +38,7 @@ def export(workspace: Path, out: Path, **settings: Any) -> tuple[dict[str, Any],
 
 
 def level_rows(workspace: Path, out: Path, count: int) -> list[str]:
-    atlas = artifacts.ATLAS.load(workspace / "atlas")
+    atlas = artifacts.ATLAS_MESH.load(workspace / "atlas")
     cameras = artifacts.SCENE.load(workspace / "undistort").cameras
     texture = read_rgb(artifacts.BASE_COLOR.load(workspace / "bake"))
     views = np.linspace(0, len(cameras), VIEWS, endpoint=False).astype(int).tolist()

@@ -103,7 +103,7 @@ def main() -> int:
         waits, works = zip(*(open_once(browser, html + REPORTER) for _ in range(arguments.runs)), strict=True)
         found = {
             "workspace": workspace.name,
-            "faces": len(artifacts.ATLAS.load(workspace / "atlas").faces),
+            "faces": len(artifacts.ATLAS_MESH.load(workspace / "atlas").faces),
             "photos": len(artifacts.SCENE.load(workspace / "undistort").cameras),
             "bytes": len(html),
             "ready_ms": round(statistics.median(waits)),

@@ -212,7 +212,7 @@ def contact_sheet(workspace: Path, path: Path) -> None:
     from stages.drawing.rendering import render_textured, turntable
     from stages.reporting.pictures import read_rgb
 
-    atlas = artifacts.ATLAS.load(workspace / "atlas")
+    atlas = artifacts.ATLAS_MESH.load(workspace / "atlas")
     scene = artifacts.SCENE.load(workspace / "undistort")
     texture = read_rgb(artifacts.BASE_COLOR.load(workspace / "bake"))
     grey = np.full((1, 1, 3), 200, np.uint8)

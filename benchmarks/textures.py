@@ -115,7 +115,7 @@ class Capture:
             sys.exit(f"{workspace} held no photo out: run it with `--set train.hold_out=8`")
         self.held_out = [i for i, name in enumerate(self.cameras.names) if name in held_out]
         self.training = [i for i, name in enumerate(self.cameras.names) if name not in held_out]
-        self.atlas = artifacts.ATLAS.load(workspace / "atlas")
+        self.atlas = artifacts.ATLAS_MESH.load(workspace / "atlas")
         loaded = [artifacts.Pictures(self.undistorted).masked(name) for name in self.cameras.names]
         self.photos, self.own_masks = [photo for photo, _ in loaded], [mask for _, mask in loaded]
         self.masks_from = "the run" if self.own_masks[0] is not None else "silhouette"
@@ -399,7 +399,7 @@ def bake_alone(workspace: Path, size: int) -> tuple[float, float, int]:
         atlas, out, scratch = (Path(folder) / name for name in ("atlas", "out", "scratch"))
         for each in (atlas, out, scratch):
             each.mkdir()
-        artifacts.ATLAS.save(atlas, replace(artifacts.ATLAS.load(workspace / "atlas"), texture_size=size))
+        artifacts.ATLAS_MESH.save(atlas, replace(artifacts.ATLAS_MESH.load(workspace / "atlas"), texture_size=size))
         inputs = {name: workspace / name for name in BAKE.needs} | {"atlas": atlas}
         context = StageContext(inputs=inputs, sources={}, out=out, scratch=scratch, params=BakeParams(), workers=2)
         began, used = time.perf_counter(), time.process_time()

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from configs.params import AtlasParams
-from stages.artifacts import ATLAS, CAMERAS, CLEAN_MESH, AtlasMesh
+from stages.artifacts import ATLAS_MESH, CAMERAS, CLEAN_MESH, AtlasMesh
 from stages.engine.stage import Stage, StageContext
 from stages.errors import ReconstructionError
 
@@ -37,7 +37,7 @@ def run(context: StageContext[AtlasParams]) -> dict[str, Any]:
             ) from misfit
     uvs = layout.texels / size
     context.write(
-        ATLAS,
+        ATLAS_MESH,
         AtlasMesh(
             vertices=vertices[layout.source].astype(np.float32),
             normals=charts.smooth_normals(vertices, faces, layout.source),
@@ -67,12 +67,12 @@ def _fitting_size(context: StageContext[AtlasParams], vertices: np.ndarray, face
     return texture_size_for(*pixels_per_area(vertices, faces, context.read(CAMERAS)))
 
 
-ATLAS_STAGE: Stage[AtlasParams] = Stage(
+ATLAS: Stage[AtlasParams] = Stage(
     name="atlas",
     version=2,
     settings=lambda config: config.atlas,
     run=run,
     reads=(CAMERAS, CLEAN_MESH),
-    writes=(ATLAS,),
+    writes=(ATLAS_MESH,),
     summary="UV charts without overlaps",
 )

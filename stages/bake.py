@@ -7,7 +7,7 @@ from typing import Any
 
 from configs.params import BakeParams
 from stages.artifacts import (
-    ATLAS,
+    ATLAS_MESH,
     BASE_COLOR,
     CAMERAS,
     CLEAN_FULL_MESH,
@@ -34,7 +34,7 @@ def run(context: StageContext[BakeParams]) -> dict[str, Any]:
 
     photos, cameras, held_out = context.read(PINHOLE_PHOTOS), context.read(CAMERAS), context.read(HELD_OUT)
     cameras = cameras.select([i for i, name in enumerate(cameras.names) if name not in held_out])
-    atlas = context.read(ATLAS)
+    atlas = context.read(ATLAS_MESH)
     field = load_field(context.read(FIELD), context.device)
     params = context.params
     texels = rasterize_atlas(atlas.uvs, atlas.faces, atlas.texture_size)
@@ -81,7 +81,7 @@ BAKE: Stage[BakeParams] = Stage(
     version=6,
     settings=lambda config: config.bake,
     run=run,
-    reads=(PINHOLE_PHOTOS, CAMERAS, FIELD, HELD_OUT, CLEAN_FULL_MESH, ATLAS),
+    reads=(PINHOLE_PHOTOS, CAMERAS, FIELD, HELD_OUT, CLEAN_FULL_MESH, ATLAS_MESH),
     writes=(BASE_COLOR, PROVENANCE, NORMAL_MAP, OCCLUSION, QUALITY),
     summary="charts + photos -> textures",
 )

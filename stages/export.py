@@ -11,7 +11,7 @@ import numpy as np
 
 from configs.params import ExportParams
 from stages import artifacts
-from stages.artifacts import ASSET, ATLAS, BASE_COLOR, NORMAL_MAP, OCCLUSION, PLACE, SCENE
+from stages.artifacts import ASSET, ATLAS_MESH, BASE_COLOR, NORMAL_MAP, OCCLUSION, SCENE, WORLD_PLACE
 from stages.engine.stage import Stage, StageContext
 from stages.engine.system import installed_version
 from stages.errors import ReconstructionError, SystemRequirementError
@@ -60,12 +60,12 @@ class Asset:
 def run(context: StageContext[ExportParams]) -> dict[str, Any]:
     """Write what the settings ask for. Returns counts, extents in world units, and bytes of each file."""
     params = context.params
-    scene, place = context.read(SCENE), context.read(PLACE)
+    scene, place = context.read(SCENE), context.read(WORLD_PLACE)
     world_from_scene = scene.world_from_scene(place)
     gltf_from_world = y_up_rotation(world_from_scene.rotation @ scene.up_in(place))
     baked = context.manifests.get("bake")
     asset = Asset(
-        mesh=context.read(ATLAS),
+        mesh=context.read(ATLAS_MESH),
         world_from_scene=world_from_scene,
         gltf_from_world=gltf_from_world,
         textures=load_textures(context),
@@ -251,7 +251,7 @@ EXPORT: Stage[ExportParams] = Stage(
     version=6,
     settings=lambda config: config.export,
     run=run,
-    reads=(SCENE, PLACE, ATLAS, BASE_COLOR, NORMAL_MAP, OCCLUSION),
+    reads=(SCENE, WORLD_PLACE, ATLAS_MESH, BASE_COLOR, NORMAL_MAP, OCCLUSION),
     writes=(ASSET,),
     reads_manifests=("bake",),
     summary="textured mesh -> GLB, USDZ, OBJ, PLY, STL",

@@ -9,7 +9,7 @@ from typing import Any
 from stages.engine.status import replaced_inputs
 from stages.engine.workspace import Workspace, storage_errors
 from stages.errors import InputError, WorkspaceError
-from stages.place import PLACE_STAGE
+from stages.place import PLACE
 from stages.undistort import UNDISTORT
 
 Writer = Callable[[Path, Path, Path, Path], dict[str, Any]]
@@ -25,7 +25,7 @@ def export_poses(workspace: Path, out: Path, write: Writer) -> dict[str, Any]:
     opened = Workspace.open(workspace)
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(f"{out} is there already.", "Name a new or empty folder.")
-    if replaced_inputs(UNDISTORT, opened) or replaced_inputs(PLACE_STAGE, opened):
+    if replaced_inputs(UNDISTORT, opened) or replaced_inputs(PLACE, opened):
         raise WorkspaceError(
             f"The workspace {opened.root} has no undistorted photos of its present poses.",
             f"Make them: `hineus undistort --workspace {opened.root}`.",

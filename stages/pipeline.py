@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from typing import Any
 
-from stages.atlas import ATLAS_STAGE
+from stages.atlas import ATLAS
 from stages.bake import BAKE
 from stages.cleanup import CLEANUP
 from stages.engine.stage import Stage
 from stages.export import EXPORT
 from stages.extract import EXTRACT
 from stages.ingest import INGEST
-from stages.place import PLACE_STAGE
+from stages.place import PLACE
 from stages.report import REPORT
 from stages.sfm import SFM
 from stages.train import TRAIN
@@ -20,12 +20,12 @@ from stages.undistort import UNDISTORT
 PIPELINE: tuple[Stage[Any], ...] = (
     INGEST,  # photos -> upright images
     SFM,  # images -> camera poses
-    PLACE_STAGE,  # poses -> metres, place and up of the world
+    PLACE,  # poses -> metres, place and up of the world
     UNDISTORT,  # poses -> pinhole images in a normalised frame
     TRAIN,  # posed images -> neural signed distance field
     EXTRACT,  # field -> mesh
     CLEANUP,  # mesh -> clean, light mesh
-    ATLAS_STAGE,  # clean mesh -> UV charts
+    ATLAS,  # clean mesh -> UV charts
     BAKE,  # charts + photos -> texture
     EXPORT,  # textured mesh -> GLB, USDZ, OBJ, PLY, STL
     REPORT,  # everything -> one HTML page

@@ -14,7 +14,7 @@ import numpy as np
 
 from configs.params import PlaceParams
 from configs.texts import read_distance, read_region
-from stages.artifacts import GIVEN_POSES, GIVEN_REGION, IMAGE_SET, MODEL, PHOTOS, PLACE, ImageSet, Pictures
+from stages.artifacts import GIVEN_POSES, GIVEN_REGION, IMAGE_SET, MODEL, PHOTOS, WORLD_PLACE, ImageSet, Pictures
 from stages.engine.stage import Stage, StageContext
 from stages.errors import ConfigError, InputError
 from stages.geometry.cameras import PinholeCameras
@@ -51,7 +51,7 @@ def run(context: StageContext[PlaceParams]) -> dict[str, Any]:
         place, up_from = replace(place, up=direction), "the settings"
     elif located is not None and located.tilt_error_deg <= MAX_GPS_TILT_DEG:
         place, up_from = replace(place, up=np.array([0.0, 0.0, 1.0])), "GPS"
-    context.write(PLACE, place)
+    context.write(WORLD_PLACE, place)
     context.write(GIVEN_REGION, _given_region(cameras, place, params.region))
     return {
         "units": place.units,
@@ -163,12 +163,12 @@ def _given_region(cameras: PinholeCameras, place: Place, text: str) -> GivenRegi
     return region
 
 
-PLACE_STAGE: Stage[PlaceParams] = Stage(
+PLACE: Stage[PlaceParams] = Stage(
     name="place",
     version=1,
     settings=lambda config: config.place,
     run=run,
     reads=(IMAGE_SET, PHOTOS, MODEL, GIVEN_POSES),
-    writes=(PLACE, GIVEN_REGION),
+    writes=(WORLD_PLACE, GIVEN_REGION),
     summary="scale, place and up of the world, from GPS, markers or a known distance",
 )

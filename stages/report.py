@@ -15,7 +15,7 @@ import numpy as np
 
 from configs.params import ReportParams
 from stages.artifacts import (
-    ATLAS,
+    ATLAS_MESH,
     BASE_COLOR,
     GIVEN_REGION,
     HELD_OUT,
@@ -26,12 +26,12 @@ from stages.artifacts import (
     PAGE,
     PHOTOS,
     PINHOLE_PHOTOS,
-    PLACE,
     PREVIEWS,
     PROVENANCE,
     QUALITY,
     REGISTRATION,
     SCENE,
+    WORLD_PLACE,
     Artifact,
     AtlasMesh,
     VertexQuality,
@@ -56,7 +56,11 @@ def run(context: StageContext[ReportParams]) -> dict[str, Any]:
     from stages.reporting import curves, numbers, photo_table, pictures
     from stages.reporting.held_out_photos import compare_held_out
 
-    place, atlas, texture = context.read(PLACE), context.read(ATLAS), pictures.read_rgb(context.read(BASE_COLOR))
+    place, atlas, texture = (
+        context.read(WORLD_PLACE),
+        context.read(ATLAS_MESH),
+        pictures.read_rgb(context.read(BASE_COLOR)),
+    )
     scene = context.read(SCENE)
     scene = replace(scene, up=scene.up_in(place))
     held_out, pinholes = context.read(HELD_OUT), context.read(PINHOLE_PHOTOS)
@@ -176,7 +180,7 @@ REPORT: Stage[ReportParams] = Stage(
         PHOTOS,
         MODEL,
         REGISTRATION,
-        PLACE,
+        WORLD_PLACE,
         GIVEN_REGION,
         SCENE,
         PINHOLE_PHOTOS,
@@ -184,7 +188,7 @@ REPORT: Stage[ReportParams] = Stage(
         METRICS,
         PREVIEWS,
         HELD_OUT,
-        ATLAS,
+        ATLAS_MESH,
         BASE_COLOR,
         PROVENANCE,
         QUALITY,

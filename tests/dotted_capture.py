@@ -12,7 +12,7 @@ from stages import artifacts
 from stages.artifacts import ImageRecord, ImageSet
 from stages.engine.stage import StageContext
 from stages.geometry.cameras import PosedScene
-from stages.place import PLACE_STAGE
+from stages.place import PLACE
 from stages.undistort import UNDISTORT
 
 WIDTH, HEIGHT, FOCAL = 320, 240, 300.0
@@ -93,7 +93,7 @@ def undistort(inputs: dict[str, Path], root: Path, **params: object) -> tuple[Po
         folder.mkdir()
     placing = PlaceParams(**{key: params[key] for key in params if key in PlaceParams.model_fields})  # type: ignore[arg-type]
     rest = UndistortParams(**{key: params[key] for key in params if key not in PlaceParams.model_fields})  # type: ignore[arg-type]
-    placed = PLACE_STAGE.run(StageContext(inputs, {}, place, root, placing))
+    placed = PLACE.run(StageContext(inputs, {}, place, root, placing))
     numbers = UNDISTORT.run(StageContext({**inputs, "place": place}, {}, out, root, rest, workers=2))
     return artifacts.SCENE.load(out), out, {**numbers, **{key: value for key, value in placed.items() if value != ""}}
 

@@ -9,7 +9,7 @@ import pytest
 
 from configs.params import AtlasParams
 from stages import artifacts
-from stages.atlas import ATLAS_STAGE
+from stages.atlas import ATLAS
 from stages.engine.stage import StageContext
 from stages.errors import ReconstructionError
 from stages.surface.decimation import decimate
@@ -211,7 +211,7 @@ def run_stage(tmp_path, mesh, **params):
     out.mkdir()
     artifacts.CLEAN_MESH.save(cleanup, mesh)
     context = StageContext({"cleanup": cleanup}, {}, out, tmp_path, AtlasParams(**params))
-    return ATLAS_STAGE.run(context), artifacts.ATLAS.load(out)
+    return ATLAS.run(context), artifacts.ATLAS_MESH.load(out)
 
 
 def test_stage_uses_xatlas(tmp_path, mesh):

@@ -46,7 +46,7 @@ def context(tmp_path, monkeypatch) -> StageContext:
         np.concatenate([faces, faces[:, ::-1] + 4]).astype(np.int32),
         64,
     )
-    artifacts.ATLAS.save(folders["atlas"], atlas)
+    artifacts.ATLAS_MESH.save(folders["atlas"], atlas)
     artifacts.CLEAN_FULL_MESH.save(folders["cleanup"], (atlas.vertices + 0.05 * atlas.normals, atlas.faces))
     up = np.array([0.0, 0, 1])
     views = [look_at(np.array([x, -2.5, 0.2]), np.zeros(3), up, 48, 40, 40) for x in (-0.5, 0.6)]

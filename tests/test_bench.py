@@ -37,7 +37,7 @@ from stages.geometry.place import Place
 from stages.geometry.similarity import Similarity
 from stages.ingest import INGEST
 from stages.neural.drawing import FieldDrawing
-from stages.place import PLACE_STAGE
+from stages.place import PLACE
 from stages.sfm import SFM
 from stages.undistort import UNDISTORT
 
@@ -62,7 +62,7 @@ def posed(context: StageContext) -> dict[str, Any]:
 PIPELINE = (
     INGEST,
     replace(SFM, run=posed),
-    PLACE_STAGE,
+    PLACE,
     UNDISTORT,
     Stage("cleanup", 1, lambda config: config.train, clean_ball, (artifacts.SCENE,), (artifacts.CLEAN_MESH,)),
 )
@@ -193,7 +193,7 @@ def test_a_mesh_is_scored_in_the_frame_of_its_poses_whatever_gps_made_of_the_wor
     workspace = Workspace.open(tmp_path / "workspace", create=True)
     for name in ("place", "undistort", "cleanup"):
         workspace.stage_folder(name).mkdir(parents=True)
-    artifacts.PLACE.save(workspace.stage_folder("place"), moved)
+    artifacts.WORLD_PLACE.save(workspace.stage_folder("place"), moved)
     artifacts.SCENE.save(workspace.stage_folder("undistort"), scene)
     corners = np.eye(3)
     artifacts.CLEAN_MESH.save(workspace.stage_folder("cleanup"), (corners, np.array([[0, 1, 2]])))

@@ -156,7 +156,7 @@ def test_a_workspace_is_judged_in_the_frame_of_its_poses(tmp_path):
         artifacts.SCENE.save(out, scene)
         workspace.publish("undistort", Manifest(Identity("undistort", 1, {}), {}))
         out, _ = workspace.begin("place", "")
-        artifacts.PLACE.save(out, Place(Similarity.identity()))
+        artifacts.WORLD_PLACE.save(out, Place(Similarity.identity()))
         workspace.publish("place", Manifest(Identity("place", 1, {}), {}))
     mesh = ball(RADIUS)
     mesh.vertices = scene.poses_from_scene.apply(mesh.vertices)

@@ -198,7 +198,7 @@ def workspace(tmp_path: Path) -> Workspace:
         artifacts.HELD_OUT.save(out, [cameras.names[i] for i in (2, 6)])
 
     publish(opened, "train", train, PARAMS.model_dump(mode="json"))
-    publish(opened, "atlas", lambda out: artifacts.ATLAS.save(out, patch_of_the_ball()))
+    publish(opened, "atlas", lambda out: artifacts.ATLAS_MESH.save(out, patch_of_the_ball()))
     gray = np.full((8, 8, 3), 128, np.uint8)
     publish(opened, "bake", lambda out: artifacts.write_png(artifacts.BASE_COLOR.load(out), gray))
     return opened
@@ -229,7 +229,9 @@ def test_the_command_scores_each_photo_and_writes_the_pictures(workspace, tmp_pa
 
 
 def test_what_is_missing_or_stale_is_explained(workspace, tmp_path):
-    publish(workspace, "atlas", lambda out: artifacts.ATLAS.save(out, replace(patch_of_the_ball(), texture_size=4)))
+    publish(
+        workspace, "atlas", lambda out: artifacts.ATLAS_MESH.save(out, replace(patch_of_the_ball(), texture_size=4))
+    )
     code, refused = evaluate(workspace.root)
     assert code == 5
     assert "bake" in refused["error"]["message"]

@@ -90,8 +90,8 @@ def workspace(tmp_path: Path, params: ExportParams | None = None) -> StageContex
         ("a.jpg",), np.array([[8, 8]]), np.eye(3)[None], np.concatenate([np.eye(3), np.zeros((3, 1))], 1)[None]
     )
     artifacts.SCENE.save(folders["undistort"], scene_without_points(cameras, WORLD))
-    artifacts.PLACE.save(folders["place"], Place(Similarity.identity()))
-    artifacts.ATLAS.save(folders["atlas"], atlas)
+    artifacts.WORLD_PLACE.save(folders["place"], Place(Similarity.identity()))
+    artifacts.ATLAS_MESH.save(folders["atlas"], atlas)
     write_png(artifacts.BASE_COLOR.load(folders["bake"]), texture)
     write_png(artifacts.NORMAL_MAP.load(folders["bake"]), np.full((32, 32, 3), (128, 128, 255), np.uint8))
     write_png(artifacts.OCCLUSION.load(folders["bake"]), np.full((32, 32), 200, np.uint8))
@@ -262,7 +262,7 @@ def test_the_glb_says_its_units_and_where_on_earth_it_is(tmp_path):
     model = Similarity(3.0, np.eye(3), np.array([1.0, 2, 3]))
     located = Place(model, True, "GPS", 0.01, (47.0, 8.5, 400.0), 1.2)
     for place, units in ((Place(model), "arbitrary units"), (located, "metres")):
-        artifacts.PLACE.save(context.inputs["place"], place)
+        artifacts.WORLD_PLACE.save(context.inputs["place"], place)
         extras = extras_of(context)
         assert extras["units"] == units
         np.testing.assert_allclose(extras["world_from_model"], model.matrix())
@@ -515,7 +515,7 @@ def test_ply_header_counts():
 def test_a_mesh_that_cannot_be_written_is_explained(tmp_path):
     context = workspace(tmp_path)
     atlas, _ = tetrahedron()
-    artifacts.ATLAS.save(
+    artifacts.ATLAS_MESH.save(
         context.inputs["atlas"], AtlasMesh(atlas.vertices, atlas.normals, atlas.uvs, atlas.faces[:0], 32)
     )
     with pytest.raises(ReconstructionError, match="cannot be exported"):

@@ -35,7 +35,7 @@ from stages.posing.undistortion import png_names
 
 
 def place_of(root: Path) -> Place:
-    return artifacts.PLACE.load(root / "place")
+    return artifacts.WORLD_PLACE.load(root / "place")
 
 
 def world_from(scene: PosedScene, root: Path) -> Similarity:
@@ -337,8 +337,8 @@ def test_scene_records_survive_saving(tmp_path: Path):
 def test_places_and_regions_survive_saving(tmp_path: Path):
     moved = Similarity(2.0, np.eye(3)[[1, 2, 0]], np.array([1.0, 2, 3]))
     place = Place(moved, True, "GPS", 0.01, (47.0, 8.5, 400.0), 1.5, np.array([0.0, 0, 1]))
-    artifacts.PLACE.save(tmp_path, place)
-    loaded = artifacts.PLACE.load(tmp_path)
+    artifacts.WORLD_PLACE.save(tmp_path, place)
+    loaded = artifacts.WORLD_PLACE.load(tmp_path)
     np.testing.assert_array_equal(loaded.world_from_poses.matrix(), moved.matrix())
     np.testing.assert_array_equal(loaded.up, place.up)
     assert tuple(loaded.origin) == place.origin
@@ -353,5 +353,5 @@ def test_places_and_regions_survive_saving(tmp_path: Path):
 def test_a_damaged_record_is_named(tmp_path: Path):
     (tmp_path / "place.json").write_text('{"metric": "perhaps"}')
     with pytest.raises(WorkspaceError, match=r"place\.json cannot be read: .*world_from_poses") as caught:
-        artifacts.PLACE.load(tmp_path)
+        artifacts.WORLD_PLACE.load(tmp_path)
     assert "--force" in caught.value.hint

@@ -28,4 +28,4 @@ class AtlasMesh:
     texture_size: int
 
 
-ATLAS = arrays_artifact("atlas", "atlas.npz", AtlasMesh)
+ATLAS_MESH = arrays_artifact("atlas", "atlas.npz", AtlasMesh)

@@ -64,5 +64,5 @@ def _load_given_region(folder: Path) -> GivenRegion | None:
     return GivenRegion(record.center, record.radius, record.box, record.world_from_poses.similarity())
 
 
-PLACE = Artifact("place", (_PLACE,), _load_place, _save_place)
+WORLD_PLACE = Artifact("place", (_PLACE,), _load_place, _save_place)
 GIVEN_REGION = Artifact("place", (_REGION,), _load_given_region, _save_given_region)

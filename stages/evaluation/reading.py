@@ -72,7 +72,9 @@ def read_prediction(place: Path) -> tuple[Path, Surface]:
     surface = read_surface(path)
     if not place.is_dir():
         return path, surface
-    poses_from_world = artifacts.PLACE.load(Workspace.open(place).stage_folder("place")).world_from_poses.inverse()
+    poses_from_world = artifacts.WORLD_PLACE.load(
+        Workspace.open(place).stage_folder("place")
+    ).world_from_poses.inverse()
     return path, surface.moved(poses_from_world.matrix())
 
 

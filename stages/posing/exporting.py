@@ -29,7 +29,7 @@ def write_colmap(undistort: Path, sfm: Path, place: Path, out: Path) -> dict[str
     Returns:
         Numbers of images, points and observations.
     """
-    _, model = _images_and_model(undistort, sfm, artifacts.PLACE.load(place), out)
+    _, model = _images_and_model(undistort, sfm, artifacts.WORLD_PLACE.load(place), out)
     folder = out / SPARSE
     folder.mkdir()
     model.write_binary(str(folder))
@@ -42,7 +42,7 @@ def write_transforms(undistort: Path, sfm: Path, place: Path, out: Path) -> dict
 
     Arguments and numbers are those of `write_colmap`.
     """
-    in_world = artifacts.PLACE.load(place)
+    in_world = artifacts.WORLD_PLACE.load(place)
     scene, model = _images_and_model(undistort, sfm, in_world, out)
     model.export_PLY(str(out / POINTS))
     cameras = into_frame(scene.cameras, scene.world_from_scene(in_world).inverse())

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from stages import artifacts
-from stages.atlas import ATLAS_STAGE
+from stages.atlas import ATLAS
 from stages.bake import BAKE
 from stages.engine.status import replaced_inputs
 from stages.engine.workspace import Workspace
@@ -20,7 +20,7 @@ from stages.train import TRAIN
 from stages.undistort import UNDISTORT
 
 # The stages that drawings are made from, in order.
-DRAWN_FROM = (UNDISTORT, TRAIN, ATLAS_STAGE, BAKE)
+DRAWN_FROM = (UNDISTORT, TRAIN, ATLAS, BAKE)
 
 
 def evaluate_views(workspace: Path, renders: Path | None = None, device: str = "auto") -> dict[str, Any]:

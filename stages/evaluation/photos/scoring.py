@@ -52,7 +52,7 @@ def score_photos(
     """
     drawer = field_drawer(workspace, device)
     if textured:
-        atlas = artifacts.ATLAS.load(workspace.stage_folder("atlas"))
+        atlas = artifacts.ATLAS_MESH.load(workspace.stage_folder("atlas"))
         texture = read_rgb(artifacts.BASE_COLOR.load(workspace.stage_folder("bake")))
     kinds = ("field", "mesh") if textured else ("field",)
     photos: list[dict[str, Any]] = []

@@ -64,7 +64,7 @@ def result_mesh(workspace: Workspace, fresh: set[str], out: Path) -> Path | None
 
 def posed_mesh(workspace: Workspace, mesh: Path, out: Path) -> Path:
     """Write a mesh that is in the world frame of a workspace, in the frame of its poses, to `out`."""
-    place = artifacts.PLACE.load(workspace.stage_folder("place"))
+    place = artifacts.WORLD_PLACE.load(workspace.stage_folder("place"))
     _write(place.world_from_poses.inverse(), read_mesh(mesh), out)
     return out
 
