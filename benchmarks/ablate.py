@@ -337,11 +337,11 @@ def score_clean_mesh(
     if not has_truth(truth):
         return None
     vertices, faces = artifacts.load_mesh(folder / "cleanup")
-    poses_from_scene = artifacts.load_scene(shared / SHARED).poses_from_scene
+    poses_from_scene = artifacts.SCENE.load(shared / SHARED).poses_from_scene
     with tempfile.TemporaryDirectory() as world:
         artifacts.save_mesh(Path(world), poses_from_scene.apply(vertices), faces)
         return score_mesh(
-            Path(world) / artifacts.MESH, artifacts.model_path(shared / "sfm"), truth, known_stem or file_stem
+            Path(world) / artifacts.MESH, artifacts.MODEL.load(shared / "sfm"), truth, known_stem or file_stem
         )
 
 

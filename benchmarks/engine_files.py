@@ -38,9 +38,9 @@ def export(workspace: Path, out: Path, **settings: Any) -> tuple[dict[str, Any],
 
 
 def level_rows(workspace: Path, out: Path, count: int) -> list[str]:
-    atlas = artifacts.load_atlas(workspace / "atlas")
-    cameras = artifacts.load_scene(workspace / "undistort").cameras
-    texture = read_rgb(artifacts.base_color_path(workspace / "bake"))
+    atlas = artifacts.ATLAS.load(workspace / "atlas")
+    cameras = artifacts.SCENE.load(workspace / "undistort").cameras
+    texture = read_rgb(artifacts.BASE_COLOR.load(workspace / "bake"))
     views = np.linspace(0, len(cameras), VIEWS, endpoint=False).astype(int).tolist()
     full = [draw_view(atlas, texture, cameras, view) for view in views]
     masks = [silhouette(atlas.vertices, atlas.faces, cameras, view) for view in views]
@@ -69,15 +69,15 @@ def shape_row(workspace: Path, out: Path, count: int) -> str:
 
     _, alone = export(workspace, out)
     _, seconds = export(workspace, out, collision="hulls", collision_pieces=count)
-    mesh = trimesh.load(artifacts.ply_path(out), process=False)
-    other = o3d.io.read_triangle_mesh(str(artifacts.ply_path(out)))
+    mesh = trimesh.load(artifacts.asset_path(out, "ply"), process=False)
+    other = o3d.io.read_triangle_mesh(str(artifacts.asset_path(out, "ply")))
     sound = {
         "closed": mesh.is_watertight,
         "winding": mesh.is_winding_consistent,
         "edges": other.is_edge_manifold(allow_boundary_edges=True),
         "vertices": other.is_vertex_manifold(),
     }
-    glb = trimesh.load(artifacts.glb_path(out), force="mesh", process=False)  # in the frame of the pieces
+    glb = trimesh.load(artifacts.asset_path(out, "glb"), force="mesh", process=False)  # in the frame of the pieces
     pieces = list(trimesh.load(artifacts.collision_path(out)).geometry.values())
     outside = np.full(len(glb.vertices), np.inf)
     for piece in pieces:

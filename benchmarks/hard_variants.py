@@ -283,7 +283,7 @@ def center_error(workspace: Path, data: Path, row: str) -> dict[str, float] | No
         return None
     centers, extent = truth
     stems, stem_of = _stems(source), known_stem(source, variant)
-    found = _found_centers(artifacts.model_path(workspace / "sfm"))
+    found = _found_centers(artifacts.MODEL.load(workspace / "sfm"))
     pairs = [(center, centers[stems.index(stem_of(name))]) for name, center in found.items()]
     if len(pairs) < 3:
         return None
@@ -345,7 +345,7 @@ def run_row(row: str, data: Path, mesh: bool, preset: str, settings: Sequence[st
             failure = _failure(answer)
     stages = {stage["name"]: stage for stage in answer.get("stages", ())}
     placed = "sfm" in stages
-    registration = artifacts.load_registration(workspace / "sfm") if placed else {}
+    registration = artifacts.REGISTRATION.load(workspace / "sfm") if placed else {}
     words = [
         "python -m benchmarks.hard_variants DATA",
         row,
@@ -394,7 +394,7 @@ def _count(workspace: Path, photos: Path) -> int:
     from stages import artifacts
 
     try:
-        return len(artifacts.load_image_set(workspace / "ingest").images)
+        return len(artifacts.IMAGE_SET.load(workspace / "ingest").images)
     except OSError:
         return sum(1 for _ in photos.iterdir())
 

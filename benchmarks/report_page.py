@@ -99,12 +99,12 @@ def main() -> int:
         print("Chromium is needed: `apt-get install chromium`.", file=sys.stderr)
         return 6
     for workspace in arguments.workspaces:
-        html = artifacts.report_path(workspace / "report").read_bytes()
+        html = artifacts.PAGE.load(workspace / "report").read_bytes()
         waits, works = zip(*(open_once(browser, html + REPORTER) for _ in range(arguments.runs)), strict=True)
         found = {
             "workspace": workspace.name,
-            "faces": len(artifacts.load_atlas(workspace / "atlas").faces),
-            "photos": len(artifacts.load_scene(workspace / "undistort").cameras),
+            "faces": len(artifacts.ATLAS.load(workspace / "atlas").faces),
+            "photos": len(artifacts.SCENE.load(workspace / "undistort").cameras),
             "bytes": len(html),
             "ready_ms": round(statistics.median(waits)),
             "slowest_ms": round(max(waits)),

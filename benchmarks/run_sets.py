@@ -175,7 +175,7 @@ def _score(workspace: Path, truth: Path | None) -> dict[str, float] | None:
 
     if truth is None or not has_truth(truth):
         return None
-    return score_mesh(artifacts.ply_path(workspace / "export"), artifacts.model_path(workspace / "sfm"), truth)
+    return score_mesh(artifacts.asset_path(workspace / "export", "ply"), artifacts.MODEL.load(workspace / "sfm"), truth)
 
 
 def validate(glb: Path) -> dict[str, int] | None:
@@ -205,9 +205,9 @@ def contact_sheet(workspace: Path, path: Path) -> None:
     from stages import artifacts
     from stages.drawing.rendering import render_textured, turntable
 
-    atlas = artifacts.load_atlas(workspace / "atlas")
-    scene = artifacts.load_scene(workspace / "undistort")
-    with Image.open(artifacts.base_color_path(workspace / "bake")) as image:
+    atlas = artifacts.ATLAS.load(workspace / "atlas")
+    scene = artifacts.SCENE.load(workspace / "undistort")
+    with Image.open(artifacts.BASE_COLOR.load(workspace / "bake")) as image:
         texture = np.asarray(image.convert("RGB"))
     grey = np.full((1, 1, 3), 200, np.uint8)
     rows = []

@@ -146,8 +146,10 @@ def figures(workspace: Path, answer: dict[str, Any], truth: Path) -> dict[str, f
     from stages.evaluation.protocols.known_object import score_mesh
 
     numbers = {stage["name"]: stage["numbers"] for stage in answer["stages"]}
-    score = score_mesh(artifacts.ply_path(workspace / "export"), artifacts.model_path(workspace / "sfm"), truth)
-    drawn = held_out_drawing(workspace, *read_glb(artifacts.glb_path(workspace / "export")))
+    score = score_mesh(
+        artifacts.asset_path(workspace / "export", "ply"), artifacts.MODEL.load(workspace / "sfm"), truth
+    )
+    drawn = held_out_drawing(workspace, *read_glb(artifacts.asset_path(workspace / "export", "glb")))
     return {
         "registered photos": numbers["sfm"]["registered"],
         "distance to the truth, %": score["mean"],
@@ -189,8 +191,8 @@ def held_out_drawing(workspace: Path, mesh: AtlasMesh, texture: np.ndarray) -> t
     from stages import artifacts
     from stages.drawing.view_scores import score_views
 
-    cameras = artifacts.load_scene(workspace / "undistort").cameras
-    names = artifacts.load_held_out(workspace / "train")
+    cameras = artifacts.SCENE.load(workspace / "undistort").cameras
+    names = artifacts.HELD_OUT.load(workspace / "train")
 
     def load(index: int) -> tuple[np.ndarray, None]:
         return artifacts.load_image(workspace / "undistort", cameras.names[index]), None

@@ -109,13 +109,13 @@ class Capture:
 
     def __init__(self, workspace: Path, data: Path) -> None:
         self.undistorted = workspace / "undistort"
-        self.cameras = artifacts.load_scene(self.undistorted).cameras
-        held_out = artifacts.load_held_out(workspace / "train")
+        self.cameras = artifacts.SCENE.load(self.undistorted).cameras
+        held_out = artifacts.HELD_OUT.load(workspace / "train")
         if not held_out:
             sys.exit(f"{workspace} held no photo out: run it with `--set train.hold_out=8`")
         self.held_out = [i for i, name in enumerate(self.cameras.names) if name in held_out]
         self.training = [i for i, name in enumerate(self.cameras.names) if name not in held_out]
-        self.atlas = artifacts.load_atlas(workspace / "atlas")
+        self.atlas = artifacts.ATLAS.load(workspace / "atlas")
         loaded = [artifacts.Pictures(self.undistorted).masked(name) for name in self.cameras.names]
         self.photos, self.own_masks = [photo for photo, _ in loaded], [mask for _, mask in loaded]
         self.masks_from = "the run" if self.own_masks[0] is not None else "silhouette"
@@ -139,7 +139,7 @@ def warped_masks(workspace: Path, folder: Path, cameras: PinholeCameras) -> list
     import cv2
     import pycolmap
 
-    model = pycolmap.Reconstruction(str(artifacts.model_path(workspace / "sfm")))
+    model = pycolmap.Reconstruction(str(artifacts.MODEL.load(workspace / "sfm")))
     lenses = {Path(image.name).stem: model.cameras[image.camera_id] for image in model.images.values()}
     masks: list[np.ndarray | None] = []
     for index, name in enumerate(cameras.names):
@@ -399,7 +399,7 @@ def bake_alone(workspace: Path, size: int) -> tuple[float, float, int]:
         atlas, out, scratch = (Path(folder) / name for name in ("atlas", "out", "scratch"))
         for each in (atlas, out, scratch):
             each.mkdir()
-        artifacts.save_atlas(atlas, replace(artifacts.load_atlas(workspace / "atlas"), texture_size=size))
+        artifacts.ATLAS.save(atlas, replace(artifacts.ATLAS.load(workspace / "atlas"), texture_size=size))
         inputs = {name: workspace / name for name in BAKE.needs} | {"atlas": atlas}
         context = StageContext(inputs=inputs, sources={}, out=out, scratch=scratch, params=BakeParams(), workers=2)
         began, used = time.perf_counter(), time.process_time()

@@ -35,13 +35,13 @@ class Watched:
 
     @property
     def report(self) -> Path:
-        return artifacts.report_path(self.workspace.stage_folder("report"))
+        return artifacts.PAGE.load(self.workspace.stage_folder("report"))
 
     @property
     def training(self) -> Path:
         """The folder of curves and previews: of the training under way or broken off, else of the finished one."""
         scratch = self.workspace.scratch_folder("train")
-        return scratch if artifacts.metrics_path(scratch).is_file() else self.workspace.stage_folder("train")
+        return scratch if artifacts.METRICS.load(scratch).is_file() else self.workspace.stage_folder("train")
 
     def shows_report(self) -> bool:
         """Whether the report is there and no run is making another one."""
@@ -58,7 +58,7 @@ class Watched:
                 {"name": stage.name, "summary": stage.summary, "state": self._stage_state(stage.name)}
                 for stage in self.pipeline
             ],
-            "charts": training_charts(artifacts.metrics_path(self.training)),
+            "charts": training_charts(artifacts.METRICS.load(self.training)),
             "previews": [path.name for path in self._pictures()],
         }
 
@@ -67,7 +67,7 @@ class Watched:
         return next((path for path in self._pictures() if path.name == name), None)
 
     def _pictures(self) -> list[Path]:
-        return sorted(artifacts.previews_path(self.training).glob("*.png"))
+        return sorted(artifacts.PREVIEWS.load(self.training).glob("*.png"))
 
     def _stage_state(self, name: str) -> str:
         if self.workspace.in_use() and self.workspace.is_writing(name):
@@ -83,7 +83,7 @@ def watch(folder: Path, pipeline: Sequence[Stage]) -> Watched:
     """
     watched = Watched(Workspace.open(folder), pipeline)
     if not (
-        watched.report.is_file() or watched.workspace.in_use() or artifacts.metrics_path(watched.training).is_file()
+        watched.report.is_file() or watched.workspace.in_use() or artifacts.METRICS.load(watched.training).is_file()
     ):
         root = watched.workspace.root
         raise WorkspaceError(

@@ -97,7 +97,7 @@ def run(context: StageContext[ExportParams]) -> dict[str, Any]:
 
 
 def _write_glb(asset: Asset) -> int:
-    return artifacts.glb_path(asset.out).write_bytes(_textured_glb(asset, asset.mesh, asset.extras))
+    return artifacts.asset_path(asset.out, "glb").write_bytes(_textured_glb(asset, asset.mesh, asset.extras))
 
 
 def _textured_glb(asset: Asset, mesh: artifacts.AtlasMesh, extras: dict[str, Any]) -> bytes:
@@ -150,14 +150,14 @@ def _write_usdz(asset: Asset) -> int:
             f"USDZ files are written with usd-core, which cannot be imported: {error}.",
             "Try `pip install usd-core`, or take usdz out of `export.formats`.",
         ) from error
-    return artifacts.usdz_path(asset.out).write_bytes(data)
+    return artifacts.asset_path(asset.out, "usdz").write_bytes(data)
 
 
 def _write_obj(asset: Asset) -> int:
     """The OBJ, its material and its images. Returns the bytes of the OBJ."""
     from stages.files.obj import mtl_text, obj_text
 
-    texture_path, mtl = artifacts.obj_texture_path(asset.out), artifacts.mtl_path(asset.out)
+    texture_path, mtl = artifacts.asset_path(asset.out, "png"), artifacts.asset_path(asset.out, "mtl")
     texture_path.write_bytes(asset.textures.base_color)
     normal_map_name = None
     if asset.textures.normal is not None:
@@ -166,7 +166,7 @@ def _write_obj(asset: Asset) -> int:
         normal_map_name = normal_map_path.name
     mtl.write_text(mtl_text(texture_path.name, normal_map_name), encoding="utf-8")
     text = obj_text(*asset.in_world(asset.mesh), asset.mesh.uvs, asset.mesh.faces, mtl.name, asset.note)
-    return artifacts.obj_path(asset.out).write_text(text, encoding="utf-8")
+    return artifacts.asset_path(asset.out, "obj").write_text(text, encoding="utf-8")
 
 
 def _write_ply(asset: Asset) -> int:
@@ -174,14 +174,14 @@ def _write_ply(asset: Asset) -> int:
 
     colors = vertex_colors(asset.textures.base_color, asset.mesh.uvs)
     data = ply_bytes(*asset.in_world(asset.mesh), colors, asset.mesh.faces, asset.note)
-    return artifacts.ply_path(asset.out).write_bytes(data)
+    return artifacts.asset_path(asset.out, "ply").write_bytes(data)
 
 
 def _write_stl(asset: Asset) -> int:
     from stages.files.ply_stl import stl_bytes
 
     vertices, _ = asset.in_world(asset.mesh)
-    return artifacts.stl_path(asset.out).write_bytes(stl_bytes(vertices, asset.mesh.faces, asset.note))
+    return artifacts.asset_path(asset.out, "stl").write_bytes(stl_bytes(vertices, asset.mesh.faces, asset.note))
 
 
 def load_textures(context: StageContext[ExportParams]) -> Textures:

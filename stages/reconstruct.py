@@ -83,11 +83,11 @@ class Reconstruction:
 
     @property
     def glb(self) -> Path | None:
-        return _existing(artifacts.glb_path(self.workspace.stage_folder("export")))
+        return _existing(artifacts.asset_path(self.workspace.stage_folder("export"), "glb"))
 
     @property
     def report(self) -> Path | None:
-        return _existing(artifacts.report_path(self.workspace.stage_folder("report")))
+        return _existing(artifacts.PAGE.load(self.workspace.stage_folder("report")))
 
 
 def reconstruct(request: Request, pipeline: Sequence[Stage], listener: Listener | None = None) -> Reconstruction:

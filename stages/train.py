@@ -51,7 +51,7 @@ def run(context: StageContext[TrainParams]) -> dict[str, Any]:
     trainer = Trainer(photos, sightings, params, context.device)
 
     checkpoint = artifacts.checkpoint_path(context.scratch)
-    metrics = artifacts.metrics_path(context.scratch)
+    metrics = artifacts.METRICS.load(context.scratch)
     spent = _resume(trainer, checkpoint, metrics)
     if trainer.step_index == 0:
         _start_from_shape(trainer, scene.cameras)
@@ -74,7 +74,7 @@ def run(context: StageContext[TrainParams]) -> dict[str, Any]:
                 _preview(trainer, context.scratch, progress)
                 previewed = progress
     _preview(trainer, context.scratch, 1.0)
-    shutil.copytree(artifacts.previews_path(context.scratch), context.to_write(PREVIEWS))
+    shutil.copytree(artifacts.PREVIEWS.load(context.scratch), context.to_write(PREVIEWS))
     torch.save(field_state(trainer.fields), context.to_write(FIELD))
     context.to_write(METRICS).write_bytes(metrics.read_bytes())
     seconds = spent + time.monotonic() - started

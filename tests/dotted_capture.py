@@ -79,8 +79,8 @@ def write_capture(
         for i in range(NUM_CAMERAS):
             track.add_element(i + 1, k)
         model.add_point3D(dot + shift, track, np.zeros(3, np.uint8))
-    artifacts.save_image_set(ingest, ImageSet(tuple(records)))
-    folder = artifacts.model_path(sfm)
+    artifacts.IMAGE_SET.save(ingest, ImageSet(tuple(records)))
+    folder = artifacts.MODEL.load(sfm)
     folder.mkdir(parents=True)
     model.write(str(folder))
     return {"ingest": ingest, "sfm": sfm}
@@ -95,7 +95,7 @@ def undistort(inputs: dict[str, Path], root: Path, **params: object) -> tuple[Po
     rest = UndistortParams(**{key: params[key] for key in params if key not in PlaceParams.model_fields})  # type: ignore[arg-type]
     placed = PLACE_STAGE.run(StageContext(inputs, {}, place, root, placing))
     numbers = UNDISTORT.run(StageContext({**inputs, "place": place}, {}, out, root, rest, workers=2))
-    return artifacts.load_scene(out), out, {**numbers, **{key: value for key, value in placed.items() if value != ""}}
+    return artifacts.SCENE.load(out), out, {**numbers, **{key: value for key, value in placed.items() if value != ""}}
 
 
 def dots_seen(photo: np.ndarray, expected: np.ndarray) -> np.ndarray:

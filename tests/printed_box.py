@@ -64,5 +64,5 @@ def ingested(folder: Path, photos: list[np.ndarray], focal: float | None = None)
         cv2.imwrite(str(path), cv2.cvtColor(photo, cv2.COLOR_GRAY2BGR))
         height, width = photo.shape
         records.append(ImageRecord(name, name, width, height, focal, f"{width} x {height}", 1.0, False, str(i)))
-    artifacts.save_image_set(folder, ImageSet(tuple(records)))
+    artifacts.IMAGE_SET.save(folder, ImageSet(tuple(records)))
     return folder

@@ -64,13 +64,13 @@ def bare_inputs(root: Path) -> StageContext:
     pose = np.concatenate([np.eye(3), [[0], [0], [3]]], 1)[None]
     K = np.array([[24.0, 0, 8], [0, 24, 8], [0, 0, 1]])
     cameras = PinholeCameras(("a.png",), np.array([[16, 16]]), K[None], pose)
-    artifacts.save_scene(folders["undistort"], scene_without_points(cameras))
-    artifacts.save_place(folders["place"], Place(Similarity.identity()))
-    artifacts.save_given_region(folders["place"], None)
-    artifacts.save_atlas(folders["atlas"], pyramid())
+    artifacts.SCENE.save(folders["undistort"], scene_without_points(cameras))
+    artifacts.PLACE.save(folders["place"], Place(Similarity.identity()))
+    artifacts.GIVEN_REGION.save(folders["place"], None)
+    artifacts.ATLAS.save(folders["atlas"], pyramid())
     texture = np.zeros((16, 16, 3), np.uint8)
     texture[:8], texture[8:] = (230, 40, 40), (40, 70, 220)
-    write_png(artifacts.base_color_path(folders["bake"]), texture)
+    write_png(artifacts.BASE_COLOR.load(folders["bake"]), texture)
     return StageContext(
         inputs={name: folders[name] for name in REPORT.needs},
         sources={},
@@ -90,8 +90,8 @@ def full_inputs(context: StageContext) -> StageContext:
         write_png(path, np.full((30, 40, 3), 120, np.uint8))
         records.append(ImageRecord(name, name, 40, 30, None, "0", 5.0, False, "00"))
     skipped = (SkippedImage("notes.txt", "not an image"),)
-    artifacts.save_image_set(inputs["ingest"], ImageSet(tuple(records), skipped))
-    artifacts.save_registration(
+    artifacts.IMAGE_SET.save(inputs["ingest"], ImageSet(tuple(records), skipped))
+    artifacts.REGISTRATION.save(
         inputs["sfm"],
         Registration(
             registered=("a.png", "c.png"),
@@ -100,34 +100,34 @@ def full_inputs(context: StageContext) -> StageContext:
     )
     lines = [{"step": 10 * i, "psnr": 10 + i, "loss": 0.5 / (i + 1), "rgb": None, "mask": 0.0} for i in range(50)]
     text = "\n".join(json.dumps(line) for line in lines) + '\n{"step": 500, "psn'
-    artifacts.metrics_path(inputs["train"]).write_text(text)
+    artifacts.METRICS.load(inputs["train"]).write_text(text)
     preview = artifacts.preview_path(inputs["train"], 100)
     preview.parent.mkdir()
     write_png(preview, np.full((20, 20, 3), 90, np.uint8))
     kinds = np.zeros((16, 16), np.uint8)
     kinds[:4, :12], kinds[4:8, :4] = 255, 128
-    write_png(artifacts.provenance_path(inputs["bake"]), kinds)
+    write_png(artifacts.PROVENANCE.load(inputs["bake"]), kinds)
     random = np.random.default_rng(0)
     scene = replace(
-        artifacts.load_scene(inputs["undistort"]),
+        artifacts.SCENE.load(inputs["undistort"]),
         points=random.normal(size=(300, 3)).astype(np.float32),
         point_errors=np.full(300, 0.5, np.float32),
         ground=Plane(UP, -0.2, 0.01, 0.5),
     )
-    artifacts.save_scene(inputs["undistort"], scene)
+    artifacts.SCENE.save(inputs["undistort"], scene)
     still = Similarity.identity()
-    artifacts.save_place(inputs["place"], Place(still, True, "2 markers (8 sides)", 0.0042))
+    artifacts.PLACE.save(inputs["place"], Place(still, True, "2 markers (8 sides)", 0.0042))
     region = given_region("box", BOX.ravel().tolist(), still)
-    artifacts.save_given_region(inputs["place"], region)
-    artifacts.overview_path(inputs["undistort"]).write_text(overview_svg(scene, region.box_corners()))
-    artifacts.save_quality(inputs["bake"], quality())
-    artifacts.save_held_out(inputs["train"], ["a.png"])
+    artifacts.GIVEN_REGION.save(inputs["place"], region)
+    artifacts.OVERVIEW.load(inputs["undistort"]).write_text(overview_svg(scene, region.box_corners()))
+    artifacts.QUALITY.save(inputs["bake"], quality())
+    artifacts.HELD_OUT.save(inputs["train"], ["a.png"])
     write_png(artifacts.image_path(inputs["undistort"], "a.png"), np.full((16, 16, 3), 77, np.uint8))
     return replace(context, manifests={name: manifest(name, faces=1234, share=0.123456) for name in REPORT.needs})
 
 
 def page(context: StageContext) -> str:
     numbers = REPORT.run(context)
-    path = artifacts.report_path(context.out)
+    path = artifacts.PAGE.load(context.out)
     assert numbers["bytes"] == path.stat().st_size
     return path.read_text(encoding="utf-8")

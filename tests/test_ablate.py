@@ -311,7 +311,7 @@ def test_the_mesh_is_scored_in_the_world_frame(here, monkeypatch):
     corners = np.eye(3)
     artifacts.save_mesh(folder / "cleanup", corners, np.array([[0, 1, 2]]))
     world = Similarity(2.0, np.eye(3), np.array([1.0, 0.0, 0.0]))
-    monkeypatch.setattr(artifacts, "load_scene", lambda path: SimpleNamespace(poses_from_scene=world))
+    monkeypatch.setattr(artifacts, "SCENE", SimpleNamespace(load=lambda _: SimpleNamespace(poses_from_scene=world)))
     seen = {}
 
     def score_mesh(mesh, model, where, known_stem):
@@ -334,7 +334,7 @@ def test_a_scene_without_sparse_points_trains(tmp_path):
     cameras = ring_of_cameras()
     folder, out, scratch = (tmp_path / name for name in ("undistort", "out", "scratch"))
     write_undistorted(folder, cameras)
-    artifacts.save_scene(folder, scene_without_points(cameras))
+    artifacts.SCENE.save(folder, scene_without_points(cameras))
     out.mkdir()
     scratch.mkdir()
     params = small({
@@ -344,4 +344,4 @@ def test_a_scene_without_sparse_points_trains(tmp_path):
     })  # fmt: skip
     numbers = train.run(StageContext({"undistort": folder}, {}, out, scratch, params))
     assert (numbers["steps"], numbers["sightings"]) == (2, 0)
-    assert artifacts.field_path(out).exists()
+    assert artifacts.FIELD.load(out).exists()

@@ -210,7 +210,7 @@ def run_stage(tmp_path, mesh, **params):
     out.mkdir()
     artifacts.save_mesh(cleanup, *mesh)
     context = StageContext({"cleanup": cleanup}, {}, out, tmp_path, AtlasParams(**params))
-    return ATLAS_STAGE.run(context), artifacts.load_atlas(out)
+    return ATLAS_STAGE.run(context), artifacts.ATLAS.load(out)
 
 
 def test_stage_uses_xatlas(tmp_path, mesh):

@@ -46,7 +46,7 @@ def context(tmp_path, monkeypatch) -> StageContext:
         np.concatenate([faces, faces[:, ::-1] + 4]).astype(np.int32),
         64,
     )
-    artifacts.save_atlas(folders["atlas"], atlas)
+    artifacts.ATLAS.save(folders["atlas"], atlas)
     artifacts.save_mesh(folders["cleanup"], atlas.vertices + 0.05 * atlas.normals, atlas.faces, artifacts.FULL_MESH)
     up = np.array([0.0, 0, 1])
     views = [look_at(np.array([x, -2.5, 0.2]), np.zeros(3), up, 48, 40, 40) for x in (-0.5, 0.6)]
@@ -56,7 +56,7 @@ def context(tmp_path, monkeypatch) -> StageContext:
         np.concatenate([view.intrinsics for view in views]),
         np.concatenate([view.cam_from_scene for view in views]),
     )
-    artifacts.save_scene(folders["undistort"], scene_without_points(cameras))
+    artifacts.SCENE.save(folders["undistort"], scene_without_points(cameras))
     for name in cameras.names:
         path = artifacts.image_path(folders["undistort"], name)
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -74,8 +74,8 @@ def test_files_and_numbers(context):
     import cv2
 
     numbers = BAKE.run(context)
-    color = cv2.imread(str(artifacts.base_color_path(context.out)))[..., ::-1]
-    kinds = cv2.imread(str(artifacts.provenance_path(context.out)), cv2.IMREAD_GRAYSCALE)
+    color = cv2.imread(str(artifacts.BASE_COLOR.load(context.out)))[..., ::-1]
+    kinds = cv2.imread(str(artifacts.PROVENANCE.load(context.out)), cv2.IMREAD_GRAYSCALE)
     assert color.shape == (64, 64, 3)
     assert np.abs(color[kinds == Provenance.PHOTO].astype(int) - SKY).max() <= 1  # red stays red
     assert (kinds[10:50, :28] == Provenance.PHOTO).mean() > 0.8
@@ -89,23 +89,23 @@ def test_maps_of_normals_and_occlusion_are_made_as_set(context):
     import cv2
 
     numbers = BAKE.run(context)
-    normal_map = cv2.imread(str(artifacts.normal_map_path(context.out)))[..., ::-1]
+    normal_map = cv2.imread(str(artifacts.NORMAL_MAP.load(context.out)))[..., ::-1]
     assert numbers["normals_share"] == 1.0
     assert np.abs(normal_map.astype(int) - [128, 128, 255]).max() <= 1  # the full mesh is as flat
-    occlusion = cv2.imread(str(artifacts.occlusion_path(context.out)), cv2.IMREAD_UNCHANGED)
+    occlusion = cv2.imread(str(artifacts.OCCLUSION.load(context.out)), cv2.IMREAD_UNCHANGED)
     assert occlusion.shape == (64, 64)
     assert (occlusion == 255).all()  # nothing stands before the square
     for folder in (context.out, context.scratch):
         for path in folder.iterdir():
             path.unlink()
     BAKE.run(replace(context, params=BakeParams(normal_map=False, occlusion_rays=0)))
-    assert not artifacts.normal_map_path(context.out).exists()
-    assert not artifacts.occlusion_path(context.out).exists()
+    assert not artifacts.NORMAL_MAP.load(context.out).exists()
+    assert not artifacts.OCCLUSION.load(context.out).exists()
 
 
 def test_the_quality_of_each_vertex_is_kept(context):
     BAKE.run(context)
-    quality = artifacts.load_quality(context.out)
+    quality = artifacts.QUALITY.load(context.out)
     assert quality.seen_by.shape == (8,)
     assert (quality.invented[4:] == 1).all()  # the back
     assert (quality.seen_by[4:] == 0).all()
@@ -163,9 +163,9 @@ def test_photos_that_were_held_out_are_not_in_the_texture(context):
 
     path = artifacts.image_path(context.inputs["undistort"], "sub/two.png")
     write_png(path, np.broadcast_to(255 - SKY, (40, 48, 3)).copy())
-    artifacts.save_held_out(context.inputs["train"], ["sub/two.png"])
+    artifacts.HELD_OUT.save(context.inputs["train"], ["sub/two.png"])
     numbers = BAKE.run(context)
-    color = cv2.imread(str(artifacts.base_color_path(context.out)))[..., ::-1]
-    kinds = cv2.imread(str(artifacts.provenance_path(context.out)), cv2.IMREAD_GRAYSCALE)
+    color = cv2.imread(str(artifacts.BASE_COLOR.load(context.out)))[..., ::-1]
+    kinds = cv2.imread(str(artifacts.PROVENANCE.load(context.out)), cv2.IMREAD_GRAYSCALE)
     assert np.abs(color[kinds == Provenance.PHOTO].astype(int) - SKY).max() <= 1
     assert numbers["mean_views"] == 1

@@ -96,7 +96,7 @@ def test_a_scene_of_every_suite_comes_to_its_undistorted_photos_without_its_test
     tests = 0 if scene.views is None else len(scene.views.names)
     assert result["photos"] == COUNT - tests
     place = Path("bench") / suite / scene.name / "tiny-seed0"
-    posed_scene = artifacts.load_scene(place / "undistort")
+    posed_scene = artifacts.SCENE.load(place / "undistort")
     true = cameras()
     for i, name in enumerate(posed_scene.cameras.names):
         number = int("".join(filter(str.isdigit, Path(name).stem)))
@@ -193,8 +193,8 @@ def test_a_mesh_is_scored_in_the_frame_of_its_poses_whatever_gps_made_of_the_wor
     workspace = Workspace.open(tmp_path / "workspace", create=True)
     for name in ("place", "undistort", "cleanup"):
         workspace.stage_folder(name).mkdir(parents=True)
-    artifacts.save_place(workspace.stage_folder("place"), moved)
-    artifacts.save_scene(workspace.stage_folder("undistort"), scene)
+    artifacts.PLACE.save(workspace.stage_folder("place"), moved)
+    artifacts.SCENE.save(workspace.stage_folder("undistort"), scene)
     corners = np.eye(3)
     artifacts.save_mesh(workspace.stage_folder("cleanup"), corners, np.array([[0, 1, 2]]))
     world = scene.world_from_scene(moved).apply(corners)
@@ -224,7 +224,7 @@ def test_test_photos_show_the_ball_where_the_scene_has_it(data: Path, suite: str
     workspace = Workspace.open(Path("bench") / suite / scene.name / "tiny-seed0")
     photos = TestPhotos(scene.views, workspace)
     assert photos.cameras.names == scene.views.names
-    trained = artifacts.load_scene(workspace.stage_folder("undistort"))
+    trained = artifacts.SCENE.load(workspace.stage_folder("undistort"))
     apart = np.linalg.norm(photos.cameras.centers[:, None] - trained.cameras.centers[None], axis=2)
     assert apart.min() > 0.1
     poses_from_scene = trained.poses_from_scene
@@ -254,7 +254,7 @@ def test_test_photos_have_the_masks_that_the_scene_is_run_with(data: Path, suite
     assert scene.views is not None
     workspace = Workspace.open(Path("bench") / suite / scene.name / "tiny-seed0")
     photos = TestPhotos(scene.views, workspace, scene.masks)
-    poses_from_scene = artifacts.load_scene(workspace.stage_folder("undistort")).poses_from_scene
+    poses_from_scene = artifacts.SCENE.load(workspace.stage_folder("undistort")).poses_from_scene
     for index in range(len(photos.cameras)):
         pixels, mask = photos.load(index)
         assert mask is not None

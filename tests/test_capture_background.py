@@ -93,7 +93,7 @@ def ingest(folder: Path, **params: object) -> tuple[artifacts.ImageSet, Path, di
     out.mkdir()
     sources, settings = {"photos": folder}, IngestParams(**params)  # type: ignore[arg-type]
     numbers = INGEST.run(StageContext({}, sources, out, folder.parent / "scratch", settings, workers=2))
-    return artifacts.load_image_set(out), out, numbers
+    return artifacts.IMAGE_SET.load(out), out, numbers
 
 
 def write_set(folder: Path, count: int, others: int = 0) -> list[np.ndarray]:

@@ -108,7 +108,7 @@ def test_ingest_takes_videos_as_one_camera_each(tmp_path: Path, alone: bool):
         {}, {"photos": video if alone else photos}, out, tmp_path / "scratch", IngestParams(video_frames=5)
     )
     numbers = INGEST.run(context)
-    image_set = artifacts.load_image_set(out)
+    image_set = artifacts.IMAGE_SET.load(out)
     assert numbers["images"] == (5 if alone else 10)
     assert numbers["cameras"] == numbers["videos"] == (1 if alone else 2)
     assert all(record.name.startswith(("clip.mp4/", "other.mp4/")) for record in image_set.images)

@@ -45,8 +45,8 @@ def stage(tmp_path):
         for folder in (undistort, extract, place, out):
             folder.mkdir()
         cameras = three_rings()
-        artifacts.save_scene(undistort, replace(scene_without_points(cameras), **(scene_extras or {})))
-        artifacts.save_given_region(place, region)
+        artifacts.SCENE.save(undistort, replace(scene_without_points(cameras), **(scene_extras or {})))
+        artifacts.GIVEN_REGION.save(place, region)
         artifacts.save_mesh(extract, vertices, faces)
         if masks is not None:
             import cv2

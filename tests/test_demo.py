@@ -35,7 +35,7 @@ def stand_ins(monkeypatch):
         export = request.workspace / "export"
         export.mkdir(parents=True, exist_ok=True)
         if made.ply:
-            artifacts.ply_path(export).write_text("ply")
+            artifacts.asset_path(export, "ply").write_text("ply")
         workspace = SimpleNamespace(root=request.workspace, stage_folder=lambda name: request.workspace / name)
         return Reconstruction(workspace, load_config(request.preset), request.preset, "cpu", 2, ())
 

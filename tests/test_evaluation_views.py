@@ -194,13 +194,13 @@ def workspace(tmp_path: Path) -> Workspace:
 
     def train(out: Path) -> None:
         fields = Fields(field_shape(PARAMS, len(cameras), background=False))
-        torch.save(field_state(fields), artifacts.field_path(out))
-        artifacts.save_held_out(out, [cameras.names[i] for i in (2, 6)])
+        torch.save(field_state(fields), artifacts.FIELD.load(out))
+        artifacts.HELD_OUT.save(out, [cameras.names[i] for i in (2, 6)])
 
     publish(opened, "train", train, PARAMS.model_dump(mode="json"))
-    publish(opened, "atlas", lambda out: artifacts.save_atlas(out, patch_of_the_ball()))
+    publish(opened, "atlas", lambda out: artifacts.ATLAS.save(out, patch_of_the_ball()))
     gray = np.full((8, 8, 3), 128, np.uint8)
-    publish(opened, "bake", lambda out: artifacts.write_png(artifacts.base_color_path(out), gray))
+    publish(opened, "bake", lambda out: artifacts.write_png(artifacts.BASE_COLOR.load(out), gray))
     return opened
 
 
@@ -229,14 +229,14 @@ def test_the_command_scores_each_photo_and_writes_the_pictures(workspace, tmp_pa
 
 
 def test_what_is_missing_or_stale_is_explained(workspace, tmp_path):
-    publish(workspace, "atlas", lambda out: artifacts.save_atlas(out, replace(patch_of_the_ball(), texture_size=4)))
+    publish(workspace, "atlas", lambda out: artifacts.ATLAS.save(out, replace(patch_of_the_ball(), texture_size=4)))
     code, refused = evaluate(workspace.root)
     assert code == 5
     assert "bake" in refused["error"]["message"]
     assert "another atlas" in refused["error"]["message"]
     (workspace.stage_folder("train") / "held_out.json").write_text("[]")
     gray = np.full((8, 8, 3), 128, np.uint8)
-    publish(workspace, "bake", lambda out: artifacts.write_png(artifacts.base_color_path(out), gray))
+    publish(workspace, "bake", lambda out: artifacts.write_png(artifacts.BASE_COLOR.load(out), gray))
     code, refused = evaluate(workspace.root)
     assert code == 3
     assert "holds no photos back" in refused["error"]["message"]

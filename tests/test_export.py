@@ -89,12 +89,12 @@ def workspace(tmp_path: Path, params: ExportParams | None = None) -> StageContex
     cameras = PinholeCameras(
         ("a.jpg",), np.array([[8, 8]]), np.eye(3)[None], np.concatenate([np.eye(3), np.zeros((3, 1))], 1)[None]
     )
-    artifacts.save_scene(folders["undistort"], scene_without_points(cameras, WORLD))
-    artifacts.save_place(folders["place"], Place(Similarity.identity()))
-    artifacts.save_atlas(folders["atlas"], atlas)
-    write_png(artifacts.base_color_path(folders["bake"]), texture)
-    write_png(artifacts.normal_map_path(folders["bake"]), np.full((32, 32, 3), (128, 128, 255), np.uint8))
-    write_png(artifacts.occlusion_path(folders["bake"]), np.full((32, 32), 200, np.uint8))
+    artifacts.SCENE.save(folders["undistort"], scene_without_points(cameras, WORLD))
+    artifacts.PLACE.save(folders["place"], Place(Similarity.identity()))
+    artifacts.ATLAS.save(folders["atlas"], atlas)
+    write_png(artifacts.BASE_COLOR.load(folders["bake"]), texture)
+    write_png(artifacts.NORMAL_MAP.load(folders["bake"]), np.full((32, 32, 3), (128, 128, 255), np.uint8))
+    write_png(artifacts.OCCLUSION.load(folders["bake"]), np.full((32, 32), 200, np.uint8))
     return StageContext(
         inputs={name: folders[name] for name in EXPORT.needs},
         sources={},
@@ -170,13 +170,13 @@ def test_glb_names_normals_occlusion_and_the_frame_they_are_for(exported):
 
 def test_files_do_without_normals_and_occlusion_that_were_not_baked(tmp_path):
     context = workspace(tmp_path)
-    artifacts.normal_map_path(context.inputs["bake"]).unlink()
-    artifacts.occlusion_path(context.inputs["bake"]).unlink()
+    artifacts.NORMAL_MAP.load(context.inputs["bake"]).unlink()
+    artifacts.OCCLUSION.load(context.inputs["bake"]).unlink()
     EXPORT.run(context)
-    data = artifacts.glb_path(context.out).read_bytes()
+    data = artifacts.asset_path(context.out, "glb").read_bytes()
     for word in (b"TANGENT", b"normalTexture", b"occlusionTexture"):
         assert word not in data
-    assert "norm" not in artifacts.mtl_path(context.out).read_text()
+    assert "norm" not in artifacts.asset_path(context.out, "mtl").read_text()
     assert not artifacts.obj_normal_map_path(context.out).exists()
 
 
@@ -262,7 +262,7 @@ def test_the_glb_says_its_units_and_where_on_earth_it_is(tmp_path):
     model = Similarity(3.0, np.eye(3), np.array([1.0, 2, 3]))
     located = Place(model, True, "GPS", 0.01, (47.0, 8.5, 400.0), 1.2)
     for place, units in ((Place(model), "arbitrary units"), (located, "metres")):
-        artifacts.save_place(context.inputs["place"], place)
+        artifacts.PLACE.save(context.inputs["place"], place)
         extras = extras_of(context)
         assert extras["units"] == units
         np.testing.assert_allclose(extras["world_from_model"], model.matrix())
@@ -280,7 +280,7 @@ def test_the_glb_says_its_units_and_where_on_earth_it_is(tmp_path):
 
 def extras_of(context: StageContext) -> dict:
     EXPORT.run(context)
-    data = artifacts.glb_path(context.out).read_bytes()
+    data = artifacts.asset_path(context.out, "glb").read_bytes()
     return json.loads(data[20 : 20 + struct.unpack("<I", data[12:16])[0]])["asset"]["extras"]
 
 
@@ -449,7 +449,11 @@ def test_gltf_validator_finds_nothing(tmp_path):
     EXPORT.run(context)
     corners = {"UCX_model_00": (CORNERS, FACES), "UCX_model_01": (CORNERS + 1, FACES)}
     artifacts.collision_path(context.out).write_bytes(shapes_glb_bytes(corners, extras={"photos": 1}))
-    files = [artifacts.glb_path(context.out), artifacts.lod_path(context.out, 1), artifacts.collision_path(context.out)]
+    files = [
+        artifacts.asset_path(context.out, "glb"),
+        artifacts.lod_path(context.out, 1),
+        artifacts.collision_path(context.out),
+    ]
     done = subprocess.run(
         ["node", str(ROOT / "benchmarks" / "validate_glb.mjs"), *map(str, files)],
         capture_output=True,
@@ -511,7 +515,7 @@ def test_ply_header_counts():
 def test_a_mesh_that_cannot_be_written_is_explained(tmp_path):
     context = workspace(tmp_path)
     atlas, _ = tetrahedron()
-    artifacts.save_atlas(
+    artifacts.ATLAS.save(
         context.inputs["atlas"], AtlasMesh(atlas.vertices, atlas.normals, atlas.uvs, atlas.faces[:0], 32)
     )
     with pytest.raises(ReconstructionError, match="cannot be exported"):

@@ -26,7 +26,7 @@ def stage(tmp_path, monkeypatch):
         stand_in = types.ModuleType("stages.neural.trained_field")
         stand_in.load_field = lambda path, device: types.SimpleNamespace(sdf=sdf)
         monkeypatch.setitem(sys.modules, "stages.neural.trained_field", stand_in)
-        artifacts.save_scene(undistort, scene_without_points(three_rings()))
+        artifacts.SCENE.save(undistort, scene_without_points(three_rings()))
         seen = []
         context = StageContext(
             inputs={"undistort": undistort, "train": train},

@@ -124,7 +124,7 @@ def test_the_stage_reports_the_photos_left_out_and_trains_on_the_others(tmp_path
     assert drawn == {0, 1, 3, 4, 5, 7}
     assert (numbers["held_out"], numbers["photos"]) == (2, 8)
     assert 5 < numbers["held_out_psnr"] < 40
-    assert len(artifacts.load_held_out(tmp_path / "out")) == 2
+    assert len(artifacts.HELD_OUT.load(tmp_path / "out")) == 2
 
 
 def test_judging_leaves_the_random_state_alone():

@@ -78,7 +78,7 @@ def ingest(photos: Path, masks: Path | None = None, **params: object) -> tuple[I
     numbers = INGEST.run(
         StageContext({}, sources, out, scratch, IngestParams(**params), workers=2)  # type: ignore[arg-type]
     )
-    return artifacts.load_image_set(out), out, numbers
+    return artifacts.IMAGE_SET.load(out), out, numbers
 
 
 def reasons(image_set: ImageSet) -> dict[str, str]:

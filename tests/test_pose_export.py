@@ -95,8 +95,8 @@ def test_both_exports_say_the_same_and_that_of_the_scene(tmp_path: Path):
     (tmp_path / "other").mkdir()
     write_colmap(folder, sfm, tmp_path / "place", tmp_path / "exported")
     write_transforms(folder, sfm, tmp_path / "place", tmp_path / "other")
-    scene = artifacts.load_scene(folder)
-    world = scene.world_from_scene(artifacts.load_place(tmp_path / "place"))
+    scene = artifacts.SCENE.load(folder)
+    world = scene.world_from_scene(artifacts.PLACE.load(tmp_path / "place"))
     colmap, transforms = (read_poses(tmp_path / name) for name in ("exported", "other"))
     for i, (one, other) in enumerate(zip(colmap.cameras, transforms.cameras, strict=True)):
         np.testing.assert_allclose(one.cam_from_world, other.cam_from_world, atol=1e-9)

@@ -459,7 +459,7 @@ def ingested(photos: Path, out: Path, params: IngestParams | None = None, **sour
     out.mkdir()
     context = StageContext({}, {"photos": photos, **sources}, out, out, params or IngestParams(), workers=1)
     INGEST.run(context)
-    return artifacts.load_image_set(out)
+    return artifacts.IMAGE_SET.load(out)
 
 
 def test_photos_without_pose_and_poses_without_photo_are_named_and_counted(

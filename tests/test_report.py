@@ -105,7 +105,7 @@ def test_the_page_says_it_all_and_refers_to_nothing_outside(full):
 
 
 def test_the_overview_shows_each_camera_from_both_sides(full):
-    drawing = ET.fromstring(artifacts.overview_path(full.inputs["undistort"]).read_text())
+    drawing = ET.fromstring(artifacts.OVERVIEW.load(full.inputs["undistort"]).read_text())
     views = drawing.findall("{*}svg")
     assert [view.find("{*}text").text for view in views] == ["from above", "from the side"]
     for view, height in zip(views, (0.0, -3.0), strict=True):  # the camera is at z = -3
@@ -155,7 +155,7 @@ def test_a_report_from_almost_nothing(context):
 def test_damaged_inputs_are_left_out(full):
     full = replace(full, manifests={name: full.manifests[name] for name in full.manifests if name != "train"})
     artifacts.image_path(full.inputs["ingest"], "c.png").write_text("not an image")
-    artifacts.provenance_path(full.inputs["bake"]).write_text("not an image")
+    artifacts.PROVENANCE.load(full.inputs["bake"]).write_text("not an image")
     html = page(full)
     assert "<td>train</td>" not in html
     assert "<td>sfm</td>" in html
@@ -191,7 +191,7 @@ def test_measures_are_packed_between_their_ends_and_unknown_ones_marked():
 
 
 def test_drawn_cameras_look_where_the_photos_look(full):
-    scene = artifacts.load_scene(full.inputs["undistort"])
+    scene = artifacts.SCENE.load(full.inputs["undistort"])
     caption = {"name": "a.jpg", "held_out": True, "error": 0.5, "points": 7}
     packed = pack_scene(scene, [caption], (), pyramid())
     camera = packed["cameras"][0]

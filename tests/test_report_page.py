@@ -50,7 +50,7 @@ def screenshot(folder: Path, url: str, *options: str) -> np.ndarray:
 
 def test_the_model_is_drawn_and_a_measure_changes_its_colours(full):
     page(full)
-    url = artifacts.report_path(full.out).as_uri()
+    url = artifacts.PAGE.load(full.out).as_uri()
     red, green, blue = screenshot(full.scratch, url).transpose(2, 0, 1)
     assert ((red > 180) & (green < 90) & (blue < 90)).sum() > 2000
     assert ((blue > 180) & (green < 110) & (red < 90)).sum() > 2000
@@ -71,7 +71,7 @@ setTimeout(() => {
 
 
 def test_a_photo_is_shown_in_the_view_and_photos_are_filtered(full):
-    report = artifacts.report_path(full.out)
+    report = artifacts.PAGE.load(full.out)
     report.write_text(page(full).replace("</body>", PRESS))
     html = browse(full.scratch, report.as_uri(), "--dump-dom").stdout
     assert 'data-viewer="ready"' in html.split(">")[1]
@@ -86,7 +86,7 @@ def test_a_photo_is_shown_in_the_view_and_photos_are_filtered(full):
 
 def test_without_webgl_the_page_says_so_and_keeps_its_pictures(full):
     page(full)
-    html = browse(full.scratch, artifacts.report_path(full.out).as_uri(), "--dump-dom", webgl=False).stdout
+    html = browse(full.scratch, artifacts.PAGE.load(full.out).as_uri(), "--dump-dom", webgl=False).stdout
     assert 'data-viewer="none"' in html
     assert re.search(r'<p class="soft" id="view-missing">', html)
     assert re.search(r'<div id="view" hidden="">', html)

@@ -43,13 +43,13 @@ def test_rendered_capture_gives_back_its_cameras(tmp_path: Path):
 
     assert numbers["registered"] == len(poses)
     assert numbers["attempts"] == 1
-    registration = artifacts.load_registration(out)
+    registration = artifacts.REGISTRATION.load(out)
     assert registration.matcher == "exhaustive"
     assert [item.name for item in registration.unregistered] == [f"{len(poses):03d}.png"]
     assert "matches no other photo" in registration.unregistered[0].reason
     assert registration.mean_reprojection_error_px < 1.0
 
-    model = pycolmap.Reconstruction(str(artifacts.model_path(out)))
+    model = pycolmap.Reconstruction(str(artifacts.MODEL.load(out)))
     found = {image.name: image.cam_from_world().matrix() for image in model.images.values()}
     names = sorted(found)
     estimated = np.array([-found[n][:, :3].T @ found[n][:, 3] for n in names])
@@ -95,7 +95,7 @@ def test_two_deterministic_runs_give_the_same_model_bit_for_bit(tmp_path: Path):
         numbers, out = run_sfm(ingest, tmp_path / run, deterministic=True)
         assert numbers["registered"] == 5
         assert numbers["attempts"] > 1
-        models.append({path.name: path.read_bytes() for path in sorted(artifacts.model_path(out).iterdir())})
+        models.append({path.name: path.read_bytes() for path in sorted(artifacts.MODEL.load(out).iterdir())})
     assert len(models[0]) >= 3
     assert models[0] == models[1]
 

@@ -173,23 +173,23 @@ def test_a_killed_run_goes_on_with_the_same_loss_curve(tmp_path, monkeypatch, se
         train.run(killed)
     monkeypatch.setattr(Trainer, "step", original)
     assert artifacts.checkpoint_path(killed.scratch).exists()
-    with artifacts.metrics_path(killed.scratch).open("a") as file:
+    with artifacts.METRICS.load(killed.scratch).open("a") as file:
         file.write('{"step": 40, "progr')  # what a kill leaves of a line that was being written
     train.run(killed)
-    curves = [metric_lines(artifacts.metrics_path(c.out)) for c in (whole, killed)]
+    curves = [metric_lines(artifacts.METRICS.load(c.out)) for c in (whole, killed)]
     assert curves[0] == curves[1]
     assert [line["step"] for line in curves[0]] == list(range(5, 61, 5))
 
-    fields = [load_field(artifacts.field_path(c.out)) for c in (whole, killed)]
+    fields = [load_field(artifacts.FIELD.load(c.out)) for c in (whole, killed)]
     points = np.random.default_rng(0).uniform(-1, 1, (50, 3))
     assert np.array_equal(fields[0].sdf(points), fields[1].sdf(points))
-    assert list(artifacts.previews_path(whole.out).iterdir())
+    assert list(artifacts.PREVIEWS.load(whole.out).iterdir())
 
 
 def test_the_published_field_answers_in_numpy(tmp_path):
     run_context = context(tmp_path, "out", changed(TINY, {"steps": 3}))
     train.run(run_context)
-    field = load_field(artifacts.field_path(run_context.out))
+    field = load_field(artifacts.FIELD.load(run_context.out))
     points = np.array([[0.0, 0, 0.9], [0, 0, 0.1]])
     sdf, normals = field.sdf(points), field.normals(points)
     assert sdf[0] > 0 > sdf[1]

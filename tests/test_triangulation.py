@@ -55,15 +55,15 @@ def test_poses_stay_and_points_are_found(tmp_path: Path, exhaustive_max: int):
     assert numbers["matcher"] == ("exhaustive" if exhaustive_max > len(POSES) else "spatial")
     assert numbers["poses_from"] == "transforms.json"
     assert numbers["mean_reprojection_error_px"] < 0.5
-    model = pycolmap.Reconstruction(str(artifacts.model_path(out)))
+    model = pycolmap.Reconstruction(str(artifacts.MODEL.load(out)))
     for image in model.images.values():
         np.testing.assert_allclose(image.cam_from_world().matrix(), POSES[int(image.name[:3])], atol=1e-9)
     points = np.array([point.xyz for point in model.points3D.values()])
     assert len(points) > 300
     # of the printed floor and box: nothing below the floor, nothing above the box
     assert np.mean((points[:, 2] > -0.02) & (points[:, 2] < 0.92)) > 0.98
-    assert artifacts.load_registration(out).registered == tuple(sorted(f"{i:03d}.png" for i in range(len(POSES))))
-    assert artifacts.load_given_poses(out) == artifacts.GivenPoses(origin="transforms.json")
+    assert artifacts.REGISTRATION.load(out).registered == tuple(sorted(f"{i:03d}.png" for i in range(len(POSES))))
+    assert artifacts.GIVEN_POSES.load(out) == artifacts.GivenPoses(origin="transforms.json")
 
 
 def test_plain_photos_are_a_warning_and_no_error(tmp_path: Path, caplog: pytest.LogCaptureFixture):
@@ -75,7 +75,7 @@ def test_plain_photos_are_a_warning_and_no_error(tmp_path: Path, caplog: pytest.
         numbers, out = run_sfm(ingested(tmp_path / "ingest", photos), poses, tmp_path)
     assert (numbers["registered"], numbers["points"]) == (len(POSES), 0)
     assert "only 0 points could be triangulated" in caplog.text
-    assert pycolmap.Reconstruction(str(artifacts.model_path(out))).num_reg_images() == len(POSES)
+    assert pycolmap.Reconstruction(str(artifacts.MODEL.load(out))).num_reg_images() == len(POSES)
 
 
 def test_a_reduced_photo_gets_a_reduced_camera():

@@ -35,7 +35,7 @@ from stages.posing.undistortion import png_names
 
 
 def place_of(root: Path) -> Place:
-    return artifacts.load_place(root / "place")
+    return artifacts.PLACE.load(root / "place")
 
 
 def world_from(scene: PosedScene, root: Path) -> Similarity:
@@ -157,9 +157,9 @@ def test_a_given_sphere_is_the_unit_sphere(tmp_path: Path):
     scene, out, numbers = undistort(inputs, tmp_path, region="sphere 2.5 -1 0.5 0.75", roi_scale=3.0)
     assert world_from(scene, tmp_path).scale == 0.75
     np.testing.assert_allclose(world_from(scene, tmp_path).translation, [2.5, -1, 0.5])
-    assert artifacts.load_given_region(tmp_path / "place").box is None
+    assert artifacts.GIVEN_REGION.load(tmp_path / "place").box is None
     assert numbers["region_from"] == "the given sphere"
-    assert artifacts.overview_path(out).read_text().startswith("<svg")
+    assert artifacts.OVERVIEW.load(out).read_text().startswith("<svg")
 
 
 def test_a_region_that_no_camera_sees_is_refused(tmp_path: Path):
@@ -172,7 +172,7 @@ def test_a_region_that_no_camera_sees_is_refused(tmp_path: Path):
 def test_a_given_box_is_kept_for_the_crop(tmp_path: Path):
     inputs = write_capture(tmp_path, *MODELS[0], masks=False)
     scene, _, _ = undistort(inputs, tmp_path, region="box 1 -2 0 3 0 1")
-    given = artifacts.load_given_region(tmp_path / "place")
+    given = artifacts.GIVEN_REGION.load(tmp_path / "place")
     np.testing.assert_array_equal(given.box, [[1, -2, 0], [3, 0, 1]])
     corners = scene.poses_from_scene.inverse().apply(given.box_corners())
     assert np.linalg.norm(corners, axis=1).max() < 0.98
@@ -188,12 +188,12 @@ def with_gps(inputs: dict[str, Path], noise: float) -> None:
     earth = pycolmap.GPSTransform(pycolmap.GPSTransformEllipsoid.WGS84)
     random = np.random.default_rng(0)
     records = []
-    for i, record in enumerate(artifacts.load_image_set(inputs["ingest"]).images):
+    for i, record in enumerate(artifacts.IMAGE_SET.load(inputs["ingest"]).images):
         pose = cam_from_world(i)
         x, y, z = -pose[:, :3].T @ pose[:, 3] * GROWTH + noise * random.normal(size=3)
         position = earth.enu_to_ellipsoid(np.array([[x, z, -y]]), 47.0, 8.5, 400.0)[0]
         records.append(replace(record, gps=tuple(position)))
-    artifacts.save_image_set(inputs["ingest"], ImageSet(tuple(records)))
+    artifacts.IMAGE_SET.save(inputs["ingest"], ImageSet(tuple(records)))
 
 
 def test_gps_makes_the_world_metric_with_z_up(tmp_path: Path):
@@ -323,8 +323,8 @@ def test_scene_records_survive_saving(tmp_path: Path):
     inputs = write_capture(tmp_path, *MODELS[0], masks=False)
     scene, _, _ = undistort(inputs, tmp_path)
     full = replace(scene, ground=Plane(np.array([0.0, 0, 1]), -0.3, 0.01, 0.4))
-    artifacts.save_scene(tmp_path, full)
-    loaded = artifacts.load_scene(tmp_path)
+    artifacts.SCENE.save(tmp_path, full)
+    loaded = artifacts.SCENE.load(tmp_path)
     np.testing.assert_array_equal(loaded.ground.normal, [0, 0, 1])
     assert (loaded.ground.offset, loaded.ground.rms, loaded.ground.share) == (-0.3, 0.01, 0.4)
     for one, other in ((loaded.cameras, full.cameras), (loaded, full)):
@@ -337,21 +337,21 @@ def test_scene_records_survive_saving(tmp_path: Path):
 def test_places_and_regions_survive_saving(tmp_path: Path):
     moved = Similarity(2.0, np.eye(3)[[1, 2, 0]], np.array([1.0, 2, 3]))
     place = Place(moved, True, "GPS", 0.01, (47.0, 8.5, 400.0), 1.5, np.array([0.0, 0, 1]))
-    artifacts.save_place(tmp_path, place)
-    loaded = artifacts.load_place(tmp_path)
+    artifacts.PLACE.save(tmp_path, place)
+    loaded = artifacts.PLACE.load(tmp_path)
     np.testing.assert_array_equal(loaded.world_from_poses.matrix(), moved.matrix())
     np.testing.assert_array_equal(loaded.up, place.up)
     assert tuple(loaded.origin) == place.origin
     assert loaded.describe() == place.describe()
-    artifacts.save_given_region(tmp_path, None)
-    assert artifacts.load_given_region(tmp_path) is None
+    artifacts.GIVEN_REGION.save(tmp_path, None)
+    assert artifacts.GIVEN_REGION.load(tmp_path) is None
     given = given_region("box", (0, 0, 0, 1, 2, 3), moved)
-    artifacts.save_given_region(tmp_path, given)
-    np.testing.assert_array_equal(artifacts.load_given_region(tmp_path).box_corners(), given.box_corners())
+    artifacts.GIVEN_REGION.save(tmp_path, given)
+    np.testing.assert_array_equal(artifacts.GIVEN_REGION.load(tmp_path).box_corners(), given.box_corners())
 
 
 def test_a_damaged_record_is_named(tmp_path: Path):
     (tmp_path / "place.json").write_text('{"metric": "perhaps"}')
     with pytest.raises(WorkspaceError, match=r"place\.json cannot be read: .*world_from_poses") as caught:
-        artifacts.load_place(tmp_path)
+        artifacts.PLACE.load(tmp_path)
     assert "--force" in caught.value.hint

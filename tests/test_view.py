@@ -36,14 +36,14 @@ def workspace(tmp_path: Path) -> Workspace:
 def train_a_little(workspace: Workspace) -> None:
     scratch = workspace.begin("train", "print")[1]
     lines = [json.dumps({"step": 50 * i, "psnr": 10 + i, "loss": 1 / (1 + i)}) for i in range(4)]
-    artifacts.metrics_path(scratch).write_text("\n".join(lines) + '\n{"step": 20')  # a line that is being written
+    artifacts.METRICS.load(scratch).write_text("\n".join(lines) + '\n{"step": 20')  # a line that is being written
     preview = artifacts.preview_path(scratch, 100)
     preview.parent.mkdir()
     preview.write_bytes(b"a picture")
 
 
 def write_report(workspace: Workspace) -> None:
-    report = artifacts.report_path(workspace.stage_folder("report"))
+    report = artifacts.PAGE.load(workspace.stage_folder("report"))
     report.parent.mkdir()
     report.write_text("<p>the report</p>")
 

@@ -1,187 +1,19 @@
 """Every file of a workspace, one module for each stage's: its name, where it lies, how it is saved and loaded.
 
 Nobody else spells a path. A stage declares the artifacts (upper case) that it reads and writes. Whoever looks at a
-finished workspace takes the functions, which want the folder of the stage that owns the file.
+finished workspace loads them from the folder of the stage that owns them: `artifacts.SCENE.load(folder)`.
 """
 
 from stages.artifacts.artifact import Artifact
-from stages.artifacts.atlas import ATLAS, AtlasMesh, load_atlas, save_atlas
-from stages.artifacts.bake import (
-    BASE_COLOR,
-    NORMAL_MAP,
-    OCCLUSION,
-    PROVENANCE,
-    QUALITY,
-    VertexQuality,
-    base_color_path,
-    load_quality,
-    normal_map_path,
-    occlusion_path,
-    provenance_path,
-    save_quality,
-)
-from stages.artifacts.export import (
-    ASSET,
-    collision_path,
-    glb_path,
-    lod_path,
-    mtl_path,
-    obj_normal_map_path,
-    obj_path,
-    obj_texture_path,
-    ply_path,
-    stl_path,
-    usdz_path,
-)
-from stages.artifacts.ingest import (
-    IMAGE_SET,
-    PHOTOS,
-    ImageRecord,
-    ImageSet,
-    SkippedImage,
-    load_image_set,
-    save_image_set,
-)
-from stages.artifacts.json_files import read_json, read_record, write_json, write_record
-from stages.artifacts.mesh import CLEAN_FULL_MESH, CLEAN_MESH, FULL_MESH, MESH, RAW_MESH, Mesh, load_mesh, save_mesh
+from stages.artifacts.atlas import ATLAS, AtlasMesh
+from stages.artifacts.bake import BASE_COLOR, NORMAL_MAP, OCCLUSION, PROVENANCE, QUALITY, VertexQuality
+from stages.artifacts.export import ASSET, asset_path, collision_path, lod_path, obj_normal_map_path
+from stages.artifacts.ingest import IMAGE_SET, PHOTOS, ImageRecord, ImageSet, SkippedImage
+from stages.artifacts.json_files import read_json, write_json
+from stages.artifacts.mesh import CLEAN_FULL_MESH, CLEAN_MESH, FULL_MESH, MESH, RAW_MESH, load_mesh, save_mesh
 from stages.artifacts.pictures import IMAGES, MASKS, Pictures, image_path, load_image, load_mask, mask_path, write_png
-from stages.artifacts.place import GIVEN_REGION, PLACE, load_given_region, load_place, save_given_region, save_place
-from stages.artifacts.report import PAGE, report_path
-from stages.artifacts.sfm import (
-    GIVEN_POSES,
-    MODEL,
-    REGISTRATION,
-    GivenPoses,
-    KnownSphere,
-    Registration,
-    Unregistered,
-    load_given_poses,
-    load_registration,
-    model_path,
-    save_given_poses,
-    save_registration,
-)
-from stages.artifacts.train import (
-    CHECKPOINT,
-    FIELD,
-    HELD_OUT,
-    METRICS,
-    PREVIEWS,
-    checkpoint_path,
-    field_path,
-    load_held_out,
-    metrics_path,
-    preview_path,
-    previews_path,
-    save_held_out,
-)
-from stages.artifacts.undistort import (
-    CAMERAS,
-    OVERVIEW,
-    PINHOLE_PHOTOS,
-    SCENE,
-    load_cameras,
-    load_scene,
-    overview_path,
-    save_cameras,
-    save_scene,
-)
-
-__all__ = [
-    "ASSET",
-    "ATLAS",
-    "BASE_COLOR",
-    "CAMERAS",
-    "CHECKPOINT",
-    "CLEAN_FULL_MESH",
-    "CLEAN_MESH",
-    "FIELD",
-    "FULL_MESH",
-    "GIVEN_POSES",
-    "GIVEN_REGION",
-    "HELD_OUT",
-    "IMAGES",
-    "IMAGE_SET",
-    "MASKS",
-    "MESH",
-    "METRICS",
-    "MODEL",
-    "NORMAL_MAP",
-    "OCCLUSION",
-    "OVERVIEW",
-    "PAGE",
-    "PHOTOS",
-    "PINHOLE_PHOTOS",
-    "PLACE",
-    "PREVIEWS",
-    "PROVENANCE",
-    "QUALITY",
-    "RAW_MESH",
-    "REGISTRATION",
-    "SCENE",
-    "Artifact",
-    "AtlasMesh",
-    "GivenPoses",
-    "ImageRecord",
-    "ImageSet",
-    "KnownSphere",
-    "Mesh",
-    "Pictures",
-    "Registration",
-    "SkippedImage",
-    "Unregistered",
-    "VertexQuality",
-    "base_color_path",
-    "checkpoint_path",
-    "collision_path",
-    "field_path",
-    "glb_path",
-    "image_path",
-    "load_atlas",
-    "load_cameras",
-    "load_given_poses",
-    "load_given_region",
-    "load_held_out",
-    "load_image",
-    "load_image_set",
-    "load_mask",
-    "load_mesh",
-    "load_place",
-    "load_quality",
-    "load_registration",
-    "load_scene",
-    "lod_path",
-    "mask_path",
-    "metrics_path",
-    "model_path",
-    "mtl_path",
-    "normal_map_path",
-    "obj_normal_map_path",
-    "obj_path",
-    "obj_texture_path",
-    "occlusion_path",
-    "overview_path",
-    "ply_path",
-    "preview_path",
-    "previews_path",
-    "provenance_path",
-    "read_json",
-    "read_record",
-    "report_path",
-    "save_atlas",
-    "save_cameras",
-    "save_given_poses",
-    "save_given_region",
-    "save_held_out",
-    "save_image_set",
-    "save_mesh",
-    "save_place",
-    "save_quality",
-    "save_registration",
-    "save_scene",
-    "stl_path",
-    "usdz_path",
-    "write_json",
-    "write_png",
-    "write_record",
-]
+from stages.artifacts.place import GIVEN_REGION, PLACE
+from stages.artifacts.report import PAGE
+from stages.artifacts.sfm import GIVEN_POSES, MODEL, REGISTRATION, GivenPoses, KnownSphere, Registration, Unregistered
+from stages.artifacts.train import FIELD, HELD_OUT, METRICS, PREVIEWS, checkpoint_path, preview_path
+from stages.artifacts.undistort import CAMERAS, OVERVIEW, PINHOLE_PHOTOS, SCENE

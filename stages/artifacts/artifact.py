@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
+
+import numpy as np
 
 T = TypeVar("T")
 
@@ -20,7 +22,7 @@ class Artifact(Generic[T]):
         files: patterns ("images/*") of its files' paths relative to that stage's folder.
         load: reads it from the stage's folder.
         save: writes it into the stage's folder.
-        optional: whether the stage may leave it out; `load` then gives what its docstring says.
+        optional: whether the stage may leave it out; `load` then gives None, nothing, or a path that is not there.
     """
 
     stage: str
@@ -46,9 +48,27 @@ def place_artifact(stage: str, place: str, files: str | None = None, optional: b
         place: relative to the stage's folder.
         files: pattern of its files; `place` where it is one file.
     """
+    return in_folder(stage, (files or place,), lambda folder: folder / place, optional)
 
-    def save(folder: Path, value: Path) -> None:
-        if value != folder / place or not value.exists():
-            raise ValueError(f"{value} was to be written at {folder / place}")
 
-    return Artifact(stage, (files or place,), lambda folder: folder / place, save, optional)
+def in_folder(stage: str, files: tuple[str, ...], of: Callable[[Path], T], optional: bool = False) -> Artifact[T]:
+    """An artifact whose value only says where its files lie in a stage's folder, `of(folder)`."""
+
+    def save(folder: Path, value: T) -> None:
+        if value != of(folder):
+            raise ValueError(f"{value} is no part of {folder}")
+
+    return Artifact(stage, files, of, save, optional)
+
+
+def arrays_artifact(stage: str, file: str, kind: Callable[..., T]) -> Artifact[T]:
+    """A dataclass `kind` of arrays and numbers, as a .npz file."""
+
+    def load(folder: Path) -> T:
+        with np.load(folder / file) as data:
+            return kind(**{name: array if array.ndim else array.item() for name, array in data.items()})
+
+    def save(folder: Path, value: Any) -> None:
+        np.savez(folder / file, **asdict(value))
+
+    return Artifact(stage, (file,), load, save)

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from dataclasses import dataclass
 
 import numpy as np
 
-from stages.artifacts.artifact import Artifact
-
-ATLAS_FILE = "atlas.npz"
+from stages.artifacts.artifact import arrays_artifact
 
 
 @dataclass(frozen=True)
@@ -31,13 +28,4 @@ class AtlasMesh:
     texture_size: int
 
 
-def save_atlas(folder: Path, atlas: AtlasMesh) -> None:
-    np.savez(folder / ATLAS_FILE, **asdict(atlas))
-
-
-def load_atlas(folder: Path) -> AtlasMesh:
-    with np.load(folder / ATLAS_FILE) as data:
-        return AtlasMesh(data["vertices"], data["normals"], data["uvs"], data["faces"], int(data["texture_size"]))
-
-
-ATLAS = Artifact("atlas", (ATLAS_FILE,), load_atlas, save_atlas)
+ATLAS = arrays_artifact("atlas", "atlas.npz", AtlasMesh)

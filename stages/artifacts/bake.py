@@ -2,18 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from dataclasses import dataclass
 
 import numpy as np
 
-from stages.artifacts.artifact import Artifact, place_artifact
-
-BASE_COLOR_FILE = "base_color.png"
-PROVENANCE_FILE = "provenance.png"
-NORMAL_MAP_FILE = "normal_map.png"
-OCCLUSION_FILE = "occlusion.png"
-QUALITY_FILE = "vertex_quality.npz"
+from stages.artifacts.artifact import arrays_artifact, place_artifact
 
 
 @dataclass(frozen=True)
@@ -38,37 +31,12 @@ class VertexQuality:
     invented: np.ndarray
 
 
-def save_quality(folder: Path, quality: VertexQuality) -> None:
-    np.savez(folder / QUALITY_FILE, **asdict(quality))
-
-
-def load_quality(folder: Path) -> VertexQuality:
-    with np.load(folder / QUALITY_FILE) as data:
-        return VertexQuality(**data)
-
-
-def base_color_path(folder: Path) -> Path:
-    """8-bit sRGB texture; row 0 is v = 1."""
-    return folder / BASE_COLOR_FILE
-
-
-def provenance_path(folder: Path) -> Path:
-    """8-bit grey, one value a texel, see `stages.texture.baking.Provenance`."""
-    return folder / PROVENANCE_FILE
-
-
-def normal_map_path(folder: Path) -> Path:
-    """8-bit tangent-space normals, +Y up, see `stages.texture.relief.bake_normals`. May not exist."""
-    return folder / NORMAL_MAP_FILE
-
-
-def occlusion_path(folder: Path) -> Path:
-    """8-bit grey, 255 where all is open, see `stages.texture.relief.bake_occlusion`. May not exist."""
-    return folder / OCCLUSION_FILE
-
-
-BASE_COLOR = place_artifact("bake", BASE_COLOR_FILE)
-PROVENANCE = place_artifact("bake", PROVENANCE_FILE)
-NORMAL_MAP = place_artifact("bake", NORMAL_MAP_FILE, optional=True)
-OCCLUSION = place_artifact("bake", OCCLUSION_FILE, optional=True)
-QUALITY = Artifact("bake", (QUALITY_FILE,), load_quality, save_quality)
+# 8-bit sRGB texture; row 0 is v = 1.
+BASE_COLOR = place_artifact("bake", "base_color.png")
+# 8-bit grey, one value a texel, see `stages.texture.baking.Provenance`.
+PROVENANCE = place_artifact("bake", "provenance.png")
+# 8-bit tangent-space normals, +Y up, see `stages.texture.relief.bake_normals`.
+NORMAL_MAP = place_artifact("bake", "normal_map.png", optional=True)
+# 8-bit grey, 255 where all is open, see `stages.texture.relief.bake_occlusion`.
+OCCLUSION = place_artifact("bake", "occlusion.png", optional=True)
+QUALITY = arrays_artifact("bake", "vertex_quality.npz", VertexQuality)

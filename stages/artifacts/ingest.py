@@ -9,7 +9,7 @@ from stages.artifacts.artifact import Artifact
 from stages.artifacts.json_files import read_json, write_json
 from stages.artifacts.pictures import pictures_of
 
-IMAGE_RECORDS = "images.json"
+_RECORDS = "images.json"
 
 
 @dataclass(frozen=True)
@@ -56,12 +56,12 @@ class ImageSet:
     skipped: tuple[SkippedImage, ...] = field(default=())
 
 
-def save_image_set(folder: Path, image_set: ImageSet) -> None:
-    write_json(folder / IMAGE_RECORDS, asdict(image_set))
+def _save_image_set(folder: Path, image_set: ImageSet) -> None:
+    write_json(folder / _RECORDS, asdict(image_set))
 
 
-def load_image_set(folder: Path) -> ImageSet:
-    data = read_json(folder / IMAGE_RECORDS)
+def _load_image_set(folder: Path) -> ImageSet:
+    data = read_json(folder / _RECORDS)
     return ImageSet(
         tuple(ImageRecord(**record) for record in data["images"]),
         tuple(SkippedImage(**record) for record in data["skipped"]),
@@ -69,4 +69,4 @@ def load_image_set(folder: Path) -> ImageSet:
 
 
 PHOTOS = pictures_of("ingest")
-IMAGE_SET = Artifact("ingest", (IMAGE_RECORDS,), load_image_set, save_image_set)
+IMAGE_SET = Artifact("ingest", (_RECORDS,), _load_image_set, _save_image_set)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, PlainSerializer, ValidationError
 
+from stages.artifacts.artifact import Artifact
 from stages.errors import WorkspaceError
 
 if TYPE_CHECKING:
@@ -48,6 +49,16 @@ def read_record(path: Path, schema: type[Schema]) -> Schema:
             f"{path} cannot be read: {found['msg']} ({where}).",
             f"Make it again: `hineus run PHOTOS --force {path.parent.name}`.",
         ) from error
+
+
+def record_artifact(stage: str, file: str, schema: type[Schema]) -> Artifact[Schema]:
+    """A record as a JSON file."""
+    return Artifact(
+        stage,
+        (file,),
+        lambda folder: read_record(folder / file, schema),
+        lambda folder, record: write_record(folder / file, record),
+    )
 
 
 def write_json(path: Path, data: Any) -> None:

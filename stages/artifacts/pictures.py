@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from stages.artifacts.artifact import Artifact
+from stages.artifacts.artifact import Artifact, in_folder
 from stages.errors import WorkspaceError
 
 IMAGES, MASKS = "images", "masks"
@@ -58,12 +58,7 @@ class Pictures:
 
 def pictures_of(stage: str) -> Artifact[Pictures]:
     """The pictures and masks that `stage` publishes."""
-
-    def save(folder: Path, pictures: Pictures) -> None:
-        if pictures.folder != folder:
-            raise ValueError(f"pictures were written to {pictures.folder} instead of {folder}")
-
-    return Artifact(stage, (f"{IMAGES}/*", f"{MASKS}/*"), Pictures, save)
+    return in_folder(stage, (f"{IMAGES}/*", f"{MASKS}/*"), Pictures)
 
 
 def image_path(folder: Path, name: str) -> Path:

@@ -9,8 +9,8 @@ from stages.artifacts.json_files import Array, Record, read_record, write_record
 from stages.geometry.place import GivenRegion, Place
 from stages.geometry.similarity import Similarity
 
-PLACE_FILE = "place.json"
-REGION_FILE = "given_region.json"
+_PLACE = "place.json"
+_REGION = "given_region.json"
 
 
 class SimilarityRecord(Record):
@@ -43,26 +43,26 @@ class _RegionRecord(Record):
     world_from_poses: SimilarityRecord | None = None
 
 
-def save_place(folder: Path, place: Place) -> None:
-    write_record(folder / PLACE_FILE, _PlaceRecord.model_validate(place))
+def _save_place(folder: Path, place: Place) -> None:
+    write_record(folder / _PLACE, _PlaceRecord.model_validate(place))
 
 
-def load_place(folder: Path) -> Place:
-    record = read_record(folder / PLACE_FILE, _PlaceRecord)
+def _load_place(folder: Path) -> Place:
+    record = read_record(folder / _PLACE, _PlaceRecord)
     return Place(**{**dict(record), "world_from_poses": record.world_from_poses.similarity()})
 
 
-def save_given_region(folder: Path, region: GivenRegion | None) -> None:
-    write_record(folder / REGION_FILE, _RegionRecord() if region is None else _RegionRecord.model_validate(region))
+def _save_given_region(folder: Path, region: GivenRegion | None) -> None:
+    write_record(folder / _REGION, _RegionRecord() if region is None else _RegionRecord.model_validate(region))
 
 
-def load_given_region(folder: Path) -> GivenRegion | None:
+def _load_given_region(folder: Path) -> GivenRegion | None:
     """None where none was given."""
-    record = read_record(folder / REGION_FILE, _RegionRecord)
+    record = read_record(folder / _REGION, _RegionRecord)
     if record.center is None or record.radius is None or record.world_from_poses is None:
         return None
     return GivenRegion(record.center, record.radius, record.box, record.world_from_poses.similarity())
 
 
-PLACE = Artifact("place", (PLACE_FILE,), load_place, save_place)
-GIVEN_REGION = Artifact("place", (REGION_FILE,), load_given_region, save_given_region)
+PLACE = Artifact("place", (_PLACE,), _load_place, _save_place)
+GIVEN_REGION = Artifact("place", (_REGION,), _load_given_region, _save_given_region)

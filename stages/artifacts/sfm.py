@@ -6,11 +6,9 @@ from pathlib import Path
 from typing import Any
 
 from stages.artifacts.artifact import Artifact, place_artifact
-from stages.artifacts.json_files import Array, Record, read_record, write_record
+from stages.artifacts.json_files import Array, Record, read_record, record_artifact, write_record
 
-MODEL_FOLDER = "model"
-REGISTRATION_FILE = "registration.json"
-KNOWN_POSES_FILE = "known_poses.json"
+_GIVEN_POSES = "known_poses.json"
 
 
 class Unregistered(Record):
@@ -59,30 +57,18 @@ class GivenPoses(Record):
     region: KnownSphere | None = None
 
 
-def model_path(folder: Path) -> Path:
-    """Folder with the COLMAP model (cameras.bin, images.bin, points3D.bin)."""
-    return folder / MODEL_FOLDER
-
-
-def save_registration(folder: Path, registration: Registration) -> None:
-    write_record(folder / REGISTRATION_FILE, registration)
-
-
-def load_registration(folder: Path) -> Registration:
-    return read_record(folder / REGISTRATION_FILE, Registration)
-
-
-def save_given_poses(folder: Path, poses: GivenPoses | None) -> None:
+def _save_given_poses(folder: Path, poses: GivenPoses | None) -> None:
     if poses is not None:
-        write_record(folder / KNOWN_POSES_FILE, poses)
+        write_record(folder / _GIVEN_POSES, poses)
 
 
-def load_given_poses(folder: Path) -> GivenPoses | None:
-    """None where the poses were found and not given."""
-    path = folder / KNOWN_POSES_FILE
+def _load_given_poses(folder: Path) -> GivenPoses | None:
+    path = folder / _GIVEN_POSES
     return read_record(path, GivenPoses) if path.exists() else None
 
 
-MODEL = place_artifact("sfm", MODEL_FOLDER, f"{MODEL_FOLDER}/*")
-REGISTRATION = Artifact("sfm", (REGISTRATION_FILE,), load_registration, save_registration)
-GIVEN_POSES = Artifact("sfm", (KNOWN_POSES_FILE,), load_given_poses, save_given_poses, optional=True)
+# The COLMAP model (cameras.bin, images.bin, points3D.bin).
+MODEL = place_artifact("sfm", "model", "model/*")
+REGISTRATION = record_artifact("sfm", "registration.json", Registration)
+# None where the poses were found and not given.
+GIVEN_POSES = Artifact("sfm", (_GIVEN_POSES,), _load_given_poses, _save_given_poses, optional=True)

@@ -8,49 +8,32 @@ from pathlib import Path
 from stages.artifacts.artifact import Artifact, place_artifact
 from stages.artifacts.json_files import read_json, write_json
 
-FIELD_FILE = "field.pt"
-METRICS_FILE = "metrics.jsonl"
-HELD_OUT_FILE = "held_out.json"
-PREVIEWS_FOLDER = "previews"
-CHECKPOINT = "checkpoint.pt"  # in the stage's scratch folder
+_HELD_OUT = "held_out.json"
 
 
-def field_path(folder: Path) -> Path:
-    """The trained field, see `stages.neural.trained_field.TrainedField`."""
-    return folder / FIELD_FILE
+def _save_held_out(folder: Path, names: Sequence[str]) -> None:
+    write_json(folder / _HELD_OUT, list(names))
 
 
-def save_held_out(folder: Path, names: Sequence[str]) -> None:
-    """Names of the photos that neither training nor texture use."""
-    write_json(folder / HELD_OUT_FILE, list(names))
-
-
-def load_held_out(folder: Path) -> tuple[str, ...]:
-    """Names of the photos that `train.hold_out` keeps back from training and texture; none where it is off."""
-    path = folder / HELD_OUT_FILE
+def _load_held_out(folder: Path) -> tuple[str, ...]:
+    path = folder / _HELD_OUT
     return tuple(read_json(path)) if path.exists() else ()
 
 
-def metrics_path(folder: Path) -> Path:
-    """JSON lines, one object a logged step."""
-    return folder / METRICS_FILE
-
-
-def previews_path(folder: Path) -> Path:
-    """Folder of the renders made while training."""
-    return folder / PREVIEWS_FOLDER
+# The trained field, see `stages.neural.trained_field.TrainedField`.
+FIELD = place_artifact("train", "field.pt")
+# JSON lines, one object a logged step.
+METRICS = place_artifact("train", "metrics.jsonl")
+# Renders made while training.
+PREVIEWS = place_artifact("train", "previews", "previews/*")
+# Names of the photos that neither training nor texture use; none where `train.hold_out` is off.
+HELD_OUT: Artifact[Sequence[str]] = Artifact("train", (_HELD_OUT,), _load_held_out, _save_held_out, optional=True)
 
 
 def preview_path(folder: Path, step: int) -> Path:
     """Photo, render and normals side by side at one step."""
-    return folder / PREVIEWS_FOLDER / f"{step:07d}.png"
+    return PREVIEWS.load(folder) / f"{step:07d}.png"
 
 
 def checkpoint_path(scratch: Path) -> Path:
-    return scratch / CHECKPOINT
-
-
-FIELD = place_artifact("train", FIELD_FILE)
-METRICS = place_artifact("train", METRICS_FILE)
-PREVIEWS = place_artifact("train", PREVIEWS_FOLDER, f"{PREVIEWS_FOLDER}/*")
-HELD_OUT = Artifact("train", (HELD_OUT_FILE,), load_held_out, save_held_out, optional=True)
+    return scratch / "checkpoint.pt"

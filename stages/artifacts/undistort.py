@@ -13,10 +13,9 @@ from stages.artifacts.place import SimilarityRecord
 from stages.geometry.cameras import PinholeCameras, PosedScene
 from stages.geometry.plane import Plane
 
-CAMERAS_FILE = "cameras.json"
-SCENE_FILE = "scene.json"
-POINTS_FILE = "points.npz"
-OVERVIEW_FILE = "overview.svg"
+_CAMERAS = "cameras.json"
+_SCENE = "scene.json"
+_POINTS = "points.npz"
 
 
 class _CameraRecord(Record):
@@ -46,17 +45,17 @@ class _SceneRecord(Record):
     ground: _PlaneRecord | None
 
 
-def save_cameras(folder: Path, cameras: PinholeCameras) -> None:
+def _save_cameras(folder: Path, cameras: PinholeCameras) -> None:
     rows = zip(cameras.names, cameras.sizes.tolist(), cameras.intrinsics, cameras.cam_from_scene, strict=True)
     records = (
         _CameraRecord(name=name, size=tuple(size), intrinsics=intrinsics, cam_from_scene=pose)
         for name, size, intrinsics, pose in rows
     )
-    write_record(folder / CAMERAS_FILE, _CamerasRecord(cameras=tuple(records)))
+    write_record(folder / _CAMERAS, _CamerasRecord(cameras=tuple(records)))
 
 
-def load_cameras(folder: Path) -> PinholeCameras:
-    records = read_record(folder / CAMERAS_FILE, _CamerasRecord).cameras
+def _load_cameras(folder: Path) -> PinholeCameras:
+    records = read_record(folder / _CAMERAS, _CamerasRecord).cameras
     return PinholeCameras(
         names=tuple(record.name for record in records),
         sizes=np.array([record.size for record in records], dtype=np.int64),
@@ -65,23 +64,23 @@ def load_cameras(folder: Path) -> PinholeCameras:
     )
 
 
-def save_scene(folder: Path, scene: PosedScene) -> None:
-    save_cameras(folder, scene.cameras)
-    write_record(folder / SCENE_FILE, _SceneRecord.model_validate(scene))
+def _save_scene(folder: Path, scene: PosedScene) -> None:
+    _save_cameras(folder, scene.cameras)
+    write_record(folder / _SCENE, _SceneRecord.model_validate(scene))
     np.savez(
-        folder / POINTS_FILE,
+        folder / _POINTS,
         points=scene.points.astype(np.float32),
         point_errors=scene.point_errors.astype(np.float32),
         observations=scene.observations.astype(np.int32),
     )
 
 
-def load_scene(folder: Path) -> PosedScene:
-    record = read_record(folder / SCENE_FILE, _SceneRecord)
-    with np.load(folder / POINTS_FILE) as points:
+def _load_scene(folder: Path) -> PosedScene:
+    record = read_record(folder / _SCENE, _SceneRecord)
+    with np.load(folder / _POINTS) as points:
         sparse = {key: points[key] for key in ("points", "point_errors", "observations")}
     return PosedScene(
-        cameras=load_cameras(folder),
+        cameras=_load_cameras(folder),
         poses_from_scene=record.poses_from_scene.similarity(),
         up=record.up,
         kind=record.kind,
@@ -90,12 +89,8 @@ def load_scene(folder: Path) -> PosedScene:
     )
 
 
-def overview_path(folder: Path) -> Path:
-    """Drawing of cameras, sparse points and the region of interest."""
-    return folder / OVERVIEW_FILE
-
-
 PINHOLE_PHOTOS = pictures_of("undistort")
-CAMERAS = Artifact("undistort", (CAMERAS_FILE,), load_cameras, save_cameras)
-SCENE = Artifact("undistort", (CAMERAS_FILE, SCENE_FILE, POINTS_FILE), load_scene, save_scene)
-OVERVIEW = place_artifact("undistort", OVERVIEW_FILE)
+CAMERAS = Artifact("undistort", (_CAMERAS,), _load_cameras, _save_cameras)
+SCENE = Artifact("undistort", (_CAMERAS, _SCENE, _POINTS), _load_scene, _save_scene)
+# Drawing of cameras, sparse points and the region of interest.
+OVERVIEW = place_artifact("undistort", "overview.svg")

@@ -37,7 +37,7 @@ def mesh_path(place: Path) -> Path:
     """The mesh of a workspace, that which was exported; a file is its own."""
     if not place.is_dir():
         return place
-    path = artifacts.ply_path(place / "export")
+    path = artifacts.asset_path(place / "export", "ply")
     if not path.exists():
         raise InputError(
             f"{place} holds no exported PLY ({path.relative_to(place)}).",
@@ -72,7 +72,7 @@ def read_prediction(place: Path) -> tuple[Path, Surface]:
     surface = read_surface(path)
     if not place.is_dir():
         return path, surface
-    poses_from_world = artifacts.load_place(Workspace.open(place).stage_folder("place")).world_from_poses.inverse()
+    poses_from_world = artifacts.PLACE.load(Workspace.open(place).stage_folder("place")).world_from_poses.inverse()
     return path, surface.moved(poses_from_world.matrix())
 
 
@@ -157,7 +157,7 @@ def workspace_cameras(workspace: Path) -> Cameras:
         raise WorkspaceError(
             f"{workspace} has no undistorted photos.", f"Make them: `hineus undistort --workspace {workspace}`."
         )
-    scene = artifacts.load_scene(opened.stage_folder("undistort"))
+    scene = artifacts.SCENE.load(opened.stage_folder("undistort"))
     return Cameras(str(workspace), into_scene(scene.cameras, scene.poses_from_scene.inverse()))
 
 

@@ -28,7 +28,7 @@ def write_colmap(undistort: Path, sfm: Path, place: Path, out: Path) -> dict[str
     Returns:
         Numbers of images, points and observations.
     """
-    _, model = _images_and_model(undistort, sfm, artifacts.load_place(place), out)
+    _, model = _images_and_model(undistort, sfm, artifacts.PLACE.load(place), out)
     folder = out / SPARSE
     folder.mkdir()
     model.write_binary(str(folder))
@@ -45,7 +45,7 @@ def write_transforms(undistort: Path, sfm: Path, place: Path, out: Path) -> dict
     Returns:
         Numbers of images, points and observations.
     """
-    in_world = artifacts.load_place(place)
+    in_world = artifacts.PLACE.load(place)
     scene, model = _images_and_model(undistort, sfm, in_world, out)
     model.export_PLY(str(out / POINTS))
     cameras = into_scene(scene.cameras, scene.world_from_scene(in_world).inverse())
@@ -76,7 +76,7 @@ def write_transforms(undistort: Path, sfm: Path, place: Path, out: Path) -> dict
 
 def _images_and_model(undistort: Path, sfm: Path, place: Place, out: Path) -> tuple[PosedScene, Any]:
     """Copy images and masks to `out`; the scene, and the pycolmap model of it."""
-    scene = artifacts.load_scene(undistort)
+    scene = artifacts.SCENE.load(undistort)
     _copy_images(scene, undistort, out)
     return scene, undistorted_model(scene, place, sfm, out / artifacts.IMAGES)
 
@@ -88,7 +88,7 @@ def undistorted_model(scene: PosedScene, in_world: Place, sfm: Path, images_fold
     """
     import pycolmap
 
-    source = pycolmap.Reconstruction(str(artifacts.model_path(sfm)))
+    source = pycolmap.Reconstruction(str(artifacts.MODEL.load(sfm)))
     photos = sorted((source.images[i] for i in source.reg_image_ids()), key=lambda image: image.name)
     cameras = into_scene(scene.cameras, scene.world_from_scene(in_world).inverse())
     model = pycolmap.Reconstruction()

@@ -81,13 +81,13 @@ def run_demo(
         workers=workers,
     )
     result = reconstruct(request, pipeline, listener)
-    ply = artifacts.ply_path(result.workspace.stage_folder("export"))
+    ply = artifacts.asset_path(result.workspace.stage_folder("export"), "ply")
     if not ply.exists():
         raise InputError(
             f"Preset {preset} writes no PLY file, which the score needs.",
             "Try `hineus demo --preset demo`.",
         )
-    score = score_mesh(ply, artifacts.model_path(result.workspace.stage_folder("sfm")), folder)
+    score = score_mesh(ply, artifacts.MODEL.load(result.workspace.stage_folder("sfm")), folder)
     artifacts.write_json(folder / SCORE, score)
     return Demo(result, score, time.monotonic() - started)
 

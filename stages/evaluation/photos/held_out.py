@@ -39,13 +39,13 @@ def evaluate_views(workspace: Path, renders: Path | None = None, device: str = "
     """
     opened = _whole(workspace)
     undistort = opened.stage_folder("undistort")
-    held_out = artifacts.load_held_out(opened.stage_folder("train"))
+    held_out = artifacts.HELD_OUT.load(opened.stage_folder("train"))
     if not held_out:
         raise InputError(
             f"{workspace} holds no photos back: all were trained on.",
             f"Train without every 8th: `hineus run --workspace {workspace} --hold-out 8`.",
         )
-    cameras = artifacts.load_scene(undistort).cameras
+    cameras = artifacts.SCENE.load(undistort).cameras
     masked = 0
 
     def load(index: int) -> tuple[np.ndarray, np.ndarray | None]:

@@ -52,8 +52,8 @@ def score_photos(
     """
     drawer = field_drawer(workspace, device)
     if textured:
-        atlas = artifacts.load_atlas(workspace.stage_folder("atlas"))
-        texture = read_rgb(artifacts.base_color_path(workspace.stage_folder("bake")))
+        atlas = artifacts.ATLAS.load(workspace.stage_folder("atlas"))
+        texture = read_rgb(artifacts.BASE_COLOR.load(workspace.stage_folder("bake")))
     kinds = ("field", "mesh") if textured else ("field",)
     photos: list[dict[str, Any]] = []
     for index in indices:
@@ -77,7 +77,7 @@ def field_drawer(workspace: Workspace, device: str) -> FieldDrawer:
     """What draws the trained field of a workspace, with the settings it was trained with."""
     manifest = workspace.published("train")
     assert manifest is not None  # callers have made sure
-    field = load_field(artifacts.field_path(workspace.stage_folder("train")), device)
+    field = load_field(artifacts.FIELD.load(workspace.stage_folder("train")), device)
     params = TrainParams.model_validate(section_with_new_names("train", manifest.identity.params))
     return FieldDrawer(field.fields, params, device)
 

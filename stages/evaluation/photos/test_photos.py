@@ -57,7 +57,7 @@ class TestPhotos:
         Raises:
             InputError: no photo has a pose, or one has another shape than its pose is for.
         """
-        scene = artifacts.load_scene(workspace.stage_folder("undistort"))
+        scene = artifacts.SCENE.load(workspace.stage_folder("undistort"))
         poses = read_poses(views.poses)
         matched = match_photos(poses, views.names)
         self._views = views

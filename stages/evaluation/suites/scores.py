@@ -51,14 +51,14 @@ def result_mesh(workspace: Workspace, fresh: set[str], out: Path) -> Path | None
     if "cleanup" not in fresh:
         return None
     vertices, faces = artifacts.load_mesh(workspace.stage_folder("cleanup"))
-    scene = artifacts.load_scene(workspace.stage_folder("undistort"))
+    scene = artifacts.SCENE.load(workspace.stage_folder("undistort"))
     _write(scene.poses_from_scene, (vertices, faces), out)
     return out
 
 
 def posed_mesh(workspace: Workspace, mesh: Path, out: Path) -> Path:
     """Write a mesh that is in the world frame of a workspace, in the frame of its poses, to `out`."""
-    place = artifacts.load_place(workspace.stage_folder("place"))
+    place = artifacts.PLACE.load(workspace.stage_folder("place"))
     _write(place.world_from_poses.inverse(), read_mesh(mesh), out)
     return out
 
@@ -76,7 +76,7 @@ def score_surface(truth: Truth, mesh: Path, workspace: Workspace) -> dict[str, A
         InputError: the truth cannot be read, or the mesh not be scored.
     """
     if truth.protocol == "known":
-        return dict(score_mesh(mesh, artifacts.model_path(workspace.stage_folder("sfm")), truth.folder))
+        return dict(score_mesh(mesh, artifacts.MODEL.load(workspace.stage_folder("sfm")), truth.folder))
     if truth.protocol == "dtu":
         return _without_paths(evaluate_dtu(mesh, truth.folder, truth.scan))
     if truth.protocol == "glossy":
