@@ -128,6 +128,13 @@ def _anchors(page):
     return {re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-") for heading in headings}
 
 
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_files_and_folders_named_on_the_pages_exist(page):
+    named = r"`((?:stages|hineus_cli|configs|benchmarks|docs|tests)/[a-z0-9_/.-]*)`"
+    for name in re.findall(named, page.read_text(encoding="utf-8")):
+        assert (ROOT / name).exists(), f"{page.name} names {name}"
+
+
 def _shell_lines(page):
     for block in re.findall(r"```\n(.*?)```", page.read_text(encoding="utf-8"), flags=re.S):
         yield from block.splitlines()
