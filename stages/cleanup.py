@@ -13,23 +13,15 @@ from stages.artifacts import CLEAN_FULL_MESH, CLEAN_MESH, GIVEN_REGION, PINHOLE_
 from stages.engine.stage import Stage, StageContext
 from stages.errors import ReconstructionError
 from stages.geometry.cameras import PinholeCameras, PosedScene
-from stages.geometry.place import GivenRegion
-from stages.geometry.plane import Plane, fit_plane
-from stages.geometry.similarity import Similarity
 
 logger = logging.getLogger(__name__)
 
 # The visibility test runs on a mesh of this many times the final faces: no slower, and fine enough for clean borders.
 WORKING_FACES = 3
-# Faces that lean less than this from the ground's plane belong to it, and this much area (in the region's radii
-# squared) is enough to fit it.
-GROUND_TILT_DEG, MIN_GROUND_AREA = 15.0, 0.02
-# Pieces that rise above the cut by less than this many tolerances, and have less than this part of the largest one's
-# area, are bumps of the ground.
-BUMP_TOLERANCES, BUMP_AREA = 5.0, 0.05
-# What hangs further under the ground than this many tolerances, further out than this, was made up along the border of
-# the region; unless more than this part of the sparse points lies under the ground, too.
-UNDER_TOLERANCES, BORDER_RADIUS, MAX_UNDER = 2.0, 0.75, 0.01
+# Pieces that rise above the cut by less than this many of the ground's tolerances are bumps of it.
+BUMP_TOLERANCES = 5.0
+# What hangs further under the ground than this many of its tolerances along the region's border was made up.
+UNDER_TOLERANCES = 2.0
 # Specks below this part of `min_component` go before anything is measured. The rest waits until the unseen is gone:
 # a background shell may be the largest piece.
 SPECK = 0.1
@@ -47,7 +39,7 @@ def _masks(pictures: Pictures, cameras: PinholeCameras, margin: int) -> Iterator
 
 
 def run(context: StageContext[CleanupParams]) -> dict[str, Any]:
-    from stages.surface import selection, triangle_mesh
+    from stages.surface import ground, selection, triangle_mesh
     from stages.surface.decimation import decimate
 
     params = context.params
@@ -73,11 +65,11 @@ def run(context: StageContext[CleanupParams]) -> dict[str, Any]:
         inside, "outside_region", "Try `--set undistort.roi_scale=1.5`, or train for longer: `--set train.steps=6000`."
     )
     region = context.read(GIVEN_REGION)
-    sides = region_sides(region, scene.poses_from_scene) if region else []
+    sides = region.sides(scene.poses_from_scene) if region else []
     vertices, faces = _crop(vertices, faces, scene, sides, params)
     numbers["ground_removed"] = params.remove_ground and scene.ground is not None
     if scene.ground is not None and not params.keep_closed:
-        under = _under_the_border(vertices, scene, UNDER_TOLERANCES * params.ground_tolerance)
+        under = ground.under_the_border(vertices, scene, UNDER_TOLERANCES * params.ground_tolerance)
         keep(np.asarray(~under[faces].all(1)), "under_ground", "Try `--set undistort.roi_scale=1.5`.")
     large, numbers["specks_dropped"] = selection.large_pieces(faces, SPECK * params.min_component)
     keep(large, "speck_faces", "Try `--set cleanup.min_component=0`.")
@@ -141,7 +133,7 @@ def _crop(
 
     A mesh that is to be closed ends in lids there, and at the border of the region of interest.
     """
-    from stages.surface import solids, triangle_mesh
+    from stages.surface import ground, solids, triangle_mesh
 
     if params.keep_closed:
         vertices, faces = solids.cut_to_ball(vertices, faces, params.roi_radius)
@@ -149,7 +141,7 @@ def _crop(
         if scene.ground is None:
             logger.warning("no ground was found in the sparse points, so none is removed")
         else:
-            sides = [*sides, _cut_above_ground(vertices, faces, scene.ground, params.ground_tolerance)]
+            sides = [*sides, ground.cut_above(vertices, faces, scene.ground, params.ground_tolerance)]
     for normal, offset in sides:
         cut = solids.cut_at_plane if params.keep_closed else triangle_mesh.clip
         vertices, faces = cut(vertices, faces, normal, offset)
@@ -159,72 +151,8 @@ def _crop(
                 "Look at `place.region` and at the report's drawing, or try `--set cleanup.remove_ground=false`.",
             )
     if params.remove_ground and scene.ground is not None:
-        vertices, faces = _without_bumps(vertices, faces, *sides[-1], BUMP_TOLERANCES * params.ground_tolerance)
+        vertices, faces = ground.without_bumps(vertices, faces, *sides[-1], BUMP_TOLERANCES * params.ground_tolerance)
     return vertices, faces
-
-
-def _under_the_border(vertices: np.ndarray, scene: PosedScene, depth: float) -> np.ndarray:
-    """Vertices [V] bool that hang under the ground by more than `depth` along the region's border.
-
-    Photos show the ground going on there and nothing below it, so that training may leave flaps.
-    """
-    assert scene.ground is not None
-    points = scene.points[np.linalg.norm(scene.points, axis=1) < 1]
-    if scene.kind != "object" or (scene.ground.heights(points) < -depth).sum() > MAX_UNDER * len(points):
-        return np.zeros(len(vertices), dtype=bool)
-    hanging: np.ndarray = np.linalg.norm(vertices, axis=1) > BORDER_RADIUS
-    hanging &= scene.ground.heights(vertices) < -depth
-    return hanging
-
-
-def _without_bumps(
-    vertices: np.ndarray, faces: np.ndarray, normal: np.ndarray, offset: float, height: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """The mesh without what a bumpy ground leaves above its cut: small pieces that rise by less than `height`."""
-    from stages.surface import triangle_mesh
-
-    labels = triangle_mesh.label_pieces(len(faces), triangle_mesh.face_adjacency(faces))
-    areas = np.bincount(labels, np.linalg.norm(triangle_mesh.face_normals(vertices, faces), axis=1))
-    tops = np.full(len(areas), -np.inf)
-    np.maximum.at(tops, labels, (vertices @ normal - offset)[faces].max(1))
-    bumps = (tops < height) & (areas < BUMP_AREA * areas.max())
-    return triangle_mesh.compact(vertices, faces[~bumps[labels]])
-
-
-def region_sides(region: GivenRegion, poses_from_scene: Similarity) -> list[tuple[np.ndarray, float]]:
-    """The sides of the box that was given, see `box_sides`; none where it was a sphere."""
-    if region.box is None:
-        return []
-    return box_sides(region.box, region.world_from_poses.compose(poses_from_scene))
-
-
-def box_sides(box: np.ndarray, world_from_scene: Similarity) -> list[tuple[np.ndarray, float]]:
-    """Planes (normal [3], offset) in the scene frame, the box's inside above them, of a world box [2, 3]."""
-    sides = []
-    for sign, corner in ((1.0, box[0]), (-1.0, box[1])):
-        for axis in range(3):
-            side = Plane(sign * np.eye(3)[axis], sign * float(corner[axis]), 0.0, 0.0).within(world_from_scene)
-            sides.append((side.normal, side.offset))
-    return sides
-
-
-def _cut_above_ground(
-    vertices: np.ndarray, faces: np.ndarray, ground: Plane, tolerance: float
-) -> tuple[np.ndarray, float]:
-    """Plane (normal [3], offset) a tolerance above the ground, which is fitted anew to the mesh where it shows it."""
-    from stages.surface.triangle_mesh import face_normals
-
-    centers = vertices[faces].mean(1).astype(np.float64)
-    normals = face_normals(vertices, faces)
-    areas = np.linalg.norm(normals, axis=1)
-    level = normals @ ground.normal > np.cos(np.radians(GROUND_TILT_DEG)) * areas
-    normal, offset = ground.normal, ground.offset
-    for reach in (2 * tolerance, tolerance, tolerance):
-        on_it = level & (np.abs(centers @ normal - offset) < reach)
-        if areas[on_it].sum() / 2 < MIN_GROUND_AREA:
-            return ground.normal, ground.offset + tolerance
-        normal, offset = fit_plane(centers[on_it], ground.normal, areas[on_it])
-    return normal, offset + tolerance
 
 
 def _seen_faces(vertices: np.ndarray, faces: np.ndarray, seen: np.ndarray, params: CleanupParams) -> np.ndarray:
@@ -238,7 +166,7 @@ def _seen_faces(vertices: np.ndarray, faces: np.ndarray, seen: np.ndarray, param
         return chosen
     chosen = selection.spread(faces, len(vertices), chosen, params.rings)
     chosen = selection.smooth_selection(faces, len(vertices), chosen, params.rings)
-    area = np.linalg.norm(triangle_mesh.face_normals(vertices, faces), axis=1) / 2
+    area = triangle_mesh.face_areas(vertices, faces)
     return selection.fill_small_gaps(vertices, faces, chosen, params.max_hidden_area * float(area[chosen].sum()))
 
 

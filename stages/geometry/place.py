@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from stages.geometry.plane import Plane
 from stages.geometry.similarity import Similarity, align_points
 
 if TYPE_CHECKING:
@@ -116,6 +117,17 @@ class GivenRegion:
             return None
         picks = np.array([[i >> k & 1 for k in range(3)] for i in range(8)])
         return self.world_from_poses.inverse().apply(np.take_along_axis(self.box, picks, axis=0))
+
+    def sides(self, poses_from_scene: Similarity) -> list[tuple[Float[np.ndarray, " 3"], float]]:
+        """Planes (normal, offset) in the scene frame with the box above them; none where there is no box."""
+        if self.box is None:
+            return []
+        world_from_scene, sides = self.world_from_poses.compose(poses_from_scene), []
+        for sign, corner in ((1.0, self.box[0]), (-1.0, self.box[1])):
+            for axis in range(3):
+                side = Plane(sign * np.eye(3)[axis], sign * float(corner[axis]), 0.0, 0.0).within(world_from_scene)
+                sides.append((side.normal, side.offset))
+        return sides
 
 
 def given_region(form: str, numbers: Sequence[float], world_from_poses: Similarity) -> GivenRegion:
