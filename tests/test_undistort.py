@@ -355,3 +355,9 @@ def test_a_damaged_record_is_named(tmp_path: Path):
     with pytest.raises(WorkspaceError, match=r"place\.json cannot be read: .*world_from_poses") as caught:
         artifacts.WORLD_PLACE.load(tmp_path)
     assert "--force" in caught.value.hint
+
+
+def test_a_workspace_of_an_older_version_is_told_how_to_go_on(tmp_path: Path):
+    with pytest.raises(WorkspaceError, match=r"place\.json cannot be read: No such file") as caught:
+        artifacts.WORLD_PLACE.load(tmp_path / "place")
+    assert f"`hineus run --workspace {tmp_path}`" in caught.value.hint

@@ -38,10 +38,16 @@ def read_record(path: Path, schema: type[Schema]) -> Schema:
     """The record in a file.
 
     Raises:
-        WorkspaceError: the file is not what the schema says.
+        WorkspaceError: there is no such file (an older version may have made the workspace), or it is not what the
+            schema says.
     """
     try:
         return schema.model_validate_json(path.read_bytes())
+    except OSError as error:
+        raise WorkspaceError(
+            f"{path} cannot be read: {error.strerror}.",
+            f"Bring the workspace up to date: `hineus run --workspace {path.parent.parent}`.",
+        ) from error
     except ValidationError as error:
         found = error.errors(include_url=False, include_input=False)[0]
         where = ".".join(str(part) for part in found["loc"]) or "the whole file"
