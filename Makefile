@@ -10,7 +10,7 @@ PYTHON ?=
 export PYTHON
 BIN := .venv/bin
 
-.PHONY: help venv demo check test bench-smoke lint format docs vendor clean
+.PHONY: help venv demo check quick test bench-smoke lint format docs vendor clean
 
 help:
 	@sed -n 's/^# //p' Makefile
@@ -21,8 +21,11 @@ venv:
 demo: venv
 	$(BIN)/hineus demo
 
-# One thread a process: two of them fill two cores.
-check: lint
+# Lint beside the tests, which have one thread a process: so two cores are busy all the time.
+check: venv
+	@$(MAKE) --no-print-directory -j2 --output-sync=target lint quick
+
+quick: venv
 	OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(BIN)/python -m pytest -m "not slow" -n auto --maxprocesses 4
 
 test: venv
