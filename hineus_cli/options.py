@@ -103,7 +103,7 @@ Time = Annotated[
 
 def hold_out_option(what_for: str) -> Any:
     """`--hold-out N`, which means the same in every command."""
-    text = f"Keep every N-th photo back {what_for}. 8: every 8th, 12 %; 0: none."
+    text = f"Hold every N-th photo out {what_for}. 8: every 8th, 12 %; 0: none."
     return typer.Option("--hold-out", parser=every_nth, metavar="N", help=text, show_default=False)
 
 

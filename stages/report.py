@@ -56,13 +56,9 @@ def run(context: StageContext[ReportParams]) -> dict[str, Any]:
     from stages.reporting import curves, numbers, photo_table, pictures
     from stages.reporting.held_out_photos import compare_held_out
 
-    place, atlas, texture = (
-        context.read(WORLD_PLACE),
-        context.read(ATLAS_MESH),
-        pictures.read_rgb(context.read(BASE_COLOR)),
-    )
-    scene = context.read(SCENE)
+    scene, place, atlas = context.read(SCENE), context.read(WORLD_PLACE), context.read(ATLAS_MESH)
     scene = replace(scene, up=scene.up_in(place))
+    texture = pictures.read_rgb(context.read(BASE_COLOR))
     held_out, pinholes = context.read(HELD_OUT), context.read(PINHOLE_PHOTOS)
     manifests = context.manifests
     steps = 5

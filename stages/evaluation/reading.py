@@ -72,10 +72,8 @@ def read_prediction(place: Path) -> tuple[Path, Surface]:
     surface = read_surface(path)
     if not place.is_dir():
         return path, surface
-    poses_from_world = artifacts.WORLD_PLACE.load(
-        Workspace.open(place).stage_folder("place")
-    ).world_from_poses.inverse()
-    return path, surface.moved(poses_from_world.matrix())
+    in_world = artifacts.WORLD_PLACE.load(Workspace.open(place).stage_folder("place"))
+    return path, surface.moved(in_world.world_from_poses.inverse().matrix())
 
 
 def _has_faces(path: Path) -> bool:

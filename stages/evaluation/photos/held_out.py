@@ -45,7 +45,7 @@ def evaluate_views(workspace: Path, renders: Path | None = None, device: str = "
             f"{workspace} holds out no photos: all were trained on.",
             f"Train without every 8th: `hineus run --workspace {workspace} --hold-out 8`.",
         )
-    cameras = artifacts.SCENE.load(undistort).cameras
+    cameras = artifacts.CAMERAS.load(undistort)
     pinholes = artifacts.PINHOLE_PHOTOS.load(undistort)
     masked = sum(pinholes.mask_path(name).exists() for name in held_out)
 
