@@ -1,7 +1,7 @@
 """How well the region of interest holds what the photos are about: nothing of it cut off, little else in it.
 
 python -m benchmarks.regions                    made-up captures and the scenes of the synthetic suite
-python -m benchmarks.regions DATA               and the sets in DATA, posed by `hineus run --until undistort`
+python -m benchmarks.regions DATA               and the sets in DATA, posed by `hineus run --until sfm`
 python -m benchmarks.regions --only trophy,pair these alone
 python -m benchmarks.regions --render trophy OUT    write small photos of one, to run the whole pipeline on
 python -m benchmarks.regions --table-only       only rewrite the tables of docs/benchmarks/regions.md
@@ -108,14 +108,21 @@ def measure(data: Path | None, workspaces: Path, only: Sequence[str]) -> Iterato
             yield simulated(SUITE, name, recipe.shows, suite.make(name))
     for name in find_sets(data, []) if data else ():
         if not only or name in only:
-            posed = sets.load_posed(_workspace(data / name, workspaces / name))
-            subject, source = sets.subject_of(data / name, posed)
-            yield measured(PROXY if source == sets.BY_PROXY else SETS, name, source, posed, subject)
+            yield from _set_rows(name, data / name, _workspace(data / name, workspaces / name))
+
+
+def _set_rows(name: str, folder: Path, workspace: Path) -> Iterator[Row]:
+    """A set as it is, and with its masks where it has some."""
+    posed, masks = sets.load_posed(workspace), sets.find_masks(folder)
+    subject, source = sets.subject_of(folder, workspace, posed)
+    yield measured(PROXY if source == sets.BY_PROXY else SETS, name, source, posed, subject)
+    if masks is not None:
+        yield measured(SETS, f"{name}, masks", source, sets.load_posed(workspace, masks), subject)
 
 
 def _workspace(folder: Path, workspace: Path) -> Path:
     """The workspace of a set, with its photos posed; as it is where they are already."""
-    if not (workspace / "undistort" / "manifest.json").is_file():
+    if not (workspace / "sfm" / "manifest.json").is_file():
         run_hineus(
             [
                 "run",
@@ -123,7 +130,7 @@ def _workspace(folder: Path, workspace: Path) -> Path:
                 "--workspace",
                 str(workspace),
                 "--until",
-                "undistort",
+                "sfm",
                 "--deterministic",
                 "--json",
             ]

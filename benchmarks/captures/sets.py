@@ -1,5 +1,5 @@
-"""Sets of real and rendered photos, from workspaces in which `hineus run --until undistort` has been: what was found,
-and points on what the photos are about, in the scene frame of the workspace."""
+"""Sets of real and rendered photos, from workspaces in which `hineus run --until sfm` has been: what was found,
+and points on what the photos are about, in the frame of the poses."""
 
 from __future__ import annotations
 
@@ -10,13 +10,17 @@ import numpy as np
 from benchmarks.captures.model import Posed
 from benchmarks.captures.subject import MIN_PHOTOS, SAMPLES
 from benchmarks.captures.tracks import sight
+from configs.params import UndistortParams
 from stages import artifacts
+from stages.capture.masks import read_mask
 from stages.evaluation.alignment import by_cameras
 from stages.evaluation.protocols.known_object import file_stem, has_truth, load_known_object
 from stages.evaluation.surfaces import sample_faces
 from stages.geometry.cameras import PinholeCameras
 from stages.posing import neus
+from stages.posing.undistortion import plan_warp, png_names, posed_cameras, registered_photos, warp_maps, warp_mask
 from stages.surface.triangle_mesh import raycaster
+from stages.undistort import _sparse_points
 
 # A sparse point that is surely what the photos are about: this many photos have it in the middle half of both
 # directions, and the rays of two that see it meet at this angle.
@@ -26,27 +30,47 @@ MAX_ERROR_PX = 1.5
 ON_MASKS = 3  # photos whose masks hold a point that lies outside none
 
 
-def load_posed(workspace: Path) -> Posed:
-    """What is known of the photos after undistort, in the scene frame."""
-    scene = artifacts.SCENE.load(workspace / "undistort")
-    pictures = artifacts.PINHOLE_PHOTOS.load(workspace / "undistort")
-    masks = tuple(pictures.mask(name) for name in scene.cameras.names)
-    known = any(mask is not None for mask in masks)
-    return Posed(
-        scene.cameras,
-        scene.points.astype(np.float64),
-        scene.point_errors,
-        scene.observations,
-        masks if known else None,
-    )
+def load_posed(workspace: Path, masks: dict[str, Path] | None = None) -> Posed:
+    """What `undistort` knows of the photos, in the frame of the poses.
+
+    Args:
+        masks: the mask of each photo, by the photo's name without suffix; None: nothing is known of silhouettes.
+    """
+    import pycolmap
+
+    model = pycolmap.Reconstruction(str(artifacts.MODEL.load(workspace / "sfm")))
+    photos = registered_photos(model)
+    warps = {number: plan_warp(camera, UndistortParams().max_side) for number, camera in model.cameras.items()}
+    cameras = posed_cameras(photos, png_names([photo.name for photo in photos]), warps)
+    points, errors, observations = _sparse_points(model, photos)
+    if masks is None:
+        return Posed(cameras, points, errors, observations)
+    warped = []
+    for photo in photos:
+        camera, warp = model.cameras[photo.camera_id], warps[photo.camera_id]
+        size = camera.width, camera.height
+        mask = read_mask(masks[file_stem(photo.name)], photo.name, size, size, orientation=1)
+        pixels = np.where(mask, 255, 0).astype(np.uint8)
+        warped.append(warp_mask(pixels, warp, warp_maps(camera, warp), erode=0))
+    return Posed(cameras, points, errors, observations, tuple(warped))
 
 
-def subject_of(folder: Path, posed: Posed) -> tuple[np.ndarray, str]:
+def find_masks(folder: Path) -> dict[str, Path] | None:
+    """The masks that a set comes with, by the names of its photos without suffix; None where it has none."""
+    for images, masks in ((neus.IMAGES, neus.MASKS), ("images", "masks")):
+        if (folder / masks).is_dir():
+            photos, files = (sorted(path for path in (folder / name).iterdir()) for name in (images, masks))
+            return {photo.stem: file for photo, file in zip(photos, files, strict=True)}  # in the same order
+    return None
+
+
+def subject_of(folder: Path, workspace: Path, posed: Posed) -> tuple[np.ndarray, str]:
     """Points [P, 3] of the subject of a set in the frame of `posed`, and what they are."""
     if has_truth(folder):
         return known_surface(folder, posed.cameras), BY_MESH
-    if (folder / neus.MASKS).is_dir():
-        return points_on_masks(folder, posed), BY_MASKS
+    masks = find_masks(folder)
+    if masks is not None:
+        return points_on_masks(load_posed(workspace, masks)), BY_MASKS
     return central_points(posed), BY_PROXY
 
 
@@ -66,18 +90,13 @@ def known_surface(folder: Path, cameras: PinholeCameras) -> np.ndarray:
     return points[seen.sum(0) >= MIN_PHOTOS]
 
 
-def points_on_masks(folder: Path, posed: Posed) -> np.ndarray:
+def points_on_masks(posed: Posed) -> np.ndarray:
     """Well-found sparse points that lie on the masks of all photos that have them in the frame."""
-    import cv2
-
-    photos, masks = (sorted(path for path in (folder / name).iterdir()) for name in (neus.IMAGES, neus.MASKS))
-    mask_of = dict(zip(map(file_stem, map(str, photos)), masks, strict=True))  # by their order, as NeuS has them
     framed, on = np.zeros((2, len(posed.points)), dtype=int)
-    for i, name in enumerate(posed.cameras.names):
-        pixels = cv2.imread(str(mask_of[file_stem(name)]), cv2.IMREAD_GRAYSCALE)
-        mask = cv2.resize(pixels, tuple(posed.cameras.sizes[i].tolist()), interpolation=cv2.INTER_NEAREST)
-        in_frame, on_mask = posed.cameras.on_mask(i, posed.points, mask > 127)
-        framed, on = framed + in_frame, on + on_mask
+    for i, mask in enumerate(posed.masks or ()):
+        if mask is not None:
+            in_frame, on_mask = posed.cameras.on_mask(i, posed.points, mask)
+            framed, on = framed + in_frame, on + on_mask
     return posed.points[well_found(posed) & (on == framed) & (on >= ON_MASKS)]
 
 
