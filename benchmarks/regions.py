@@ -2,8 +2,8 @@
 
 python -m benchmarks.regions                    made-up captures and the scenes of the synthetic suite
 python -m benchmarks.regions DATA               and the sets in DATA, posed by `hineus run --until sfm`
-python -m benchmarks.regions --only trophy,pair these alone
-python -m benchmarks.regions --render trophy OUT    write small photos of one, to run the whole pipeline on
+python -m benchmarks.regions --only "trophy;pair"   these alone
+python -m benchmarks.regions OUT --render trophy    photos of one in OUT/trophy, to run the whole pipeline on
 python -m benchmarks.regions --table-only       only rewrite the tables of docs/benchmarks/regions.md
 
 Results go to benchmarks/results/regions/: one file a version of the code (`--version`, by default "now"), rows that
@@ -22,7 +22,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.captures import kinds, sets, suite
+from benchmarks.captures import kinds, photos, sets, suite
 from benchmarks.captures.model import Capture, Posed
 from benchmarks.captures.subject import fit, seen_points
 from benchmarks.captures.tracks import simulate
@@ -218,12 +218,20 @@ def tables() -> dict[str, str]:
 
 def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("data", nargs="?", type=Path, help="folder of sets")
+    parser.add_argument("data", nargs="?", type=Path, help="folder of sets; with --render, of what is written")
     parser.add_argument("--only", default="", help="names, with semicolons between; default: all")
     parser.add_argument("--workspaces", type=Path, default=WORKSPACES, help="where those of the sets lie or will lie")
     parser.add_argument("--version", default=NOW, help=f"of the code that is measured, e.g. {BEFORE}; default: {NOW}")
     parser.add_argument("--table-only", action="store_true", help="only rewrite the tables")
+    parser.add_argument("--render", metavar="NAME", help="write the photos of this made-up capture; needs Mitsuba")
     arguments = parser.parse_args(argv)
+    if arguments.render:
+        if arguments.data is None or arguments.render not in kinds.KINDS:
+            parser.error(f"name a folder, and one of {'; '.join(kinds.KINDS)}")
+        folder = arguments.data / arguments.render
+        photos.render(kinds.make(arguments.render), arguments.render, folder)
+        print(folder / "images")
+        return 0
     if not arguments.table_only:
         rows = load_rows(arguments.version)
         for row in measure(arguments.data, arguments.workspaces, list(filter(None, arguments.only.split(";")))):

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from benchmarks.captures.model import FOCAL, SIZE, Capture, Thing
+from benchmarks.captures.model import SIZE, Capture, Thing
 from benchmarks.captures.shapes import (
     BRICK,
     CLOTH,

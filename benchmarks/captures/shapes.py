@@ -60,7 +60,7 @@ def rod(
     vertices = np.array(cylinder.vertices)
     along = vertices[:, 2:] / length + 0.5
     vertices[:, :2] *= 1 + (taper - 1) * along
-    turned = (vertices + [0, 0, length / 2]) @ rotation_onto(UP, (end - begin) / length).T
+    turned = (vertices + UP * length / 2) @ rotation_onto(UP, (end - begin) / length).T
     return Thing(turned + begin, np.asarray(cylinder.faces), texture, color)
 
 
@@ -115,14 +115,17 @@ def sheet(
     return Thing(vertices + np.array(center), faces, texture, color)
 
 
-def room(center: Vector, sides: Vector, walls: float, floor: float, color: tuple[float, float, float] = PLASTER,
-) -> tuple[Thing, ...]:  # fmt: skip
-    """Floor, ceiling and four walls, seen from within; `center` on the floor; textures of walls and floor."""
+def room(
+    center: Vector, sides: Vector, walls: float, floor: float, color: tuple[float, float, float] = PLASTER
+) -> tuple[Thing, ...]:
+    """Floor and four walls, seen from within; `center` on the floor; textures of walls and floor.
+
+    The ceiling is open: it would be plain, and light comes in there.
+    """
     x, y, z = center
     wide, deep, high = sides
     return (
-        sheet((x, y, z), UP, (wide, deep), floor, WOOD) if wide == deep else _flat(center, wide, deep, floor),
-        _flat((x, y, z + high), wide, deep, 0.1 * walls, PLASTER),
+        flat(center, wide, deep, floor, WOOD),
         sheet((x - wide / 2, y, z + high / 2), (1, 0, 0), (deep, high), walls, color),
         sheet((x + wide / 2, y, z + high / 2), (-1, 0, 0), (deep, high), walls, color),
         sheet((x, y - deep / 2, z + high / 2), (0, 1, 0), (wide, high), walls, color),
@@ -130,7 +133,7 @@ def room(center: Vector, sides: Vector, walls: float, floor: float, color: tuple
     )
 
 
-def _flat(center: Vector, wide: float, deep: float, texture: float, color: tuple[float, float, float] = WOOD) -> Thing:
+def flat(center: Vector, wide: float, deep: float, texture: float, color: tuple[float, float, float] = WOOD) -> Thing:
     """A level rectangle."""
     corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) * np.array([wide, deep, 0]) / 2
     return Thing(corners + np.array(center), np.array([[0, 1, 2], [0, 2, 3]]), texture, color)
@@ -138,14 +141,14 @@ def _flat(center: Vector, wide: float, deep: float, texture: float, color: tuple
 
 def ground(side: float, texture: float, color: tuple[float, float, float] = STONE, center: Vector = (0, 0, 0)) -> Thing:
     """A level square."""
-    return _flat(center, side, side, texture, color)
+    return flat(center, side, side, texture, color)
 
 
 def wood(rng: np.random.Generator, count: int, near: float, far: float) -> tuple[Thing, ...]:
     """Leaf-strewn ground and trunks between two distances from the origin."""
     angles, distances = rng.uniform(0, 2 * np.pi, count), rng.uniform(near, far, count)
     feet = np.stack([distances * np.cos(angles), distances * np.sin(angles), np.zeros(count)], 1)
-    trunks = (rod(foot, foot + [0, 0, 8], rng.uniform(0.1, 0.3), 0.7, WOOD, 0.6) for foot in feet)
+    trunks = (rod(foot, foot + 8 * UP, rng.uniform(0.1, 0.3), 0.7, WOOD, 0.6) for foot in feet)
     return (ground(3 * far, 0.8, GREEN), *trunks)
 
 

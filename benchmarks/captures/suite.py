@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from benchmarks.captures.model import Capture, Thing
+from benchmarks.captures.shapes import flat
 from benchmarks.synthetic.capture import Order
 from benchmarks.synthetic.scenes import RECIPES
 
@@ -17,7 +18,7 @@ def make(name: str) -> Capture:
     """The scene of this name, as the suite makes it with its defaults."""
     order = Order(name, PHOTOS, SIZE, spp=1, seed=0)
     scene = RECIPES[name].make(np.random.default_rng(order.seed), order.num_photos)
-    half, z = scene.ground.side / 2, scene.ground.height
-    corners = np.array([[-half, -half, z], [half, -half, z], [half, half, z], [-half, half, z]])
-    printed = Thing(corners, np.array([[0, 1, 2], [0, 2, 3]]), GROUND_TEXTURE)
+    assert scene.ground is not None  # all of them stand on one
+    side, z = scene.ground.side, scene.ground.height
+    printed = flat((0, 0, z), side, side, GROUND_TEXTURE)
     return Capture((Thing(*scene.surface(), TEXTURES[name]),), (printed,), scene.cam_from_world, SIZE, order.focal)
