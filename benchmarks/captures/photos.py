@@ -19,7 +19,8 @@ from stages.surface.triangle_mesh import face_areas
 LONG_SIDE, PATHS = 480, 32
 FINEST, PAINTED = 0.012, 400  # metres: longest painted edge; and that many of them along the side of a large thing
 SPOTS, OCTAVES = 18.0, 4  # of the print: a metre, and how often each is made half as large
-CONTRAST = 3.0  # of a print with texture 1
+CONTRAST = 6.0  # of a print with texture 1
+CELLS = 128  # of the noise before it comes again: seven metres, for no two places may look the same
 SKY = 1.0  # radiance: an overcast day
 
 
@@ -50,21 +51,21 @@ def render(capture: Capture, name: str, folder: Path) -> None:
 
 def _scene(capture: Capture) -> Scene:
     rng = np.random.default_rng(0)
-    parts = tuple(_part(thing, rng) for thing in capture.subject + capture.surroundings)
+    noise = ValueNoise(rng, CELLS)
+    parts = tuple(_part(thing, noise, rng.uniform(0, 100, 3)) for thing in capture.subject + capture.surroundings)
     return Scene(parts, None, np.full((32, 64, 3), SKY, np.float32), capture.cam_from_world)
 
 
-def _part(thing: Thing, rng: np.random.Generator) -> Part:
+def _part(thing: Thing, noise: ValueNoise, origin: np.ndarray) -> Part:
     side = float(np.sqrt(face_areas(thing.vertices, thing.faces).sum()))
-    return Part(thing.vertices, thing.faces, "matte", _print(thing, rng), grain=max(FINEST, side / PAINTED))
+    return Part(thing.vertices, thing.faces, "matte", _print(thing, noise, origin), grain=max(FINEST, side / PAINTED))
 
 
-def _print(thing: Thing, rng: np.random.Generator) -> Paint:
-    """Spots around the thing's colour, as strong as its texture says."""
-    noise = ValueNoise(rng)
+def _print(thing: Thing, noise: ValueNoise, origin: np.ndarray) -> Paint:
+    """Spots around the thing's colour, as strong as its texture says; `origin` [3] is the noise's."""
 
     def paint(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
-        spots = CONTRAST * thing.texture * (noise.fractal(points, SPOTS, OCTAVES) - 0.5)
+        spots = CONTRAST * thing.texture * (noise.fractal(points + origin, SPOTS, OCTAVES) - 0.5)
         return np.clip(np.array(thing.color) * np.exp(spots)[:, None], 0.02, 0.9)
 
     return paint
