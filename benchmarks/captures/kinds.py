@@ -97,7 +97,7 @@ def beside(rng: np.random.Generator) -> Capture:
         rod((0, 0, 0.05), (0, 0, 1.4), 0.025, 0.4, METAL),
         rod((0, 0, 1.35), (0, 0, 1.7), 0.28, 0.6, CLOTH, 0.6),
     )
-    inside = (*room((1, 1, 0), (7, 6, 2.7), 0.4, 0.5), *clutter(rng, 8, (1.5, 2, 0), (4, 3.8, 0), (0.4, 1.2)))
+    inside = (*room((1, 0.5, 0), (7, 7, 2.7), 0.4, 0.5), *clutter(rng, 8, (1.5, 2, 0), (4, 3.8, 0), (0.4, 1.2)))
     eyes = on_circle((0, 0, 0), 2.1, (1.3, 1.6), 160, 24, toward_deg=-70)
     return Capture(subject, inside, np.array([shot(eye, (0, 0, 0.85), rng, (-0.38, 0.05)) for eye in eyes]))
 
@@ -168,6 +168,7 @@ def niche(rng: np.random.Generator) -> Capture:
         sheet((0, 0, 0.5), (0, -1, 0), (1.2, 1.0), 0.5, STONE),
         sheet((0, 0.8, 1.9), (0, -1, 0), (1.2, 1.8), 0.4, STONE),
         *(sheet((0.6 * s, 0.4, 1.9), (-s, 0, 0), (0.8, 1.8), 0.4, STONE) for s in (-1, 1)),
+        *(block((0, 0.4, z), (1.2, 0.8, 0.04), 0.4, STONE) for z in (0.98, 2.82)),
         ground(20, 0.5),
     )
     wide = [shot(eye, (0, 0.25, 1.8), rng) for eye in on_circle((0, 0.25, 0), 3.0, (1.5, 1.7), 90, 8)]
@@ -250,7 +251,10 @@ def column(rng: np.random.Generator) -> Capture:
 # ---------------------------------------------------------------- all around
 def living_room(rng: np.random.Generator) -> Capture:
     """A room, photographed outwards from near its middle."""
-    subject = (*room((0, 0, 0), (5.5, 4.5, 2.6), 0.4, 0.6), *clutter(rng, 8, (-2.4, 1.6, 0), (2.4, 1.9, 0), (0.4, 0.9)))
+    subject = (
+        *room((0, 0, 0), (5.5, 4.5, 2.6), 0.4, 0.6),
+        *(thing for y in (-1.7, 1.7) for thing in clutter(rng, 6, (-2.3, y - 0.1, 0), (2.3, y + 0.1, 0), (0.5, 1.1))),
+    )
     eyes = on_circle((0, 0, 0), 0.8, (1.3, 1.6), 360, 24)
     return Capture(subject, (), np.array([shot(eye, eye * [4, 4, 0.85], rng) for eye in eyes]))
 

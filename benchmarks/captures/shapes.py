@@ -101,7 +101,7 @@ def sheet(
         frequency: bumps of the relief along the shorter side.
     """
     facing = np.array(normal, dtype=float) / np.linalg.norm(normal)
-    across = np.cross(UP, facing) if abs(facing[2]) < 0.9 else perpendicular(facing)
+    across = np.cross(UP, facing) if abs(facing[2]) < 0.99 else perpendicular(facing)
     across /= np.linalg.norm(across)
     up = np.cross(facing, across)
     counts = [2, 2] if rng is None else [max(round(120 * side / max(sides)), 8) for side in sides]
