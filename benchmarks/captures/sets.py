@@ -22,12 +22,12 @@ from stages.posing.undistortion import plan_warp, png_names, posed_cameras, regi
 from stages.surface.triangle_mesh import raycaster
 from stages.undistort import _sparse_points
 
-# A sparse point that is surely what the photos are about: this many photos have it in the middle half of both
-# directions, and the rays of two that see it meet at this angle.
+# A sparse point that is surely what the photos are about: this many that see it have it in the middle half of both
+# directions, and the rays of two of them meet at this angle.
 BY_MESH, BY_MASKS, BY_PROXY = "mesh", "points on masks", "points in the middle"
 CENTRAL_PHOTOS, CENTRAL, MIN_ANGLE_DEG = 3, 0.25, 4.0
-MAX_ERROR_PX = 1.5
-ON_MASKS = 3  # photos whose masks hold a point that lies outside none
+MAX_ERROR_PX, MIN_TRACK = 1.5, 3  # matches of two photos alone are false too often
+ON_MASKS = 0.5  # part of the photos whose masks hold a point that lies outside none: false points are in few frames
 
 
 def load_posed(workspace: Path, masks: dict[str, Path] | None = None) -> Posed:
@@ -91,13 +91,13 @@ def known_surface(folder: Path, cameras: PinholeCameras) -> np.ndarray:
 
 
 def points_on_masks(posed: Posed) -> np.ndarray:
-    """Well-found sparse points that lie on the masks of all photos that have them in the frame."""
+    """Well-found sparse points on the masks of all photos that have them in the frame, at least half of the photos."""
     framed, on = np.zeros((2, len(posed.points)), dtype=int)
     for i, mask in enumerate(posed.masks or ()):
         if mask is not None:
             in_frame, on_mask = posed.cameras.on_mask(i, posed.points, mask)
             framed, on = framed + in_frame, on + on_mask
-    return posed.points[well_found(posed) & (on == framed) & (on >= ON_MASKS)]
+    return posed.points[well_found(posed) & (on == framed) & (on >= ON_MASKS * len(posed.cameras))]
 
 
 def central_points(posed: Posed) -> np.ndarray:
@@ -113,7 +113,7 @@ def central_points(posed: Posed) -> np.ndarray:
 
 
 def well_found(posed: Posed) -> np.ndarray:
-    """[P] bool: small error, and rays that meet at an angle."""
+    """[P] bool: small error, seen by three photos at least, and rays that meet at an angle."""
     image, point = posed.observations.T
     rays = posed.points[point] - posed.cameras.centers[image]
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
@@ -123,4 +123,4 @@ def well_found(posed: Posed) -> np.ndarray:
     least = np.ones(len(mean))
     np.minimum.at(least, point, np.einsum("mi,mi->m", rays, mean[point]))
     wide = 2 * np.degrees(np.arccos(np.clip(least, -1, 1))) >= MIN_ANGLE_DEG
-    return wide & (posed.errors < MAX_ERROR_PX)
+    return wide & (posed.errors < MAX_ERROR_PX) & (np.bincount(point, minlength=len(mean)) >= MIN_TRACK)
