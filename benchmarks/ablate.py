@@ -337,7 +337,7 @@ def score_clean_mesh(
     if not has_truth(truth):
         return None
     vertices, faces = artifacts.CLEAN_MESH.load(folder / "cleanup")
-    poses_from_scene = artifacts.SCENE.load(shared / SHARED).poses_from_scene
+    poses_from_scene = artifacts.SCENE.load(folder / "train").poses_from_scene
     with tempfile.TemporaryDirectory() as world:
         artifacts.CLEAN_MESH.save(Path(world), (poses_from_scene.apply(vertices), faces))
         return score_mesh(

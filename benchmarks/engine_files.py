@@ -39,7 +39,7 @@ def export(workspace: Path, out: Path, **settings: Any) -> tuple[dict[str, Any],
 
 def level_rows(workspace: Path, out: Path, count: int) -> list[str]:
     atlas = artifacts.ATLAS_MESH.load(workspace / "atlas")
-    cameras = artifacts.CAMERAS.load(workspace / "undistort")
+    cameras = artifacts.CAMERAS.load(workspace / "train")
     texture = read_rgb(artifacts.BASE_COLOR.load(workspace / "bake"))
     views = np.linspace(0, len(cameras), VIEWS, endpoint=False).astype(int).tolist()
     full = [draw_view(atlas, texture, cameras, view) for view in views]

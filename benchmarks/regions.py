@@ -68,7 +68,7 @@ class Row:
 def region_of(posed: Posed) -> RegionOfInterest:
     """The region that undistort finds; all that this benchmark asks of the pipeline."""
     masks = posed.masks or (None,) * len(posed.cameras)
-    region, _, _ = _find_region(posed.cameras, posed.points, masks, None, None, 1.0)
+    region, _, _ = _find_region(posed.cameras, posed.points, posed.observations, masks, None, None, 1.0)
     return region
 
 

@@ -104,7 +104,7 @@ def main() -> int:
         found = {
             "workspace": workspace.name,
             "faces": len(artifacts.ATLAS_MESH.load(workspace / "atlas").faces),
-            "photos": len(artifacts.CAMERAS.load(workspace / "undistort")),
+            "photos": len(artifacts.CAMERAS.load(workspace / "train")),
             "bytes": len(html),
             "ready_ms": round(statistics.median(waits)),
             "slowest_ms": round(max(waits)),

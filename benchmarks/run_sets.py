@@ -213,7 +213,7 @@ def contact_sheet(workspace: Path, path: Path) -> None:
     from stages.reporting.pictures import read_rgb
 
     atlas = artifacts.ATLAS_MESH.load(workspace / "atlas")
-    scene = artifacts.SCENE.load(workspace / "undistort")
+    scene = artifacts.SCENE.load(workspace / "train")
     texture = read_rgb(artifacts.BASE_COLOR.load(workspace / "bake"))
     grey = np.full((1, 1, 3), 200, np.uint8)
     rows = []

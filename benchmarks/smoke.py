@@ -191,7 +191,7 @@ def held_out_drawing(workspace: Path, mesh: AtlasMesh, texture: np.ndarray) -> t
     from stages import artifacts
     from stages.drawing.view_scores import score_views
 
-    cameras = artifacts.CAMERAS.load(workspace / "undistort")
+    cameras = artifacts.CAMERAS.load(workspace / "train")
     names = artifacts.HELD_OUT.load(workspace / "train")
 
     def load(index: int) -> tuple[np.ndarray, None]:

@@ -109,7 +109,7 @@ class Capture:
 
     def __init__(self, workspace: Path, data: Path) -> None:
         self.undistorted = workspace / "undistort"
-        self.cameras = artifacts.CAMERAS.load(self.undistorted)
+        self.cameras = artifacts.CAMERAS.load(workspace / "train")
         held_out = artifacts.HELD_OUT.load(workspace / "train")
         if not held_out:
             sys.exit(f"{workspace} held no photo out: run it with `--set train.hold_out=8`")

@@ -112,6 +112,8 @@ def run(context: StageContext[CleanupParams]) -> dict[str, Any]:
     if params.keep_closed and not state.watertight:
         logger.warning("mesh was to be closed, but %d edges are open", state.open_edges)
     context.write(CLEAN_MESH, (vertices, faces))
+    if region is None:
+        numbers["cut_photos"] = _warn_of_cut(vertices, faces, scene)
     return {
         **numbers,
         "faces": len(faces),
@@ -120,6 +122,22 @@ def run(context: StageContext[CleanupParams]) -> dict[str, Any]:
         "watertight": state.watertight,
         "manifold": state.manifold,
     }
+
+
+def _warn_of_cut(vertices: np.ndarray, faces: np.ndarray, scene: PosedScene) -> int:
+    """How many photos have in their middle what the border of the region cuts; says so where there are any."""
+    from stages.surface.border import border_cut, region_without_cut
+
+    cut = border_cut(vertices, faces, scene.cameras, scene.ground)
+    if cut is None:
+        return 0
+    center, radius = region_without_cut(cut)
+    logger.warning(
+        "the region of interest cuts what %d photos have in their middle; for a larger one: "
+        "`--set undistort.roi_scale=%.2f`, or set it in the report's 3D view",
+        cut.photos, radius + np.linalg.norm(center),
+    )  # fmt: skip
+    return cut.photos
 
 
 def _crop(

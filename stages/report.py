@@ -22,7 +22,6 @@ from stages.artifacts import (
     IMAGE_SET,
     METRICS,
     MODEL,
-    OVERVIEW,
     PAGE,
     PHOTOS,
     PINHOLE_PHOTOS,
@@ -36,6 +35,7 @@ from stages.artifacts import (
     AtlasMesh,
     VertexQuality,
 )
+from stages.drawing.overview import overview_svg
 from stages.engine.stage import Stage, StageContext
 from stages.errors import HineusError
 from stages.geometry.cameras import PosedScene
@@ -45,7 +45,6 @@ T = TypeVar("T")
 
 TEMPLATES = Path(__file__).parent / "templates"
 THREE = TEMPLATES / "vendor" / "three.min.js"
-SVG = "http://www.w3.org/2000/svg"
 REPLAY_WORKSPACE = "again_hineus"
 
 
@@ -85,8 +84,7 @@ def run(context: StageContext[ReportParams]) -> dict[str, Any]:
     placed = {name: manifests[name].numbers for name in ("undistort", "place") if name in manifests}
     page |= {
         "numbers": numbers.headline(scene, atlas, manifests, page["held_out"]),
-        # part of a page, the drawing needs no namespace
-        "overview": read_text(context.read(OVERVIEW)).replace(f' xmlns="{SVG}"', ""),
+        "overview": overview_svg(scene, region_corners(scene, context.read(GIVEN_REGION))),
         "where": numbers.describe_where(scene, place, placed),
         "charts": curves.training_charts(context.read(METRICS)),
         "previews": pictures.training_previews(context.read(PREVIEWS)),
@@ -133,8 +131,6 @@ def describe_view(
     from stages.reporting import view3d
     from stages.reporting.next_views import suggest_views, vertex_needs
 
-    corners = region.box_corners() if region else None
-    box = None if corners is None else scene.poses_from_scene.inverse().apply(corners)
     advice = quality and suggest_views(atlas.vertices, atlas.normals, atlas.faces, vertex_needs(quality), scene)
     page: dict[str, Any] = {"advice": advice}
     if len(atlas.faces) > view3d.MAX_FACES:
@@ -143,11 +139,17 @@ def describe_view(
     page["overlays"] = view3d.pack_overlays(quality) if quality else []
     page["viewer"] = {
         **view3d.pack_mesh(atlas, texture, scene.up),
-        **view3d.pack_scene(scene, captions, advice.views if advice else (), atlas, box),
+        **view3d.pack_scene(scene, captions, advice.views if advice else (), atlas, region_corners(scene, region)),
         "overlays": page["overlays"],
     }
     page["three"] = THREE.read_text(encoding="utf-8")
     return page
+
+
+def region_corners(scene: PosedScene, region: GivenRegion | None) -> np.ndarray | None:
+    """Corners [8, 3] of the box that was given as region, scene frame; None where none was."""
+    corners = region.box_corners() if region else None
+    return None if corners is None else scene.poses_from_scene.inverse().apply(corners)
 
 
 def replay(context: StageContext[ReportParams]) -> str:
@@ -161,14 +163,9 @@ def replay(context: StageContext[ReportParams]) -> str:
     return replay_command(record.sources, record.preset, config, REPLAY_WORKSPACE)
 
 
-def read_text(path: Path) -> str:
-    """The file's text; empty where there is none."""
-    return path.read_text(encoding="utf-8") if path.exists() else ""
-
-
 REPORT: Stage[ReportParams] = Stage(
     name="report",
-    version=5,
+    version=6,
     settings=lambda config: config.report,
     run=run,
     reads=(
@@ -180,7 +177,6 @@ REPORT: Stage[ReportParams] = Stage(
         GIVEN_REGION,
         SCENE,
         PINHOLE_PHOTOS,
-        OVERVIEW,
         METRICS,
         PREVIEWS,
         HELD_OUT,

@@ -8,6 +8,7 @@ import os
 import shutil
 import time
 from collections.abc import Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any
 
@@ -15,10 +16,12 @@ import numpy as np
 
 from configs.training import TrainParams
 from stages import artifacts
-from stages.artifacts import FIELD, HELD_OUT, METRICS, PINHOLE_PHOTOS, PREVIEWS, SCENE, Pictures
+from stages.artifacts import CAMERAS, FIELD, FIRST_SCENE, HELD_OUT, METRICS, PINHOLE_PHOTOS, PREVIEWS, SCENE, Pictures
 from stages.engine.stage import Stage, StageContext
 from stages.errors import ConfigError, InputError, ReconstructionError
-from stages.geometry.cameras import PinholeCameras
+from stages.geometry.cameras import PinholeCameras, PosedScene
+from stages.geometry.normalisation import regrown
+from stages.geometry.similarity import Similarity
 
 log = logging.getLogger(__name__)
 
@@ -26,69 +29,182 @@ LOG_EVERY = 50  # steps between metric lines
 CHECKPOINT_EVERY = 60.0  # seconds
 MIN_TRAINING = 3  # photos
 METRIC_GRADIENTS = (0.8, 1.2)  # mean lengths of grad f within which f passes for a distance
+# Part of the budget after which the region is looked at: the shape is there, and little of the time is lost.
+LOOK_AT = 0.2
 SETTLED = 500  # steps between looks at that
 
 
 def run(context: StageContext[TrainParams]) -> dict[str, Any]:
-    """Train until the budget of steps or minutes is spent; write field.pt, metrics.jsonl and previews."""
+    """Train until the budget of steps or minutes is spent; write field.pt, the scene, metrics.jsonl and previews.
+
+    A region that was found is looked at once on the way: where its border cuts what the photos are about, it grows, and
+    training goes on in the larger one from the shape that it has learned.
+    """
     import torch
 
-    from stages.neural.held_out_psnr import held_out_psnr, left_out
-    from stages.neural.sightings import Sightings
+    from stages.neural.held_out_psnr import held_out_psnr
     from stages.neural.trained_field import field_state
+
+    _use_threads(context)
+    scene = _scene_in_training(context)
+    training = _Training.begun(context, scene)
+    if scene.growable:
+        training.advance(LOOK_AT)
+        grown = _grown(training)
+        if grown is not None:
+            training = training.moved(grown)
+    training.advance(1.0)
+
+    trainer, params, scene = training.trainer, context.params, training.scene
+    _preview(trainer, context.scratch, 1.0)
+    shutil.copytree(artifacts.PREVIEWS.load(context.scratch), context.to_write(PREVIEWS))
+    torch.save(field_state(trainer.fields), context.to_write(FIELD))
+    context.write(SCENE, scene)
+    context.to_write(METRICS).write_bytes(training.metrics.read_bytes())
+    summary: dict[str, Any] = _last_numbers(context.to_write(METRICS))
+    if params.hold_out:
+        names = [scene.cameras.names[i] for i in (~trainer.photos.training).nonzero().flatten().tolist()]
+        context.write(HELD_OUT, tuple(names))
+        psnr = held_out_psnr(trainer.photos, lambda batch: trainer.render(batch, 1.0).colors)
+        summary |= {"held_out": len(names), "held_out_psnr": psnr and round(psnr, 4)}
+    seconds = training.seconds
+    return {
+        "steps": trainer.step_index,
+        "train_seconds": round(seconds, 1),
+        "rays_per_second": round(trainer.step_index * params.sampling.rays / max(seconds, 1e-9)),
+        "photos": len(trainer.photos),
+        "sightings": len(trainer.sightings.weights),
+        "region_grown": round(scene.poses_from_scene.scale / context.read(FIRST_SCENE).poses_from_scene.scale, 3),
+        **summary,
+    }
+
+
+# ---------------------------------------------------------------- training in one region
+@dataclass
+class _Training:
+    """A trainer in a scene, and how much of the budget is spent.
+
+    Attributes:
+        spent: seconds before this process, or this scene.
+        started: clock at its start.
+    """
+
+    context: StageContext[TrainParams]
+    scene: PosedScene
+    trainer: Any
+    spent: float = 0.0
+    started: float = field(default_factory=time.monotonic)
+
+    @classmethod
+    def begun(cls, context: StageContext[TrainParams], scene: PosedScene) -> _Training:
+        """From the checkpoint where there is one, else from the first shape."""
+        training = cls(context, scene, _make_trainer(context, scene))
+        training.spent = _resume(training.trainer, training.checkpoint, training.metrics)
+        if training.trainer.step_index == 0:
+            _start_from_shape(training.trainer, scene.cameras)
+        training.started = time.monotonic()
+        return training
+
+    def moved(self, scene: PosedScene) -> _Training:
+        """In another region, from the shape that was learned in this one; as much of the budget is spent."""
+        trainer = _make_trainer(self.context, scene)
+        shape = _shape_within(self.trainer, scene.poses_from_scene, self.scene.poses_from_scene)
+        error = trainer.start_from(shape)
+        log.info("the SDF starts from the shape learned so far, met to %.4f on average", error)
+        trainer.step_index = self.trainer.step_index
+        artifacts.SCENE.save(self.context.scratch, scene)
+        training = _Training(self.context, scene, trainer, self.seconds)
+        _save(trainer, training.checkpoint, training.seconds)
+        return training
+
+    @property
+    def checkpoint(self) -> Path:
+        return artifacts.checkpoint_path(self.context.scratch)
+
+    @property
+    def metrics(self) -> Path:
+        return artifacts.METRICS.load(self.context.scratch)
+
+    @property
+    def seconds(self) -> float:
+        return self.spent + time.monotonic() - self.started
+
+    @property
+    def progress(self) -> float:
+        """Part of the budget that is spent, from 0 to 1: of the minutes where they are set, else of the steps."""
+        params = self.context.params
+        return self.seconds / (60 * params.minutes) if params.minutes else self.trainer.step_index / params.steps
+
+    def advance(self, until: float) -> None:
+        """Train to this part of the budget; checkpoints, previews and metric lines on the way."""
+        context, trainer = self.context, self.trainer
+        saved, previewed = time.monotonic(), self.progress
+        # a line at a time, so that `hineus view` can draw them as they come
+        with self.metrics.open("a", encoding="utf-8", buffering=1) as lines:
+            while (progress := self.progress) < until:
+                numbers = trainer.step(progress)
+                if trainer.step_index % LOG_EVERY == 0:
+                    numbers_out = {key: float(value) for key, value in numbers.items()}
+                    _write_metrics(lines, trainer, progress, numbers_out)
+                    context.progress(progress, 1.0, f"PSNR {numbers_out['psnr']:.1f} dB")
+                    _check(numbers_out, trainer.step_index)
+                if time.monotonic() - saved > CHECKPOINT_EVERY:
+                    _save(trainer, self.checkpoint, self.seconds)
+                    saved = time.monotonic()
+                if progress - previewed >= context.params.preview_every:
+                    _preview(trainer, context.scratch, progress)
+                    previewed = progress
+
+
+def _make_trainer(context: StageContext[TrainParams], scene: PosedScene) -> Any:
+    from stages.neural.held_out_psnr import left_out
+    from stages.neural.sightings import Sightings
     from stages.neural.trainer import Trainer
     from stages.neural.training_photos import Photos
 
-    _use_threads(context)
-    params, scene = context.params, context.read(SCENE)
+    params = context.params
     held_out = left_out(len(scene.cameras), params.hold_out)
     _check_hold_out(len(held_out), int(held_out.sum()), params.hold_out)
     images = _load_images(context.read(PINHOLE_PHOTOS), scene.cameras.names)
     photos = Photos(scene.cameras, *images, context.device, ~held_out)
     sightings = Sightings.from_scene(scene, context.device, (~held_out).numpy())
-    trainer = Trainer(photos, sightings, params, context.device)
+    return Trainer(photos, sightings, params, context.device)
 
-    checkpoint = artifacts.checkpoint_path(context.scratch)
-    metrics = artifacts.METRICS.load(context.scratch)
-    spent = _resume(trainer, checkpoint, metrics)
-    if trainer.step_index == 0:
-        _start_from_shape(trainer, scene.cameras)
-    started = saved = time.monotonic()
-    previewed = _progress(trainer.step_index, spent, params)
-    # a line at a time, so that `hineus view` can draw them as they come
-    with metrics.open("a", encoding="utf-8", buffering=1) as lines:
-        while (progress := _progress(trainer.step_index, spent + time.monotonic() - started, params)) < 1:
-            numbers = trainer.step(progress)
-            if trainer.step_index % LOG_EVERY == 0:
-                numbers_out = {key: float(value) for key, value in numbers.items()}
-                _write_metrics(lines, trainer, progress, numbers_out)
-                context.progress(progress, 1.0, f"PSNR {numbers_out['psnr']:.1f} dB")
-                _check(numbers_out, trainer.step_index)
-            now = time.monotonic()
-            if now - saved > CHECKPOINT_EVERY:
-                _save(trainer, checkpoint, spent + now - started)
-                saved = now
-            if progress - previewed >= params.preview_every:
-                _preview(trainer, context.scratch, progress)
-                previewed = progress
-    _preview(trainer, context.scratch, 1.0)
-    shutil.copytree(artifacts.PREVIEWS.load(context.scratch), context.to_write(PREVIEWS))
-    torch.save(field_state(trainer.fields), context.to_write(FIELD))
-    context.to_write(METRICS).write_bytes(metrics.read_bytes())
-    seconds = spent + time.monotonic() - started
-    summary: dict[str, Any] = _last_numbers(context.to_write(METRICS))
-    if params.hold_out:
-        context.write(HELD_OUT, tuple(scene.cameras.names[i] for i in held_out.nonzero().flatten().tolist()))
-        psnr = held_out_psnr(photos, lambda batch: trainer.render(batch, 1.0).colors)
-        summary |= {"held_out": int(held_out.sum()), "held_out_psnr": psnr and round(psnr, 4)}
-    return {
-        "steps": trainer.step_index,
-        "train_seconds": round(seconds, 1),
-        "rays_per_second": round(trainer.step_index * params.sampling.rays / max(seconds, 1e-9)),
-        "photos": len(photos),
-        "sightings": len(sightings.weights),
-        **summary,
-    }
+
+# ---------------------------------------------------------------- a region that grows
+def _scene_in_training(context: StageContext[TrainParams]) -> PosedScene:
+    """The scene as undistort framed it, or as it had grown before a kill."""
+    if (context.scratch / artifacts.SCENE.files[0]).exists():
+        return artifacts.SCENE.load(context.scratch)
+    return context.read(FIRST_SCENE)
+
+
+def _grown(training: _Training) -> PosedScene | None:
+    """The scene with a larger region, where the surface learned so far is cut in the middle of many photos."""
+    from stages.surface.border import border_cut, region_without_cut
+
+    scene = training.scene
+    vertices, faces = training.trainer.coarse_surface()
+    cut = border_cut(vertices, faces, scene.cameras, scene.ground)
+    if cut is None:
+        return None
+    center, radius = region_without_cut(cut)
+    log.info("the region cuts what %d photos have in their middle: it grows to %.2f of its radius", cut.photos, radius)
+    return regrown(scene, center, radius)
+
+
+def _shape_within(trainer: Any, poses_from_new: Similarity, poses_from_old: Similarity) -> np.ndarray:
+    """Signed distances [G, G, G] of a trained SDF in the frame of another region; beyond its own, to its border."""
+    from stages.geometry.hull import cube
+
+    old_from_new = poses_from_old.inverse().compose(poses_from_new)
+    places = old_from_new.apply(cube())
+    lengths = np.linalg.norm(places, axis=-1)
+    beyond = np.maximum(lengths - 1, 0.0)
+    within = places / np.maximum(lengths, 1.0)[..., None]
+    distances: np.ndarray = trainer.distances(within.reshape(-1, 3)).reshape(lengths.shape)
+    shape: np.ndarray = ((distances + beyond) / old_from_new.scale).astype(np.float32)
+    return shape
 
 
 def _use_threads(context: StageContext[TrainParams]) -> None:
@@ -152,11 +268,6 @@ def _check_hold_out(num_photos: int, num_held_out: int, every: int) -> None:
     if every and (left < MIN_TRAINING or num_held_out == 0):
         found = f"leaves {left} of {num_photos} photos to train on (needed: {MIN_TRAINING} to {num_photos - 1})"
         raise ConfigError(f"`train.hold_out` = {every} {found}.", "Try `--hold-out 8`, or 0 for none.")
-
-
-def _progress(step: int, seconds: float, params: TrainParams) -> float:
-    """Part of the budget that is spent, from 0 to 1: of the minutes where they are set, else of the steps."""
-    return seconds / (60 * params.minutes) if params.minutes else step / params.steps
 
 
 def _write_metrics(lines: IO[str], trainer: Any, progress: float, numbers: dict[str, float]) -> None:
@@ -233,10 +344,10 @@ def _last_numbers(metrics: Path) -> dict[str, float]:
 
 TRAIN: Stage[TrainParams] = Stage(
     name="train",
-    version=3,
+    version=4,
     settings=lambda config: config.train,
     run=run,
-    reads=(SCENE, PINHOLE_PHOTOS),
-    writes=(FIELD, METRICS, PREVIEWS, HELD_OUT),
+    reads=(FIRST_SCENE, PINHOLE_PHOTOS),
+    writes=(FIELD, CAMERAS, SCENE, METRICS, PREVIEWS, HELD_OUT),
     summary="learn a signed distance field and its colours from the posed images",
 )

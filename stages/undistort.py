@@ -16,25 +16,23 @@ import numpy as np
 
 from configs.params import UndistortParams
 from stages.artifacts import (
-    CAMERAS,
+    FIRST_SCENE,
     GIVEN_POSES,
     GIVEN_REGION,
     MODEL,
-    OVERVIEW,
     PHOTOS,
     PINHOLE_PHOTOS,
-    SCENE,
     KnownSphere,
     write_png,
 )
-from stages.drawing.overview import overview_svg
 from stages.engine.stage import Stage, StageContext
 from stages.errors import ReconstructionError
+from stages.geometry.attention import attended
 from stages.geometry.cameras import PinholeCameras, PosedScene
 from stages.geometry.normalisation import into_frame, scene_frame
 from stages.geometry.place import GivenRegion
 from stages.geometry.plane import Plane, find_ground
-from stages.geometry.region import RegionOfInterest, find_region, grown_alone
+from stages.geometry.region import RegionOfInterest, find_region, grown_over
 from stages.geometry.up import Up, choose_up, estimate_up
 from stages.posing.undistortion import (
     plan_warp,
@@ -63,7 +61,7 @@ def run(context: StageContext[UndistortParams]) -> dict[str, Any]:
     points, errors, observations = _sparse_points(model, photos)
     known, given = context.read(GIVEN_POSES), context.read(GIVEN_REGION)
     stated = known.region if known else None
-    region, ground, up = _find_region(cameras, points, masks, stated, given, context.params.roi_scale)
+    region, ground, up = _find_region(cameras, points, observations, masks, stated, given, context.params.roi_scale)
     poses_from_scene = scene_frame(region.center, region.radius, up.direction)
     scene = PosedScene(
         cameras=into_frame(cameras, poses_from_scene),
@@ -74,11 +72,9 @@ def run(context: StageContext[UndistortParams]) -> dict[str, Any]:
         up=np.array([0.0, 0.0, 1.0]),
         kind=region.kind,
         ground=ground and ground.within(poses_from_scene),
+        growable=stated is None and given is None and all(mask is None for mask in masks),
     )
-    context.write(SCENE, scene)
-    corners = given.box_corners() if given else None
-    drawing = overview_svg(scene, None if corners is None else poses_from_scene.inverse().apply(corners))
-    context.to_write(OVERVIEW).write_text(drawing, encoding="utf-8")
+    context.write(FIRST_SCENE, scene)
     context.progress(len(photos) + 1, len(photos) + 1, "done")
 
     inside = np.linalg.norm(scene.points, axis=1) < 1
@@ -157,6 +153,7 @@ def _sparse_points(model: Any, photos: list[Any]) -> tuple[np.ndarray, np.ndarra
 def _find_region(
     cameras: PinholeCameras,
     points: np.ndarray,
+    observations: np.ndarray,
     masks: Sequence[np.ndarray | None],
     stated: KnownSphere | None,
     given: GivenRegion | None,
@@ -168,10 +165,10 @@ def _find_region(
         stated: what the given poses say. given: what the user says, which wins.
         scale: of the region that is found.
     """
-    held = estimate_up(cameras)
+    held, about = estimate_up(cameras), attended(cameras, points, observations)
     sphere = RegionOfInterest(stated.center, stated.radius, "object", stated.source) if stated else None
     try:
-        region = find_region(cameras, points, masks, sphere)
+        region = find_region(cameras, points, about, masks, sphere)
     except ValueError as error:
         raise ReconstructionError(
             f"No region of interest found from {len(cameras)} cameras and {len(points)} points ({error}).",
@@ -179,7 +176,7 @@ def _find_region(
             "`--set 'place.region=sphere X Y Z RADIUS'`.",
         ) from error
     ground = find_ground(points, cameras.centers, held.direction, region.center, region.radius)
-    region = grown_alone(region, points, ground)
+    region = grown_over(region, points[about], ground)
     if given is not None:
         source = "the given sphere" if given.box is None else "the given box"
         region = RegionOfInterest(given.center, given.radius, region.kind, source)
@@ -190,10 +187,10 @@ def _find_region(
 
 UNDISTORT: Stage[UndistortParams] = Stage(
     name="undistort",
-    version=5,
+    version=6,
     settings=lambda config: config.undistort,
     run=run,
     reads=(PHOTOS, MODEL, GIVEN_POSES, GIVEN_REGION),
-    writes=(PINHOLE_PHOTOS, CAMERAS, SCENE, OVERVIEW),
+    writes=(PINHOLE_PHOTOS, FIRST_SCENE),
     summary="make pinhole images and find the region of interest",
 )

@@ -95,7 +95,11 @@ def undistort(inputs: dict[str, Path], root: Path, **params: object) -> tuple[Po
     rest = UndistortParams(**{key: params[key] for key in params if key not in PlaceParams.model_fields})  # type: ignore[arg-type]
     placed = PLACE.run(StageContext(inputs, {}, place, root, placing))
     numbers = UNDISTORT.run(StageContext({**inputs, "place": place}, {}, out, root, rest, workers=2))
-    return artifacts.SCENE.load(out), out, {**numbers, **{key: value for key, value in placed.items() if value != ""}}
+    return (
+        artifacts.FIRST_SCENE.load(out),
+        out,
+        {**numbers, **{key: value for key, value in placed.items() if value != ""}},
+    )
 
 
 def dots_seen(photo: np.ndarray, expected: np.ndarray) -> np.ndarray:

@@ -21,7 +21,6 @@ from stages.artifacts import (
     VertexQuality,
     write_png,
 )
-from stages.drawing.overview import overview_svg
 from stages.engine.fingerprint import Identity
 from stages.engine.manifest import Manifest
 from stages.engine.stage import StageContext
@@ -64,7 +63,7 @@ def bare_inputs(root: Path) -> StageContext:
     pose = np.concatenate([np.eye(3), [[0], [0], [3]]], 1)[None]
     K = np.array([[24.0, 0, 8], [0, 24, 8], [0, 0, 1]])
     cameras = PinholeCameras(("a.png",), np.array([[16, 16]]), K[None], pose)
-    artifacts.SCENE.save(folders["undistort"], scene_without_points(cameras))
+    artifacts.SCENE.save(folders["train"], scene_without_points(cameras))
     artifacts.WORLD_PLACE.save(folders["place"], Place(Similarity.identity()))
     artifacts.GIVEN_REGION.save(folders["place"], None)
     artifacts.ATLAS_MESH.save(folders["atlas"], pyramid())
@@ -109,17 +108,16 @@ def full_inputs(context: StageContext) -> StageContext:
     write_png(artifacts.PROVENANCE.load(inputs["bake"]), kinds)
     random = np.random.default_rng(0)
     scene = replace(
-        artifacts.SCENE.load(inputs["undistort"]),
+        artifacts.SCENE.load(inputs["train"]),
         points=random.normal(size=(300, 3)).astype(np.float32),
         point_errors=np.full(300, 0.5, np.float32),
         ground=Plane(UP, -0.2, 0.01, 0.5),
     )
-    artifacts.SCENE.save(inputs["undistort"], scene)
+    artifacts.SCENE.save(inputs["train"], scene)
     still = Similarity.identity()
     artifacts.WORLD_PLACE.save(inputs["place"], Place(still, True, "2 markers (8 sides)", 0.0042))
     region = given_region("box", BOX.ravel().tolist(), still)
     artifacts.GIVEN_REGION.save(inputs["place"], region)
-    artifacts.OVERVIEW.load(inputs["undistort"]).write_text(overview_svg(scene, region.box_corners()))
     artifacts.QUALITY.save(inputs["bake"], quality())
     artifacts.HELD_OUT.save(inputs["train"], ["a.png"])
     write_png(artifacts.Pictures(inputs["undistort"]).path("a.png"), np.full((16, 16, 3), 77, np.uint8))

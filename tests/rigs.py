@@ -9,7 +9,6 @@ import numpy as np
 
 from stages.geometry.cameras import PinholeCameras, PosedScene
 from stages.geometry.normalisation import rotation_onto
-from stages.geometry.region import frames_around
 from stages.geometry.similarity import Similarity
 
 EAST, NORTH, UP = np.eye(3)
@@ -85,6 +84,15 @@ def three_rings(
         intrinsics=np.repeat(K[None], count, 0),
         extrinsics=np.array(extrinsics),
     )
+
+
+def sightings(cameras: PinholeCameras, points: np.ndarray) -> np.ndarray:
+    """Observations [M, 2] (image, point) of photos that see all that is in their frame."""
+    return np.concatenate([
+        np.stack([np.full(seen.sum(), i), np.flatnonzero(seen)], 1)
+        for i in range(len(cameras))
+        for seen in [cameras.in_frame(i, points)]
+    ])  # fmt: skip
 
 
 def dome_on_a_table(seed: int = 0, noise: float = 0.002) -> tuple[PinholeCameras, np.ndarray]:
@@ -169,7 +177,7 @@ def oblique_flight(seed: int = 0) -> tuple[PinholeCameras, np.ndarray]:
     cameras = capture(poses)
     places = np.concatenate([town, fields])
     # structure from motion has points only where two photos overlap
-    return cameras, places[frames_around(cameras, places) > 1]
+    return cameras, places[np.bincount(sightings(cameras, places)[:, 1], minlength=len(places)) > 1]
 
 
 def facade(seed: int = 0) -> tuple[PinholeCameras, np.ndarray]:

@@ -66,7 +66,7 @@ def write_undistorted(folder: Path, cameras: PinholeCameras, masks: bool = False
     """The folder that the undistort stage would have published."""
     (folder / artifacts.IMAGES).mkdir(parents=True)
     (folder / artifacts.MASKS).mkdir()
-    artifacts.SCENE.save(folder, sphere_scene(cameras))
+    artifacts.FIRST_SCENE.save(folder, sphere_scene(cameras))
     for i, name in enumerate(cameras.names):
         photo, mask = render(cameras, i)
         Image.fromarray(photo).save(artifacts.Pictures(folder).path(name))

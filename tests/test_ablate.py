@@ -232,7 +232,7 @@ def _stub_stages(monkeypatch):
         (context.out / "file").write_text("")
         return {"psnr": 31.25, "held_out_psnr": 28.5}
 
-    reads = {"train": (artifacts.SCENE,), "extract": (artifacts.CAMERAS, artifacts.FIELD)}
+    reads = {"train": (artifacts.FIRST_SCENE,), "extract": (artifacts.CAMERAS, artifacts.FIELD)}
     stages = [
         Stage("train", 1, lambda config: config.train, run, reads["train"]),
         Stage("extract", 1, lambda config: config.extract, run, reads["extract"]),
@@ -335,7 +335,7 @@ def test_a_scene_without_sparse_points_trains(tmp_path):
     cameras = ring_of_cameras()
     folder, out, scratch = (tmp_path / name for name in ("undistort", "out", "scratch"))
     write_undistorted(folder, cameras)
-    artifacts.SCENE.save(folder, scene_without_points(cameras))
+    artifacts.FIRST_SCENE.save(folder, scene_without_points(cameras))
     out.mkdir()
     scratch.mkdir()
     params = small({

@@ -56,7 +56,7 @@ def context(tmp_path, monkeypatch) -> StageContext:
         np.concatenate([view.intrinsics for view in views]),
         np.concatenate([view.extrinsics for view in views]),
     )
-    artifacts.SCENE.save(folders["undistort"], scene_without_points(cameras))
+    artifacts.SCENE.save(folders["train"], scene_without_points(cameras))
     for name in cameras.names:
         path = artifacts.Pictures(folders["undistort"]).path(name)
         path.parent.mkdir(parents=True, exist_ok=True)

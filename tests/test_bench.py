@@ -59,11 +59,18 @@ def posed(context: StageContext) -> dict[str, Any]:
     return SFM.run(replace(context, sources={"poses": truth}, workers=1))
 
 
+def untrained(context: StageContext) -> dict[str, Any]:
+    """The train stage's stand-in."""
+    context.write(artifacts.SCENE, context.read(artifacts.FIRST_SCENE))
+    return {}
+
+
 PIPELINE = (
     INGEST,
     replace(SFM, run=posed),
     PLACE,
     UNDISTORT,
+    Stage("train", 1, lambda config: config.train, untrained, (artifacts.FIRST_SCENE,), (artifacts.SCENE,)),
     Stage("cleanup", 1, lambda config: config.train, clean_ball, (artifacts.SCENE,), (artifacts.CLEAN_MESH,)),
 )
 
@@ -96,7 +103,7 @@ def test_a_scene_of_every_suite_comes_to_its_undistorted_photos_without_its_test
     tests = 0 if scene.views is None else len(scene.views.names)
     assert result["photos"] == COUNT - tests
     place = Path("bench") / suite / scene.name / "tiny-seed0"
-    posed_scene = artifacts.SCENE.load(place / "undistort")
+    posed_scene = artifacts.FIRST_SCENE.load(place / "undistort")
     true = cameras()
     for i, name in enumerate(posed_scene.cameras.names):
         number = int("".join(filter(str.isdigit, Path(name).stem)))
@@ -115,7 +122,7 @@ def test_one_json_a_run_with_settings_costs_and_scores(data: Path):
     assert result["settings"]["undistort.max_side"] == 64
     assert result["settings"]["train.steps"] == 500
     assert "train.hold_out" not in result["settings"]
-    assert [stage["name"] for stage in result["stages"]] == ["ingest", "sfm", "place", "undistort", "cleanup"]
+    assert [stage["name"] for stage in result["stages"]] == ["ingest", "sfm", "place", "undistort", "train", "cleanup"]
     assert result["wall_s"] > 0
     assert result["wall_after_poses_s"] == pytest.approx(result["stages"][-1]["wall_s"], abs=0.01)
     assert result["peak_rss"] > 1 << 20
@@ -191,10 +198,10 @@ def test_a_mesh_is_scored_in_the_frame_of_its_poses_whatever_gps_made_of_the_wor
     moved = Place(Similarity(2.0, np.eye(3), np.array([10.0, 0, 0])), metric=True, scale_from="GPS")
     scene = sphere_scene(ring_of_cameras())
     workspace = Workspace.open(tmp_path / "workspace", create=True)
-    for name in ("place", "undistort", "cleanup"):
+    for name in ("place", "train", "cleanup"):
         workspace.stage_folder(name).mkdir(parents=True)
     artifacts.WORLD_PLACE.save(workspace.stage_folder("place"), moved)
-    artifacts.SCENE.save(workspace.stage_folder("undistort"), scene)
+    artifacts.SCENE.save(workspace.stage_folder("train"), scene)
     corners = np.eye(3)
     artifacts.CLEAN_MESH.save(workspace.stage_folder("cleanup"), (corners, np.array([[0, 1, 2]])))
     world = scene.world_from_scene(moved).apply(corners)
@@ -222,9 +229,9 @@ def test_test_photos_show_the_ball_where_the_scene_has_it(data: Path, suite: str
     scene = find_scenes(SUITES[suite], data, Wanted(hold_out=4))[0]
     assert scene.views is not None
     workspace = Workspace.open(Path("bench") / suite / scene.name / "tiny-seed0")
-    photos = NovelPhotos(scene.views, workspace)
+    trained = artifacts.FIRST_SCENE.load(workspace.stage_folder("undistort"))
+    photos = NovelPhotos(scene.views, trained)
     assert photos.cameras.names == scene.views.names
-    trained = artifacts.SCENE.load(workspace.stage_folder("undistort"))
     apart = np.linalg.norm(photos.cameras.centers[:, None] - trained.cameras.centers[None], axis=2)
     assert apart.min() > 0.1
     poses_from_scene = trained.poses_from_scene
@@ -253,8 +260,9 @@ def test_test_photos_have_the_masks_that_the_scene_is_run_with(data: Path, suite
     scene = find_scenes(SUITES[suite], data, Wanted(masks=True, hold_out=4))[0]
     assert scene.views is not None
     workspace = Workspace.open(Path("bench") / suite / scene.name / "tiny-seed0")
-    photos = NovelPhotos(scene.views, workspace, scene.masks)
-    poses_from_scene = artifacts.SCENE.load(workspace.stage_folder("undistort")).poses_from_scene
+    posed_scene = artifacts.FIRST_SCENE.load(workspace.stage_folder("undistort"))
+    photos = NovelPhotos(scene.views, posed_scene, scene.masks)
+    poses_from_scene = posed_scene.poses_from_scene
     for index in range(len(photos.cameras)):
         pixels, mask = photos.load(index)
         assert mask is not None
@@ -280,9 +288,10 @@ def test_views_of_nerf_synthetic_are_whole_photos_on_white(data: Path, monkeypat
 
     def no_training(context: StageContext) -> dict[str, Any]:
         context.to_write(artifacts.FIELD).write_text("")
-        return {}
+        return untrained(context)
 
-    train = Stage("train", 1, lambda config: config.train, no_training, (artifacts.SCENE,), (artifacts.FIELD,))
+    writes = artifacts.FIELD, artifacts.SCENE
+    train = Stage("train", 1, lambda config: config.train, no_training, (artifacts.FIRST_SCENE,), writes)
     (result,) = results_of("nerf-synthetic", str(data), pipeline=(*PIPELINE[:4], train))
     views = result["scores"]["views"]
     assert (views["counted"], set(views["mean"])) == (2, {"field"})

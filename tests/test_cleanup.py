@@ -39,13 +39,15 @@ def join(*meshes):
 @pytest.fixture
 def stage(tmp_path):
     """Runs cleanup on a mesh; returns its numbers, vertices and faces."""
-    undistort, extract, place, out = (tmp_path / name for name in ("undistort", "extract", "place", "out"))
+    undistort, train, extract, place, out = (
+        tmp_path / name for name in ("undistort", "train", "extract", "place", "out")
+    )
 
     def run(vertices, faces, masks=None, scene_extras=None, region=None, **params):
-        for folder in (undistort, extract, place, out):
+        for folder in (undistort, train, extract, place, out):
             folder.mkdir()
         cameras = three_rings()
-        artifacts.SCENE.save(undistort, replace(scene_without_points(cameras), **(scene_extras or {})))
+        artifacts.SCENE.save(train, replace(scene_without_points(cameras), **(scene_extras or {})))
         artifacts.GIVEN_REGION.save(place, region)
         artifacts.RAW_MESH.save(extract, (vertices, faces))
         if masks is not None:
@@ -56,7 +58,7 @@ def stage(tmp_path):
                 path.parent.mkdir(exist_ok=True)
                 cv2.imwrite(str(path), mask.astype(np.uint8) * 255)
         context = StageContext(
-            inputs={"undistort": undistort, "extract": extract, "place": place},
+            inputs={"undistort": undistort, "train": train, "extract": extract, "place": place},
             sources={},
             out=out,
             scratch=tmp_path,

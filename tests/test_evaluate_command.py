@@ -153,7 +153,7 @@ def test_a_workspace_is_judged_in_the_frame_of_its_poses(tmp_path):
     with workspace.lock():
         workspace.remember({}, None, {})
         out, _ = workspace.begin("undistort", "")
-        artifacts.SCENE.save(out, scene)
+        artifacts.FIRST_SCENE.save(out, scene)
         workspace.publish("undistort", Manifest(Identity("undistort", 1, {}), {}))
         out, _ = workspace.begin("place", "")
         artifacts.WORLD_PLACE.save(out, Place(Similarity.identity()))

@@ -82,14 +82,14 @@ def exported(tmp_path) -> tuple[Path, dict]:
 def workspace(tmp_path: Path, params: ExportParams | None = None) -> StageContext:
     from stages.artifacts import write_png
 
-    folders = {name: tmp_path / name for name in ("undistort", "place", "atlas", "bake", "out", "scratch")}
+    folders = {name: tmp_path / name for name in ("train", "place", "atlas", "bake", "out", "scratch")}
     for folder in folders.values():
         folder.mkdir()
     atlas, texture = tetrahedron()
     cameras = PinholeCameras(
         ("a.jpg",), np.array([[8, 8]]), np.eye(3)[None], np.concatenate([np.eye(3), np.zeros((3, 1))], 1)[None]
     )
-    artifacts.SCENE.save(folders["undistort"], scene_without_points(cameras, WORLD))
+    artifacts.SCENE.save(folders["train"], scene_without_points(cameras, WORLD))
     artifacts.WORLD_PLACE.save(folders["place"], Place(Similarity.identity()))
     artifacts.ATLAS_MESH.save(folders["atlas"], atlas)
     write_png(artifacts.BASE_COLOR.load(folders["bake"]), texture)

@@ -18,18 +18,18 @@ from stages.extract import EXTRACT, supported_resolution
 
 @pytest.fixture
 def stage(tmp_path, monkeypatch):
-    undistort, train, out = (tmp_path / name for name in ("undistort", "train", "out"))
+    train, out = (tmp_path / name for name in ("train", "out"))
 
     def run(sdf, **params):
-        for folder in (undistort, train, out):
+        for folder in (train, out):
             folder.mkdir()
         stand_in = types.ModuleType("stages.neural.trained_field")
         stand_in.load_field = lambda path, device: types.SimpleNamespace(sdf=sdf)
         monkeypatch.setitem(sys.modules, "stages.neural.trained_field", stand_in)
-        artifacts.SCENE.save(undistort, scene_without_points(three_rings()))
+        artifacts.SCENE.save(train, scene_without_points(three_rings()))
         seen = []
         context = StageContext(
-            inputs={"undistort": undistort, "train": train},
+            inputs={"train": train},
             sources={},
             out=out,
             scratch=tmp_path,

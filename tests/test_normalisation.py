@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from rigs import EAST, NORTH, capture, look_at, ring
+from rigs import EAST, NORTH, capture, look_at, ring, scene_without_points
 
 from stages.geometry.cameras import PinholeCameras
-from stages.geometry.normalisation import into_frame, rotation_onto, scene_frame
+from stages.geometry.normalisation import into_frame, regrown, rotation_onto, scene_frame
 from stages.geometry.region import (
+    ATTENDED_MARGIN,
     SEEN_WHOLE_MARGIN,
+    enclosing_sphere,
     find_region,
-    grown_alone,
+    grown_over,
     meeting_point,
+    merged_spheres,
     seen_whole_radii,
 )
 from stages.geometry.similarity import Similarity
@@ -58,21 +63,59 @@ def test_seen_whole_radius_is_negative_for_a_center_out_of_view_or_behind():
     assert (seen_whole_radii(cameras, np.array([0.0, -5.0, 0.0])) <= 0).all()
 
 
-def test_an_object_alone_gets_a_sphere_that_takes_in_its_far_ends():
+def test_what_the_photos_look_at_is_inside_however_large_it_is():
     cameras = capture(ring(TARGET, UP, distance=5.0))
     fits = 5.0 * np.sin(np.arctan(240 / 600))
     shell = np.random.default_rng(0).normal(size=(500, 3))
     shell *= 1.4 * fits / np.linalg.norm(shell, axis=1, keepdims=True)
     shell += 0.5 * fits * EAST  # larger than the frame, and not in its middle
     frusta = find_region(cameras, TARGET + shell)
-    region = grown_alone(frusta, TARGET + shell, None)
-    assert np.linalg.norm(region.center - TARGET - 0.5 * fits * EAST) < 0.05 * fits
-    assert region.radius == pytest.approx(1.05 * 1.4 * fits, rel=0.03)
-    # amid other things these points are not known to be the object
-    wide = np.random.default_rng(1).uniform(-9, 9, (500, 3))
-    assert grown_alone(frusta, TARGET + np.concatenate([shell, wide]), None) is frusta
+    region = grown_over(frusta, TARGET + shell, None)
+    assert (np.linalg.norm(TARGET + shell - region.center, axis=1) < region.radius).all()
+    assert region.radius < 1.25 * ATTENDED_MARGIN * 1.4 * fits
+    # one point far off is a wrong one
+    stray = np.concatenate([TARGET + shell, [TARGET + 40 * NORTH]])
+    assert grown_over(frusta, stray, None).radius == pytest.approx(region.radius, rel=0.02)
     # and a small object does not shrink what the views show
-    assert grown_alone(frusta, TARGET + 0.3 * shell, None) is frusta
+    assert grown_over(frusta, TARGET + 0.3 * shell, None) is frusta
+    assert grown_over(frusta, np.zeros((0, 3)), None) is frusta
+
+
+@given(st.integers(0, 1000), st.integers(4, 60))
+@settings(max_examples=20, deadline=None)
+def test_the_enclosing_sphere_holds_all_and_is_nearly_the_smallest(seed: int, count: int):
+    random = np.random.default_rng(seed)
+    directions = random.normal(size=(count, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    points = np.concatenate([TARGET + 2 * directions, TARGET - 2 * directions])  # opposite ones: radius 2
+    center, radius = enclosing_sphere(points)
+    assert (np.linalg.norm(points - center, axis=1) <= radius + 1e-9).all()
+    assert 2 - 1e-9 <= radius < 2.05
+
+
+def test_merged_spheres_touch_both():
+    center, radius = merged_spheres((np.zeros(3), 1.0), (np.array([4.0, 0, 0]), 2.0))
+    np.testing.assert_allclose(center, [2.5, 0, 0])
+    assert radius == 3.5
+    assert merged_spheres((np.zeros(3), 3.0), (np.ones(3), 0.5))[1] == 3.0
+
+
+def test_a_regrown_scene_is_the_same_capture():
+    cameras = capture(ring(TARGET, UP))
+    points = TARGET + np.random.default_rng(0).normal(size=(20, 3))
+    first = scene_frame(TARGET, 2.0, UP)
+    scene = replace(
+        scene_without_points(into_frame(cameras, first), first),
+        points=first.inverse().apply(points).astype(np.float32),
+        growable=True,
+    )
+    grown = regrown(scene, np.array([0.5, 0.0, 0.0]), 1.5)
+    assert (grown.poses_from_scene.scale, grown.growable) == (3.0, False)
+    np.testing.assert_allclose(grown.poses_from_scene.apply(grown.points), points, atol=1e-5)
+    np.testing.assert_allclose(grown.poses_from_scene.apply(grown.cameras.centers), cameras.centers, atol=1e-9)
+    for i in (0, 5):
+        before, after = cameras.project(i, points), grown.cameras.project(i, grown.points)
+        np.testing.assert_allclose(before[0], after[0], atol=1e-2)
 
 
 def test_photos_of_something_else_do_not_move_the_center():
@@ -155,7 +198,7 @@ def test_masks_give_the_sphere_about_the_object(radius: float):
     poses = ring(np.zeros(3), up, pitch_deg=10) + ring(np.zeros(3), up, pitch_deg=50)
     cameras = capture(poses, size=(160, 120), focal=150.0)
     ball = np.array([0.2, -0.1, 0.15])
-    region = find_region(cameras, np.zeros((0, 3)), silhouettes(cameras, ball, radius))
+    region = find_region(cameras, np.zeros((0, 3)), masks=silhouettes(cameras, ball, radius))
     assert region.source == "the visual hull of the masks"
     assert np.linalg.norm(region.center - ball) < 0.15 * radius
     assert 1.0 < region.radius / radius < 1.5  # a hull is larger than its object
@@ -166,15 +209,15 @@ def test_one_wrong_mask_does_not_cut_the_hull():
     up = np.array([0.0, 0.0, 1.0])
     cameras = capture(ring(np.zeros(3), up, count=16), size=(160, 120), focal=150.0)
     masks: list[np.ndarray | None] = list(silhouettes(cameras, np.zeros(3), 1.0))
-    good = find_region(cameras, np.zeros((0, 3)), masks)
+    good = find_region(cameras, np.zeros((0, 3)), masks=masks)
     masks[3] = np.zeros_like(masks[3])
-    bad = find_region(cameras, np.zeros((0, 3)), masks)
+    bad = find_region(cameras, np.zeros((0, 3)), masks=masks)
     assert bad.radius == pytest.approx(good.radius, rel=0.15)
 
 
 def test_masks_that_agree_on_nothing_fall_back_to_the_frusta():
     cameras = capture(ring(np.zeros(3), UP), size=(160, 120), focal=150.0)
-    region = find_region(cameras, np.zeros((0, 3)), [np.zeros((120, 160), bool)] * len(cameras))
+    region = find_region(cameras, np.zeros((0, 3)), masks=[np.zeros((120, 160), bool)] * len(cameras))
     assert region.source == "the frusta of the cameras"
 
 

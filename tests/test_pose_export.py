@@ -95,7 +95,7 @@ def test_both_exports_say_the_same_and_that_of_the_scene(tmp_path: Path):
     (tmp_path / "other").mkdir()
     write_colmap(folder, sfm, tmp_path / "place", tmp_path / "exported")
     write_transforms(folder, sfm, tmp_path / "place", tmp_path / "other")
-    scene = artifacts.SCENE.load(folder)
+    scene = artifacts.FIRST_SCENE.load(folder)
     world = scene.world_from_scene(artifacts.WORLD_PLACE.load(tmp_path / "place"))
     colmap, transforms = (read_poses(tmp_path / name) for name in ("exported", "other"))
     for i, (one, other) in enumerate(zip(colmap.cameras, transforms.cameras, strict=True)):

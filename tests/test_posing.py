@@ -508,7 +508,7 @@ def test_the_region_is_that_of_the_file_where_there_are_no_masks():
     with pytest.raises(ValueError, match="got 0 sparse points"):
         find_region(facing_one_way, nothing)
     stated = RegionOfInterest(CENTER, 2.0, "object", "the file")
-    assert find_region(facing_one_way, nothing, None, stated) is stated
+    assert find_region(facing_one_way, nothing, stated=stated) is stated
 
 
 @pytest.mark.parametrize(("radius", "source"), [(1.0, "the visual hull of the masks"), (0.3, "the file")])
@@ -525,7 +525,7 @@ def test_of_hull_and_stated_region_the_smaller_is_taken(radius: float, source: s
     x, y = np.meshgrid(np.arange(WIDTH) - WIDTH / 2, np.arange(HEIGHT) - HEIGHT / 2)
     masks = [np.hypot(x, y) < 50] * NUM  # a ball of about 0.46
     stated = RegionOfInterest(CENTER, radius, "object", "the file")
-    assert find_region(cameras, np.zeros((0, 3)), masks, stated).source == source
+    assert find_region(cameras, np.zeros((0, 3)), masks=masks, stated=stated).source == source
 
 
 # ---------------------------------------------------------------- a real set

@@ -18,11 +18,13 @@ from rigs import (
     ring,
     room,
     room_from_its_walls,
+    sightings,
 )
 
+from stages.geometry.attention import attended
 from stages.geometry.normalisation import rotation_onto
 from stages.geometry.plane import find_ground
-from stages.geometry.region import find_region, grown_alone
+from stages.geometry.region import FROM_ATTENTION, find_region, grown_over
 from stages.geometry.similarity import Similarity
 from stages.geometry.up import Up, angle_deg, choose_up, estimate_up
 
@@ -30,7 +32,7 @@ from stages.geometry.up import Up, angle_deg, choose_up, estimate_up
 def found(rig):
     cameras, points = rig
     up = estimate_up(cameras)
-    region = find_region(cameras, points)
+    region = find_region(cameras, points, attended(cameras, points, sightings(cameras, points)))
     return cameras, points, region, up, find_ground(points, cameras.centers, up.direction, region.center, region.radius)
 
 
@@ -131,24 +133,27 @@ def test_a_larger_plane_above_the_cameras_is_no_ground():
 
 
 def test_an_object_on_a_table_does_not_grow_over_it():
-    _, points, region, _, ground = found(dome_on_a_table())
+    cameras, points, region, _, ground = found(dome_on_a_table())
     assert ground is not None
-    assert grown_alone(region, points, ground) is region
-    assert grown_alone(region, points[:600], None).radius >= region.radius
+    points = points[:1800]  # the last are wrong ones, which no three photos would agree on
+    about = points[attended(cameras, points, sightings(cameras, points))]
+    assert (np.abs(about[:, 2]) < 0.1).sum() > 100  # the table is looked at, too
+    assert grown_over(region, about, ground) is region
 
 
 def test_a_long_object_that_fills_the_frame_is_taken_whole_without_its_table():
-    _, points, region, _, ground = found(long_object_on_a_table())
+    cameras, points, region, _, ground = found(long_object_on_a_table())
     assert ground is not None
     assert region.radius < 2.3  # its ends are out of the frame
-    grown = grown_alone(region, points, ground)
+    about = points[attended(cameras, points, sightings(cameras, points))]
+    grown = grown_over(region, about, ground)
     ends = np.array([[-2.5, 0, 0.6], [2.5, 0, 0.6]])
     assert (np.linalg.norm(ends - grown.center, axis=1) < grown.radius).all()
-    assert grown.radius < 3.0
-    assert grown.source == "the sparse points above the ground"
+    assert grown.radius < 3.6
+    assert grown.source == FROM_ATTENTION
     # other things that stand around it are no part of it
     clutter = np.random.default_rng(1).uniform([6, 6, 0], [9, 9, 2], (300, 3))
-    assert grown_alone(region, np.concatenate([points, clutter]), ground) is region
+    assert grown_over(region, np.concatenate([about, clutter]), ground).radius == grown.radius
 
 
 # ---------------------------------------------------------------- up

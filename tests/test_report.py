@@ -16,10 +16,11 @@ from report_inputs import BOX, UP, bare_inputs, full_inputs, manifest, page, pyr
 from configs.load import load_config
 from configs.params import ReportParams
 from stages import artifacts
+from stages.drawing.overview import overview_svg
 from stages.engine.stage import StageContext
 from stages.engine.workspace import Record
 from stages.geometry.up import y_up_rotation
-from stages.report import THREE
+from stages.report import THREE, region_corners
 from stages.reporting.curves import line_chart
 from stages.reporting.numbers import duration
 from stages.reporting.pictures import draw_stills
@@ -105,7 +106,9 @@ def test_the_page_says_it_all_and_refers_to_nothing_outside(full):
 
 
 def test_the_overview_shows_each_camera_from_both_sides(full):
-    drawing = ET.fromstring(artifacts.OVERVIEW.load(full.inputs["undistort"]).read_text())
+    scene = artifacts.SCENE.load(full.inputs["train"])
+    corners = region_corners(scene, artifacts.GIVEN_REGION.load(full.inputs["place"]))
+    drawing = ET.fromstring(overview_svg(scene, corners))
     views = drawing.findall("{*}svg")
     assert [view.find("{*}text").text for view in views] == ["from above", "from the side"]
     for view, height in zip(views, (0.0, -3.0), strict=True):  # the camera is at z = -3
@@ -191,7 +194,7 @@ def test_measures_are_packed_between_their_ends_and_unknown_ones_marked():
 
 
 def test_drawn_cameras_look_where_the_photos_look(full):
-    scene = artifacts.SCENE.load(full.inputs["undistort"])
+    scene = artifacts.SCENE.load(full.inputs["train"])
     caption = {"name": "a.jpg", "held_out": True, "error": 0.5, "points": 7}
     packed = pack_scene(scene, [caption], (), pyramid())
     camera = packed["cameras"][0]

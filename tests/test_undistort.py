@@ -154,12 +154,11 @@ def test_png_names_stay_unique():
 # ---------------------------------------------------------------- region, scale and place
 def test_a_given_sphere_is_the_unit_sphere(tmp_path: Path):
     inputs = write_capture(tmp_path, *MODELS[0], masks=False)
-    scene, out, numbers = undistort(inputs, tmp_path, region="sphere 2.5 -1 0.5 0.75", roi_scale=3.0)
+    scene, _, numbers = undistort(inputs, tmp_path, region="sphere 2.5 -1 0.5 0.75", roi_scale=3.0)
     assert world_from(scene, tmp_path).scale == 0.75
     np.testing.assert_allclose(world_from(scene, tmp_path).translation, [2.5, -1, 0.5])
     assert artifacts.GIVEN_REGION.load(tmp_path / "place").box is None
     assert numbers["region_from"] == "the given sphere"
-    assert artifacts.OVERVIEW.load(out).read_text().startswith("<svg")
 
 
 def test_a_region_that_no_camera_sees_is_refused(tmp_path: Path):
@@ -313,7 +312,7 @@ def test_a_known_distance_changes_nothing_of_the_scene(tmp_path: Path):
     (tmp_path / "b").mkdir()
     _, one, _ = undistort(inputs, tmp_path / "a")
     _, other, _ = undistort(inputs, tmp_path / "b", known_distance="0 0 0 1 0 0 3.3")
-    for file in ("cameras.json", "scene.json", "overview.svg"):
+    for file in ("cameras.json", "scene.json"):
         assert (one / file).read_bytes() == (other / file).read_bytes()
     assert place_of(tmp_path / "b").metric
     assert not place_of(tmp_path / "a").metric

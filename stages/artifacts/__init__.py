@@ -15,5 +15,5 @@ from stages.artifacts.pictures import IMAGES, MASKS, Pictures, write_png
 from stages.artifacts.place import GIVEN_REGION, WORLD_PLACE
 from stages.artifacts.report import PAGE
 from stages.artifacts.sfm import GIVEN_POSES, MODEL, REGISTRATION, GivenPoses, KnownSphere, Registration, Unregistered
-from stages.artifacts.train import FIELD, HELD_OUT, METRICS, PREVIEWS, checkpoint_path, preview_path
-from stages.artifacts.undistort import CAMERAS, OVERVIEW, PINHOLE_PHOTOS, SCENE
+from stages.artifacts.train import CAMERAS, FIELD, HELD_OUT, METRICS, PREVIEWS, SCENE, checkpoint_path, preview_path
+from stages.artifacts.undistort import FIRST_SCENE, PINHOLE_PHOTOS

@@ -1,4 +1,4 @@
-"""What train publishes: the field, its metrics, previews, and the names of the photos that were held out."""
+"""What train publishes: the field and the scene that it fills, metrics, previews, and which photos were held out."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from pathlib import Path
 
 from stages.artifacts.artifact import Artifact, place_artifact
 from stages.artifacts.json_files import read_json, write_json
+from stages.artifacts.scene import cameras_of, scene_of
 
 _HELD_OUT = "held_out.json"
 
@@ -20,6 +21,9 @@ def _load_held_out(folder: Path) -> tuple[str, ...]:
     return tuple(read_json(path)) if path.exists() else ()
 
 
+# The scene that everything from here on is in: undistort's, or one whose region was grown.
+CAMERAS = cameras_of("train")
+SCENE = scene_of("train")
 # The trained field, see `stages.neural.trained_field.TrainedField`.
 FIELD = place_artifact("train", "field.pt")
 # JSON lines, one object a logged step.

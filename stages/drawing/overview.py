@@ -15,7 +15,7 @@ COLORS = {"point": "#8a94a3", "inside": "#3c8d5a", "camera": "#2f6fb0", "region"
 
 
 def overview_svg(scene: PosedScene, box_corners: np.ndarray | None = None) -> str:
-    """An SVG with two views of the scene frame side by side: from above (x right, y up), from the side (x, z).
+    """An SVG for a page, with two views of the scene frame: from above (x right, y up) and from the side (x, z).
 
     Args:
         box_corners: [8, 3] scene frame, of the box that the mesh is cropped to; see `GivenRegion.box_corners`.
@@ -37,7 +37,7 @@ def overview_svg(scene: PosedScene, box_corners: np.ndarray | None = None) -> st
         )
     width = 2 * SIDE + 12
     return (
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {SIDE}" role="img" '
+        f'<svg viewBox="0 0 {width} {SIDE}" role="img" '
         f'aria-label="Cameras, points and region of interest">{"".join(views)}</svg>'
     )
 

@@ -157,7 +157,7 @@ def workspace_cameras(workspace: Path) -> Cameras:
         raise WorkspaceError(
             f"{workspace} has no undistorted photos.", f"Make them: `hineus undistort --workspace {workspace}`."
         )
-    scene = artifacts.SCENE.load(opened.stage_folder("undistort"))
+    scene = artifacts.FIRST_SCENE.load(opened.stage_folder("undistort"))
     return Cameras(str(workspace), into_frame(scene.cameras, scene.poses_from_scene.inverse()))
 
 

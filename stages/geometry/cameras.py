@@ -111,6 +111,7 @@ class PosedScene:
         up: unit vector, the estimated up direction in the scene frame.
         kind: "object" (cameras around one thing) or "forward" (a room, a facade, a survey flight).
         ground: plane of the ground or table in the scene frame, or None where none was found.
+        growable: whether the region may grow where it turns out to cut what the photos show: it was found, not given.
     """
 
     cameras: PinholeCameras
@@ -121,6 +122,7 @@ class PosedScene:
     up: Float[np.ndarray, " 3"]
     kind: str = "object"
     ground: Plane | None = None
+    growable: bool = False
 
     def world_from_scene(self, place: Place) -> Similarity:
         """To the frame of the results."""

@@ -81,7 +81,7 @@ def hull_distances(
     from scipy.ndimage import distance_transform_edt
 
     cell = 2.0 / cells
-    grid = _cube(cells).reshape(-1, 3)
+    grid = cube(cells).reshape(-1, 3)
     inside = (_inside_silhouettes(cameras, masks, grid) & (np.linalg.norm(grid, axis=1) < 1)).reshape([cells] * 3)
     if not inside.any() or inside.all():
         return None
@@ -93,10 +93,10 @@ def hull_distances(
 
 def room_distances(cells: int = DISTANCE_CELLS) -> Float32[np.ndarray, "{cells} {cells} {cells}"]:
     """Signed distance to a round room's wall, positive within, at the centres of a grid as of `hull_distances`."""
-    return (ROOM_RADIUS - np.linalg.norm(_cube(cells), axis=-1)).astype(np.float32)
+    return (ROOM_RADIUS - np.linalg.norm(cube(cells), axis=-1)).astype(np.float32)
 
 
-def _cube(cells: int) -> Float[np.ndarray, "{cells} {cells} {cells} 3"]:
+def cube(cells: int = DISTANCE_CELLS) -> Float[np.ndarray, "{cells} {cells} {cells} 3"]:
     """Centres of a grid over the cube [-1, 1]^3."""
     axis = (np.arange(cells) + 0.5) * 2.0 / cells - 1
     return np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1)

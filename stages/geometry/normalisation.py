@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from stages.geometry.cameras import PinholeCameras
+from stages.geometry.cameras import PinholeCameras, PosedScene
 from stages.geometry.similarity import Similarity
 
 if TYPE_CHECKING:
@@ -44,3 +44,16 @@ def into_frame(cameras: PinholeCameras, old_from_new: Similarity) -> PinholeCame
     extrinsics[:, :, :3] = rotation @ old_from_new.rotation
     extrinsics[:, :, 3] = (rotation @ old_from_new.translation + translation) / old_from_new.scale
     return replace(cameras, extrinsics=extrinsics)
+
+
+def regrown(scene: PosedScene, center: Float[np.ndarray, " 3"], radius: float) -> PosedScene:
+    """The same capture with another region, a sphere given in the frame of `scene`; it grows no more."""
+    old_from_new = Similarity(radius, np.eye(3), center)
+    return replace(
+        scene,
+        cameras=into_frame(scene.cameras, old_from_new),
+        poses_from_scene=scene.poses_from_scene.compose(old_from_new),
+        points=old_from_new.inverse().apply(scene.points).astype(np.float32),
+        ground=scene.ground and scene.ground.within(old_from_new),
+        growable=False,
+    )

@@ -6,8 +6,10 @@ Two kinds of capture:
 - "object": the cameras look at one place. The sphere is centred where their optical axes meet and a little
   larger than what the views show whole; where silhouettes are known, it encloses their visual hull instead.
 - "forward": the optical axes are nearly parallel (a facade, a survey flight), meet behind the cameras (a room), meet in
-  empty space (a room from its walls), or only come near each other (a survey flight with oblique photos). The sphere
-  encloses the sparse points, outliers aside.
+  empty space (a room from its walls), or only come near each other (a survey flight with oblique photos).
+
+Either holds the sparse points that the photos are about (`attention`): what is larger than the frame, off its middle,
+or seen from one side only. Rather too large than too small: what lies outside is lost.
 """
 
 from __future__ import annotations
@@ -23,7 +25,7 @@ from stages.geometry.hull import visual_hull_sphere
 from stages.geometry.plane import Plane
 
 if TYPE_CHECKING:
-    from jaxtyping import Float, Int, Shaped
+    from jaxtyping import Bool, Float, Shaped
 
 # Axes that spread less than this (root mean square angle to their mean) are "nearly parallel".
 MIN_AXIS_SPREAD_DEG = 8.0
@@ -44,23 +46,23 @@ MIN_RADIUS_RATIO = 0.05
 # People fill the frame with the object, and its far ends stick out of the largest sphere the short side shows:
 # on three captures with known geometry they reached 0.95, 1.04 and 1.14 of its radius. Enlarged by this.
 SEEN_WHOLE_MARGIN = 1.2
-# An object without surroundings (a turntable before black cloth, a model larger than the frame): no ground, and
-# nearly all sparse points within this many seen-whole radii. Then they are the object, all of it and little else.
-ALONE_RADII, ALONE_SHARE = 2.5, 0.97
-ALONE_PERCENTILES, ALONE_MARGIN = (0.5, 99.5), 1.05
-# An object that fills the frame hides the table: this part of all points at least stands above it, by this part of the
-# region's radius (three times what is taken for the table). On five captures that show more table it was 3 to 31 %.
-FILLING_SHARE, STANDING = 0.5, 0.03
+# What stands on the ground rises above it by this part of the region's radius: three times what is taken for ground.
+STANDING = 0.03
+# What stands on the same ground beyond a gap wider than this, in radii of the region, is something else.
+MAX_GAP = 0.4
+# The ends of a subject, which fewer photos see, reach beyond the points on it: those of an object, which photos leave
+# above and below, and those of a forward capture, which goes on at its sides.
+ATTENDED_MARGIN, FORWARD_MARGIN = 1.18, 1.12
 # Free space around silhouettes' visual hull: 10 % of the radius.
 HULL_MARGIN = 1.1
-# Robust range of the sparse points of a forward capture, percent.
-FORWARD_PERCENTILES = (1.0, 99.0)
-FORWARD_MARGIN = 1.05
-# Points farther from the nearest camera than this many times the median are horizon, not what was photographed.
+# In a room points lie all around the cameras: their directions from the cameras' middle cancel to less than this.
+MAX_ONE_SIDED = 0.5
+# All of it was photographed, but for what is farther from the nearest camera than this many times the median.
 FORWARD_DEPTHS = 4.0
-# Points in the frames of fewer photos than this part of the median are the rim of a capture, where little can be known.
-FORWARD_FRAMES, MAX_COUNTED = 0.25, 20_000
-FROM_FRUSTA, FROM_POINTS = "the frusta of the cameras", "the sparse points"
+# Points with fewer neighbours than this within this part of their median distance from the middle are wrong.
+MIN_NEIGHBOURS, MAX_ISOLATION = 2, 0.7
+ENCLOSING_STEPS = 200
+FROM_FRUSTA, FROM_ATTENTION, FROM_POINTS = "the frusta of the cameras", "what the photos look at", "the sparse points"
 IRLS_STEPS = 30
 TINY = 1e-12  # keeps divisions finite; far below any length that occurs
 
@@ -140,14 +142,6 @@ def seen_whole_radii(cameras: PinholeCameras, center: Float[np.ndarray, " 3"]) -
     return radii
 
 
-def frames_around(cameras: PinholeCameras, points: Float[np.ndarray, "p 3"]) -> Int[np.ndarray, " p"]:
-    """How many photos have each of the points within their frame, hidden or not."""
-    frames = np.zeros(len(points), dtype=np.int64)
-    for i in range(len(cameras)):
-        frames += cameras.in_frame(i, points)
-    return frames
-
-
 def present_share(cameras: PinholeCameras, points: Float[np.ndarray, "p 3"], place: Float[np.ndarray, " 3"]) -> float:
     """Part of the points in the middle of the photos that lie about as far away as `place`; median photo."""
     thinned = points[:: -(-len(points) // MAX_JUDGED)]
@@ -161,30 +155,19 @@ def present_share(cameras: PinholeCameras, points: Float[np.ndarray, "p 3"], pla
     return float(np.median(shares)) if shares else 0.0
 
 
-def robust_sphere(
-    points: Float[np.ndarray, "p 3"], percentiles: tuple[float, float] = FORWARD_PERCENTILES
-) -> tuple[Float[np.ndarray, " 3"], float]:
-    """Centre and radius of a sphere about points with the extremes of each axis cut off."""
-    if len(points) == 0:
-        raise ValueError("got 0 points, expected at least 1")
-    low, high = np.percentile(points, percentiles, axis=0)
-    center = (low + high) / 2
-    kept = np.all((points >= low) & (points <= high), axis=1)
-    distances = np.linalg.norm(points[kept] - center, axis=1) if kept.any() else np.zeros(1)
-    return center, float(distances.max())
-
-
 def find_region(
     cameras: PinholeCameras,
     points: Float[np.ndarray, "p 3"],
+    about: Bool[np.ndarray, " p"] | None = None,
     masks: Sequence[Shaped[np.ndarray, "_ _"] | None] | None = None,
     stated: RegionOfInterest | None = None,
 ) -> RegionOfInterest:
-    """The sphere the capture is about; of an object without ground, see `grown_alone`.
+    """The sphere the capture is about; of an object, see `grown_over`, too.
 
     Args:
         cameras: at least two, in the frame of the poses.
         points: sparse points, likewise.
+        about: which of them the photos are about, see `attention.attended`; None: nobody knows.
         masks: one silhouette per camera (or None for it), or None without masks.
         stated: what the poses' file says; taken unless the silhouettes' hull is smaller, for both hold the object.
 
@@ -208,42 +191,108 @@ def find_region(
         found = None
     if found is not None:
         return RegionOfInterest(found.point, SEEN_WHOLE_MARGIN * found.radius, "object", FROM_FRUSTA)
-    if len(points) == 0:
-        raise ValueError("got 0 sparse points and optical axes that do not meet, expected either")
+    return _around_points(cameras, points, about)
+
+
+def _around_points(
+    cameras: PinholeCameras, points: Float[np.ndarray, "p 3"], about: Bool[np.ndarray, " p"] | None
+) -> RegionOfInterest:
+    """The region of a forward capture: what its photos are about, or all that surrounds the cameras."""
     from scipy.spatial import cKDTree
 
-    points = points[:: -(-len(points) // MAX_COUNTED)]
-    distances, _ = cKDTree(cameras.centers).query(points)
-    points = points[distances <= FORWARD_DEPTHS * np.median(distances)]
-    frames = frames_around(cameras, points)
-    center, radius = robust_sphere(points[frames >= FORWARD_FRAMES * np.median(frames)])
+    if len(points) == 0:
+        raise ValueError("got 0 sparse points and optical axes that do not meet, expected either")
+    chosen, source = points[[] if about is None else about], FROM_ATTENTION
+    if not len(chosen) or _one_sidedness(cameras, chosen) < MAX_ONE_SIDED:
+        distances, _ = cKDTree(cameras.centers).query(points)
+        chosen, source = points[distances <= FORWARD_DEPTHS * np.median(distances)], FROM_POINTS
+    chosen = _without_strays(chosen)
+    center, radius = enclosing_sphere(chosen)
     if radius <= 0:
         raise ValueError(f"got sparse points within a radius of {radius}, expected a positive one")
-    return RegionOfInterest(center, radius * FORWARD_MARGIN, "forward", FROM_POINTS)
+    return RegionOfInterest(center, FORWARD_MARGIN * radius, "forward", source)
 
 
-def grown_alone(region: RegionOfInterest, points: Float[np.ndarray, "p 3"], ground: Plane | None) -> RegionOfInterest:
-    """The region about the sparse points where these are one object and nothing else; else as it was.
+def _one_sidedness(cameras: PinholeCameras, points: Float[np.ndarray, "p 3"]) -> float:
+    """Length of the mean direction of points as seen from the middle of the cameras: 0 all around, 1 one way."""
+    away = points - cameras.centers.mean(0)
+    directions = away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), TINY)
+    return float(np.linalg.norm(directions.mean(0)))
 
-    Where there is a ground, the points above it are asked, and only where they are the most: a table around the object
-    lies as near as its far ends do, and reflections in it are as many as the points of a plain object.
+
+def grown_over(region: RegionOfInterest, points: Float[np.ndarray, "p 3"], ground: Plane | None) -> RegionOfInterest:
+    """The region of an object with all in it that the photos are about; as it was where that is so.
+
+    What stands on a ground is a thing of its own, and the ground does not count. Where there is none, the object may
+    hang on a wall or be larger than the frame, and all counts.
+
+    Args:
+        points: those that `attention.attended` names.
     """
-    if region.source != FROM_FRUSTA or len(points) < MIN_JUDGED:
+    if region.source != FROM_FRUSTA:
         return region
     if ground is not None:
-        standing = points[ground.heights(points) > STANDING * region.radius]
-        if len(standing) < FILLING_SHARE * len(points):
-            return region
-        points = standing
-    distances = np.linalg.norm(points - region.center, axis=1)
-    near = points[distances < ALONE_RADII * region.radius / SEEN_WHOLE_MARGIN]
-    if len(near) < ALONE_SHARE * len(points):
+        points = _connected(points[ground.heights(points) > STANDING * region.radius], region)
+    points = _without_strays(points)
+    if not (np.linalg.norm(points - region.center, axis=1) > region.radius / ATTENDED_MARGIN).any():
         return region
-    center, radius = robust_sphere(near, ALONE_PERCENTILES)
-    if ALONE_MARGIN * radius < region.radius:
-        return region
-    source = "the sparse points of an object alone" if ground is None else "the sparse points above the ground"
-    return RegionOfInterest(center, ALONE_MARGIN * radius, "object", source)
+    center, radius = enclosing_sphere(points)
+    center, radius = merged_spheres((region.center, region.radius), (center, ATTENDED_MARGIN * radius))
+    return RegionOfInterest(center, radius, region.kind, FROM_ATTENTION)
+
+
+def _without_strays(points: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "k 3"]:
+    """The points that have others near."""
+    from scipy.spatial import cKDTree
+
+    if len(points) <= MIN_NEIGHBOURS:
+        return points
+    typical = np.median(np.linalg.norm(points - np.median(points, axis=0), axis=1))
+    isolation = cKDTree(points).query(points, k=MIN_NEIGHBOURS + 1)[0][:, -1]
+    return points[isolation <= MAX_ISOLATION * typical]
+
+
+def _connected(points: Float[np.ndarray, "p 3"], region: RegionOfInterest) -> Float[np.ndarray, "k 3"]:
+    """Points that lie in the region or hang together with some that do; all of them where none does."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import cKDTree
+
+    gap = MAX_GAP * region.radius
+    # one point a cell is enough to tell what hangs together
+    _, first, cell_of = np.unique(np.floor(points / (gap / 4)), axis=0, return_index=True, return_inverse=True)
+    cells = points[first]
+    pairs = cKDTree(cells).query_pairs(gap, output_type="ndarray")
+    links = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(cells), len(cells)))
+    group = connected_components(links, directed=False)[1][cell_of.reshape(-1)]
+    core = group[np.linalg.norm(points - region.center, axis=1) < region.radius]
+    return points[np.isin(group, core)] if len(core) else points
+
+
+def enclosing_sphere(points: Float[np.ndarray, "p 3"]) -> tuple[Float[np.ndarray, " 3"], float]:
+    """Nearly the smallest sphere about points (at most 1 % too large).
+
+    Steps of shrinking length towards the farthest point (Badoiu and Clarkson, "Smaller core-sets for balls", 2003).
+    """
+    center = points.mean(0)
+    for step in range(1, ENCLOSING_STEPS):
+        farthest = points[np.argmax(((points - center) ** 2).sum(1))]
+        center = center + (farthest - center) / (step + 1)
+    return center, float(np.linalg.norm(points - center, axis=1).max())
+
+
+Sphere = tuple["Float[np.ndarray, ' 3']", float]
+
+
+def merged_spheres(one: Sphere, other: Sphere) -> Sphere:
+    """The smallest sphere that holds two spheres, each given by its centre and radius."""
+    (center, radius), (other_center, other_radius) = (one, other) if one[1] >= other[1] else (other, one)
+    away = other_center - center
+    distance = float(np.linalg.norm(away))
+    if distance + other_radius <= radius:
+        return center, radius
+    merged = (distance + radius + other_radius) / 2
+    return center + away / distance * (merged - radius), merged
 
 
 class _Meeting(NamedTuple):

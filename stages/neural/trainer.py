@@ -10,7 +10,7 @@ from torch import Tensor
 
 from configs.training import TrainParams
 from stages.neural import losses, schedules
-from stages.neural.acceleration import is_mixed, short_products
+from stages.neural.acceleration import is_mixed, points_at_a_time, short_products
 from stages.neural.encoding_shapes import Frequencies, HashGrid
 from stages.neural.fields import Fields, FieldShape
 from stages.neural.proposal import interlevel_loss, sample_edges, updates_now
@@ -24,7 +24,7 @@ from stages.neural.terms.planar import has_feature_mlp
 from stages.neural.training_photos import Photos, RayBatch
 
 if TYPE_CHECKING:
-    from jaxtyping import Float, UInt8
+    from jaxtyping import Float, Int, UInt8
 
 # The regression to a hull before training: long enough for an error of about a cell of its grid.
 HULL_STEPS, HULL_POINTS = 200, 2048
@@ -214,6 +214,24 @@ class Trainer:
         band = None if full else 4 * self.cache.cell
         self.cache.refresh(lambda p: self.fields.sdf.sdf(p, moment.levels), band)
         self.cache_step = self.step_index
+
+    # ------------------------------------------------------------------ the shape so far
+    @torch.no_grad()
+    def distances(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+        """The SDF at points, with all levels."""
+        parts = torch.from_numpy(points).float().to(self.device).split(points_at_a_time(self.device))
+        levels = self.params.field.levels
+        return torch.cat([self.fields.sdf.sdf(part, levels) for part in parts]).cpu().numpy()
+
+    def coarse_surface(self) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:
+        """Vertices and faces of the surface in the sampler's grid, within the region."""
+        from skimage.measure import marching_cubes
+
+        grid = self.cache.values[0, 0].cpu().numpy().transpose(2, 1, 0)
+        vertices, faces, _, _ = marching_cubes(grid, 0.0, gradient_direction="ascent")
+        vertices = vertices * self.cache.cell - 1
+        inside = (np.linalg.norm(vertices, axis=1) < 1)[faces].all(1)
+        return vertices, faces[inside]
 
     # ------------------------------------------------------------------ previews, checkpoints
     @torch.no_grad()

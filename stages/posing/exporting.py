@@ -73,7 +73,7 @@ def write_transforms(undistort: Path, sfm: Path, place: Path, out: Path) -> dict
 
 def _images_and_model(undistort: Path, sfm: Path, place: Place, out: Path) -> tuple[PosedScene, Any]:
     """Copy images and masks to `out`; the scene, and the pycolmap model of it."""
-    scene = artifacts.SCENE.load(undistort)
+    scene = artifacts.FIRST_SCENE.load(undistort)
     ours, theirs = artifacts.Pictures(undistort), artifacts.Pictures(out)
     for name in scene.cameras.names:
         for source, target in ((ours.path(name), theirs.path(name)), (ours.mask_path(name), theirs.mask_path(name))):

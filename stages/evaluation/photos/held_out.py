@@ -38,14 +38,14 @@ def evaluate_views(workspace: Path, renders: Path | None = None, device: str = "
         WorkspaceError: a stage is missing, or is of another run than those after it.
     """
     opened = _whole(workspace)
-    undistort = opened.stage_folder("undistort")
-    held_out = artifacts.HELD_OUT.load(opened.stage_folder("train"))
+    undistort, train = opened.stage_folder("undistort"), opened.stage_folder("train")
+    held_out = artifacts.HELD_OUT.load(train)
     if not held_out:
         raise InputError(
             f"{workspace} holds out no photos: all were trained on.",
             f"Train without every 8th: `hineus run --workspace {workspace} --hold-out 8`.",
         )
-    cameras = artifacts.CAMERAS.load(undistort)
+    cameras = artifacts.CAMERAS.load(train)
     pinholes = artifacts.PINHOLE_PHOTOS.load(undistort)
     masked = sum(pinholes.mask_path(name).exists() for name in held_out)
 

@@ -8,10 +8,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from stages import artifacts
-from stages.engine.workspace import Workspace
 from stages.evaluation.photos.regions import WHITE
-from stages.geometry.cameras import PinholeCameras
+from stages.geometry.cameras import PinholeCameras, PosedScene
 from stages.geometry.normalisation import into_frame
 from stages.ingest import find_masks, read_mask_file
 from stages.posing.known import image_size, match_photos
@@ -45,13 +43,12 @@ class NovelPhotos:
         cameras: in the scene frame, in the order of the views' names; photos without a pose are left out.
     """
 
-    def __init__(self, views: NovelViews, workspace: Workspace, masks: Path | None = None) -> None:
-        """With the folder of the masks that the scene is run with, if it is.
+    def __init__(self, views: NovelViews, scene: PosedScene, masks: Path | None = None) -> None:
+        """As the trained scene has them, and with the folder of its masks, if it is run with any.
 
         Raises:
             InputError: no photo has a pose, or one has another shape than its pose is for.
         """
-        scene = artifacts.SCENE.load(workspace.stage_folder("undistort"))
         poses = read_poses(views.poses)
         matched = match_photos(poses, views.names)
         self._views = views

@@ -38,7 +38,8 @@ def score_result(
     if scene.truth is not None and mesh is not None:
         scores["mesh"] = score_surface(scene.truth, mesh, workspace)
     if scene.views is not None and "train" in fresh:
-        photos = NovelPhotos(scene.views, workspace, scene.masks)
+        trained = artifacts.SCENE.load(workspace.stage_folder("train"))
+        photos = NovelPhotos(scene.views, trained, scene.masks)
         indices = range(len(photos.cameras))
         found = score_photos(
             workspace, photos.cameras, indices, photos.load, device, textured="bake" in fresh, lpips=find_lpips()[0]
@@ -57,7 +58,7 @@ def result_mesh(workspace: Workspace, fresh: set[str], out: Path) -> Path | None
     if "cleanup" not in fresh:
         return None
     vertices, faces = artifacts.CLEAN_MESH.load(workspace.stage_folder("cleanup"))
-    scene = artifacts.SCENE.load(workspace.stage_folder("undistort"))
+    scene = artifacts.SCENE.load(workspace.stage_folder("train"))
     _write(scene.poses_from_scene, (vertices, faces), out)
     return out
 
