@@ -170,7 +170,7 @@ def read_text(path: Path) -> str:
 
 REPORT: Stage[ReportParams] = Stage(
     name="report",
-    version=5,
+    version=6,
     settings=lambda config: config.report,
     run=run,
     reads=(

@@ -15,8 +15,10 @@ import pytest
 from report_inputs import BOX, bare_inputs, full_inputs, page
 
 from configs.texts import read_region
+from hineus_cli.viewing import serving, watch
 from stages import artifacts
 from stages.engine.stage import StageContext
+from stages.engine.workspace import Workspace
 from stages.geometry.normalisation import rotation_onto
 from stages.geometry.place import GivenRegion, Place, given_region
 from stages.geometry.similarity import Similarity
@@ -112,19 +114,27 @@ def tilted(context: StageContext) -> StageContext:
     return context
 
 
+def after_a_while(script: str) -> str:
+    """The end of a page that runs a script once the view is there."""
+    return f"<script>setTimeout(() => {{ {script} }}, 2000);</script></body>"
+
+
 def edited(context: StageContext, script: str = "") -> tuple[GivenRegion, str]:
     """The region that the page's command would give, and what it says of the sparse points, after a script."""
     report = artifacts.PAGE.load(context.out)
-    run = f"<script>setTimeout(() => {{ {script} }}, 2000);</script></body>"
-    report.write_text(page(context).replace("</body>", run))
+    report.write_text(page(context).replace("</body>", after_a_while(script)))
     dom = browse(context.scratch, f"{report.as_uri()}#edit=region", "--dump-dom").stdout
-    command = html.unescape(re.search(r'<pre id="region-command">(.*?)</pre>', dom)[1])
-    *words, setting = shlex.split(command)
+    *words, setting = command_in(dom)
     assert words == ["hineus", "run", "--workspace", "WORKSPACE", "--set"]
     key, _, text = setting.partition("=")
     assert key == "place.region"
     world_from_poses = artifacts.WORLD_PLACE.load(context.inputs["place"]).world_from_poses
     return given_region(*read_region(text), world_from_poses), re.search(r'id="region-count">(.*?)</p>', dom)[1]
+
+
+def command_in(dom: str) -> list[str]:
+    """The words of the page's command, as a shell reads them."""
+    return shlex.split(html.unescape(re.search(r'<pre id="region-command">(.*?)</pre>', dom)[1]))
 
 
 def says(context: StageContext, region: GivenRegion) -> str:
@@ -151,6 +161,19 @@ def test_the_command_of_an_unchanged_box_gives_the_same_box(full):
     region, count = edited(full)
     np.testing.assert_allclose(region.box, BOX, atol=1e-5)
     assert count == says(full, region)
+
+
+def test_the_command_names_the_workspace_from_its_file_and_from_view(full, tmp_path):
+    workspace = Workspace.open(tmp_path / "it's one", create=True)
+    with workspace.lock():
+        workspace.remember({"photos": None}, "cpu", {})
+    report = artifacts.PAGE.load(workspace.stage_folder("report"))
+    report.parent.mkdir()
+    report.write_text(page(full))
+    with serving(watch(workspace.root, ())) as url:
+        for address in (report.as_uri(), url):
+            dom = browse(full.scratch, address, "--dump-dom").stdout
+            assert command_in(dom)[:4] == ["hineus", "run", "--workspace", str(workspace.root)]
 
 
 TYPE = """
@@ -207,10 +230,13 @@ def test_a_handle_moves_one_face_of_the_box(full):
 
 
 def test_what_lies_outside_the_region_fades(full):
-    page(full)
-    url = artifacts.PAGE.load(full.out).as_uri()
-    pure, faded = (
-        ((blue > 180) & (green < 110) & (red < 90)).sum()
-        for red, green, blue in (screenshot(full.scratch, url + end).transpose(2, 0, 1) for end in ("", "#edit=region"))
-    )
-    assert 0.2 * pure < faded < 0.97 * pure
+    report = artifacts.PAGE.load(full.out)
+    html = page(full)
+    pure = []
+    for top in ("0.9", "-0.15"):  # above the mesh, and below it
+        script = TYPE + f"""type('[data-region="high"][data-axis="2"]', {top});"""
+        report.write_text(html.replace("</body>", after_a_while(script)))
+        red, green, blue = screenshot(full.scratch, f"{report.as_uri()}#edit=region").transpose(2, 0, 1)
+        pure.append(((blue > 180) & (green < 110) & (red < 90)).sum())
+    assert pure[0] > 1000
+    assert pure[1] < 0.01 * pure[0]

@@ -13,18 +13,30 @@ function regionText({ form, center, radius, low, high }) {
   return [form, ...numbers.map((value) => regionNumber(value, size))].join(" ");
 }
 
-// The command for a page at this address: it names the workspace where the page lies in one.
-function regionCommand(region, { protocol, pathname }) {
-  const found = protocol === "file:" && decodeURIComponent(pathname).match(/^(.+)\/report\/report\.html$/);
+// The workspace that the page lies in, or that `hineus view` shows; else a name to fill in.
+async function findWorkspace() {
+  if (location.protocol === "file:") {
+    const found = decodeURIComponent(location.pathname).match(/^(.+)\/report\/report\.html$/);
+    return found ? found[1] : "WORKSPACE";
+  }
+  try {
+    return (await (await fetch("/state.json")).json()).workspace || "WORKSPACE";
+  } catch {
+    return "WORKSPACE";
+  }
+}
+
+function regionCommand(region, workspace) {
   const quoted = (word) => (/^[\w@%+=:,./-]+$/.test(word) ? word : `'${word.replaceAll("'", `'"'"'`)}'`);
-  const workspace = quoted(found ? found[1] : "WORKSPACE");
-  return `hineus run --workspace ${workspace} --set ${quoted("place.region=" + regionText(region))}`;
+  return `hineus run --workspace ${quoted(workspace)} --set ${quoted("place.region=" + regionText(region))}`;
 }
 
 /* Draws the region and lets the person edit it.
    given: as view3d.py packs it. cloud: positions of the sparse points in the view's frame, and for how many each stands.
-   Returns the lines, and `dim`, which makes a material fade outside the region while the lines are visible. */
-function addRegion({ given, cloud, scene, eye, canvas, paint, redraw }) {
+   home: puts the eye where it sees all, as `span` says.
+   Returns the lines; `dim`, which makes a material fade outside the region while the lines are visible; `span`; and
+   `start`, once the rest of the view is there. */
+function addRegion({ given, cloud, scene, eye, canvas, paint, redraw, home }) {
   const element = (id) => document.getElementById(id);
   const vector = (numbers) => new THREE.Vector3(...numbers);
   const viewFromWorld = new THREE.Matrix4().set(...given.view_from_world);
@@ -68,7 +80,7 @@ function addRegion({ given, cloud, scene, eye, canvas, paint, redraw }) {
         .replace("#include <opaque_fragment>", `#include <opaque_fragment>
           vec3 side = abs(inRegion);
           float away = regionForm == 1 ? length(side) : max(side.x, max(side.y, side.z));
-          if (regionForm > 0 && away > 1.0) gl_FragColor.rgb = mix(gl_FragColor.rgb, fade, 0.6);`); // prettier-ignore
+          if (regionForm > 0 && away > 1.0) gl_FragColor.rgb = mix(gl_FragColor.rgb, fade, 0.5);`); // prettier-ignore
     };
     return material;
   };
@@ -109,6 +121,7 @@ function addRegion({ given, cloud, scene, eye, canvas, paint, redraw }) {
     if (list(field) === "radius") region.radius = value;
     else region[list(field)][index(field)] = value;
   };
+  let workspace = "WORKSPACE";
   const sound = () => reach().every((side) => side > 0) && middle().every(Number.isFinite);
   const count = () => {
     const point = new THREE.Vector3();
@@ -131,7 +144,7 @@ function addRegion({ given, cloud, scene, eye, canvas, paint, redraw }) {
     element("region-count").textContent = fine
       ? count()
       : "The radius must be positive, and each upper end larger than its lower one.";
-    element("region-command").textContent = fine ? regionCommand(region, location) : "";
+    element("region-command").textContent = fine ? regionCommand(region, workspace) : "";
   };
   const fill = () => {
     const size = Math.max(...reach());
@@ -175,6 +188,7 @@ function addRegion({ given, cloud, scene, eye, canvas, paint, redraw }) {
     element("region-panel").hidden = !open;
     element("region-toggle").setAttribute("aria-expanded", String(open));
     handles.visible = open;
+    home();
     for (const layer of ["region", "points"]) {
       const box = document.querySelector(`[data-layer="${layer}"]`);
       if (open && !box.checked) box.click();
@@ -252,5 +266,23 @@ function addRegion({ given, cloud, scene, eye, canvas, paint, redraw }) {
       held = null;
     });
 
-  return { lines, dim, start: fill };
+  // How far from a point of the view there is something to see: the mesh's middle, while the region is edited.
+  const span = (from) => {
+    if (!handles.visible) return 0;
+    const point = new THREE.Vector3();
+    const distances = new Float32Array(cloud.positions.length / 3)
+      .map((_, i) => point.fromArray(cloud.positions, 3 * i).distanceTo(from))
+      .sort();
+    const corner = vector(middle()).add(vector(reach())).applyMatrix4(viewFromWorld);
+    const [center] = handlePlaces();
+    return Math.max(center.distanceTo(from) + corner.distanceTo(center), distances[Math.floor(0.8 * distances.length)] || 0);
+  };
+  const start = () => {
+    fill();
+    findWorkspace().then((found) => {
+      workspace = found;
+      tell();
+    });
+  };
+  return { lines, dim, span, start };
 }

@@ -41,7 +41,7 @@
   const eye = new THREE.PerspectiveCamera(40, 1);
   const sparse = data.points ? positions(data.points) : [];
   const cloud = { positions: sparse, each: data.points_each, total: data.points_total };
-  const region = addRegion({ given: data.region, cloud, scene, eye, canvas, paint, redraw });
+  const region = addRegion({ given: data.region, cloud, scene, eye, canvas, paint, redraw, home: () => home() });
   const geometry = new THREE.BufferGeometry();
   geometry.setAttribute("position", new THREE.BufferAttribute(positions(data), 3));
   geometry.setAttribute("uv", new THREE.BufferAttribute(new Uint16Array(bytes(data.uvs)), 2, true));
@@ -135,7 +135,7 @@
   const home = () => {
     const narrow = Math.max(1, canvas.clientHeight / Math.max(canvas.clientWidth, 1));
     controls.target.copy(middle);
-    eye.position.copy(start).multiplyScalar(radius * 2.6 * narrow).add(middle);
+    eye.position.copy(start).multiplyScalar(Math.max(radius, region.span(middle)) * 2.6 * narrow).add(middle);
     controls.update();
     redraw();
   };
