@@ -45,19 +45,17 @@ function addRegion({ given, cloud, scene, eye, canvas, paint, redraw, home }) {
   let region = copy(given);
   const middle = () => (region.form === "sphere" ? region.center : region.low.map((from, k) => (from + region.high[k]) / 2));
   const reach = () =>
-    region.form === "sphere" ? [0, 0, 0].fill(region.radius) : region.low.map((from, k) => (region.high[k] - from) / 2);
+    region.form === "sphere" ? Array(3).fill(region.radius) : region.low.map((from, k) => (region.high[k] - from) / 2);
 
   // ---------------------------------------------------------------- drawing
+  const turned = (point, k) => point.map((_, i) => point[(i - k + 3) % 3]); // its first coordinate along axis k
   const circle = (k) =>
     Array.from({ length: 128 }, (_, i) => {
       const angle = (Math.floor((i + 1) / 2) / 64) * 2 * Math.PI;
-      const point = [0, 0, 0];
-      [point[k], point[(k + 1) % 3]] = [Math.cos(angle), Math.sin(angle)];
-      return point;
+      return turned([Math.cos(angle), Math.sin(angle), 0], k);
     });
   const signs = [-1, 1];
-  const edges = (k) =>
-    signs.flatMap((a) => signs.flatMap((b) => signs.map((c) => [c, a, b].map((_, i) => [c, a, b][(i - k + 3) % 3]))));
+  const edges = (k) => signs.flatMap((a) => signs.flatMap((b) => signs.map((c) => turned([c, a, b], k))));
   const shape = (side) => new THREE.BufferAttribute(new Float32Array([0, 1, 2].flatMap(side).flat()), 3);
   const shapes = { sphere: shape(circle), box: shape(edges) };
   const lines = new THREE.LineSegments(
@@ -74,13 +72,13 @@ function addRegion({ given, cloud, scene, eye, canvas, paint, redraw, home }) {
       shader.vertexShader = shader.vertexShader
         .replace("void main() {", "uniform mat4 viewToRegion; varying vec3 inRegion;\nvoid main() {")
         .replace("#include <project_vertex>", `#include <project_vertex>
-          inRegion = (viewToRegion * vec4(transformed, 1.0)).xyz;`); // prettier-ignore
+          inRegion = (viewToRegion * vec4(transformed, 1.0)).xyz;`);
       shader.fragmentShader = shader.fragmentShader
         .replace("void main() {", "uniform int regionForm; uniform vec3 fade; varying vec3 inRegion;\nvoid main() {")
         .replace("#include <opaque_fragment>", `#include <opaque_fragment>
           vec3 side = abs(inRegion);
           float away = regionForm == 1 ? length(side) : max(side.x, max(side.y, side.z));
-          if (regionForm > 0 && away > 1.0) gl_FragColor.rgb = mix(gl_FragColor.rgb, fade, 0.5);`); // prettier-ignore
+          if (regionForm > 0 && away > 1.0) gl_FragColor.rgb = mix(gl_FragColor.rgb, fade, 0.5);`);
     };
     return material;
   };
