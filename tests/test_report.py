@@ -8,6 +8,7 @@ import xml.etree.ElementTree as ET
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -237,10 +238,15 @@ def test_the_view_gets_the_region_in_the_world_and_the_way_from_there(full):
 def test_points_that_a_small_region_leaves_out_are_drawn(full):
     random, scene = np.random.default_rng(1), full.read(artifacts.SCENE)
     points = np.concatenate([random.normal(size=(40, 3)), 20 + random.random((940, 3)), np.full((20, 3), 1e4)])
-    packed = pack_scene(replace(scene, points=points.astype(np.float32)), [caption()], (), pyramid())
+
+    def packed_times(count: int) -> dict[str, Any]:
+        many = np.tile(points, (count, 1)).astype(np.float32)
+        return pack_scene(replace(scene, points=many, point_errors=many[:, 0]), [caption()], (), pyramid())
+
+    packed = packed_times(1)
     drawn = decode(packed["points"]["positions"], "<u2", 3)
     assert (len(drawn), packed["points_each"], packed["points_total"]) == (980, 1, 1000)  # all but the stray ones
-    many = pack_scene(replace(scene, points=np.tile(points, (100, 1))), [caption()], (), pyramid())
+    many = packed_times(100)
     assert many["points_each"] == 3
     assert len(decode(many["points"]["positions"], "<u2", 3)) == pytest.approx(98_000 / 3, abs=1)
 
