@@ -48,10 +48,11 @@ class Watched:
         return self.report.is_file() and not self.workspace.in_use()
 
     def state(self) -> dict[str, Any]:
-        """What the live page asks for every other second."""
+        """What the live page asks for every other second, and the report once."""
         from stages.reporting.curves import training_charts
 
         return {
+            "workspace": str(self.workspace.root),
             "report": self.shows_report(),
             "running": self.workspace.in_use(),
             "stages": [

@@ -113,7 +113,7 @@ def run(context: StageContext[CleanupParams]) -> dict[str, Any]:
         logger.warning("mesh was to be closed, but %d edges are open", state.open_edges)
     context.write(CLEAN_MESH, (vertices, faces))
     if region is None:
-        numbers["cut_photos"] = _warn_of_cut(vertices, faces, scene)
+        numbers["warnings"] = _cut_warnings(vertices, faces, scene)
     return {
         **numbers,
         "faces": len(faces),
@@ -124,20 +124,18 @@ def run(context: StageContext[CleanupParams]) -> dict[str, Any]:
     }
 
 
-def _warn_of_cut(vertices: np.ndarray, faces: np.ndarray, scene: PosedScene) -> int:
-    """How many photos have in their middle what the border of the region cuts; says so where there are any."""
+def _cut_warnings(vertices: np.ndarray, faces: np.ndarray, scene: PosedScene) -> list[dict[str, str]]:
+    """For the report and the log: that the border of the region cuts what photos have in their middle, if it does."""
     from stages.surface.border import border_cut, region_without_cut
 
     cut = border_cut(vertices, faces, scene.cameras, scene.ground)
     if cut is None:
-        return 0
+        return []
     center, radius = region_without_cut(cut)
-    logger.warning(
-        "the region of interest cuts what %d photos have in their middle; for a larger one: "
-        "`--set undistort.roi_scale=%.2f`, or set it in the report's 3D view",
-        cut.photos, radius + np.linalg.norm(center),
-    )  # fmt: skip
-    return cut.photos
+    sentence = f"The region of interest cuts what {cut.photos} photos have in their middle."
+    command = f"hineus run --workspace WORKSPACE --set undistort.roi_scale={radius + np.linalg.norm(center):.2f}"
+    logger.warning("%s A larger one: `%s`, or set it in the report's 3D view.", sentence, command)
+    return [{"sentence": sentence, "command": command}]
 
 
 def _crop(

@@ -39,7 +39,7 @@ from stages.drawing.overview import overview_svg
 from stages.engine.stage import Stage, StageContext
 from stages.errors import HineusError
 from stages.geometry.cameras import PosedScene
-from stages.geometry.place import GivenRegion
+from stages.geometry.place import GivenRegion, Place
 
 T = TypeVar("T")
 
@@ -79,12 +79,13 @@ def run(context: StageContext[ReportParams]) -> dict[str, Any]:
     )
     context.progress(3, steps, "packing the 3D view")
     captions = photo_table.camera_captions(results, scene.cameras.names)
-    page |= describe_view(scene, context.read(GIVEN_REGION), atlas, texture, left(context, QUALITY), captions)
+    page |= describe_view(scene, place, context.read(GIVEN_REGION), atlas, texture, left(context, QUALITY), captions)
     context.progress(4, steps, "writing the page")
     placed = {name: manifests[name].numbers for name in ("undistort", "place") if name in manifests}
     page |= {
         "numbers": numbers.headline(scene, atlas, manifests, page["held_out"]),
         "overview": overview_svg(scene, region_corners(scene, context.read(GIVEN_REGION))),
+        "warnings": numbers.warnings(manifests),
         "where": numbers.describe_where(scene, place, placed),
         "charts": curves.training_charts(context.read(METRICS)),
         "previews": pictures.training_previews(context.read(PREVIEWS)),
@@ -121,6 +122,7 @@ def left(context: StageContext[ReportParams], artifact: Artifact[T]) -> T | None
 
 def describe_view(
     scene: PosedScene,
+    place: Place,
     region: GivenRegion | None,
     atlas: AtlasMesh,
     texture: np.ndarray,
@@ -132,18 +134,20 @@ def describe_view(
     from stages.reporting.next_views import suggest_views, vertex_needs
 
     advice = quality and suggest_views(atlas.vertices, atlas.normals, atlas.faces, vertex_needs(quality), scene)
-    page: dict[str, Any] = {"advice": advice}
-    if len(atlas.faces) > view3d.MAX_FACES:
-        most = f"{view3d.MAX_FACES:,} faces; this model has {len(atlas.faces):,}"
-        return page | {"viewer_missing": f"The interactive view holds at most {most}."}
-    page["overlays"] = view3d.pack_overlays(quality) if quality else []
-    page["viewer"] = {
-        **view3d.pack_mesh(atlas, texture, scene.up),
-        **view3d.pack_scene(scene, captions, advice.views if advice else (), atlas, region_corners(scene, region)),
-        "overlays": page["overlays"],
+    shown, quality = view3d.light_enough(atlas, quality)
+    overlays = view3d.pack_overlays(quality) if quality else []
+    return {
+        "advice": advice,
+        "faces_shown": len(shown.faces) if shown is not atlas else None,
+        "overlays": overlays,
+        "viewer": {
+            **view3d.pack_mesh(shown, texture, scene.up),
+            **view3d.pack_scene(scene, captions, advice.views if advice else (), shown),
+            "region": view3d.pack_region(scene, place, region),
+            "overlays": overlays,
+        },
+        "three": THREE.read_text(encoding="utf-8"),
     }
-    page["three"] = THREE.read_text(encoding="utf-8")
-    return page
 
 
 def region_corners(scene: PosedScene, region: GivenRegion | None) -> np.ndarray | None:

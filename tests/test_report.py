@@ -8,23 +8,30 @@ import xml.etree.ElementTree as ET
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from globe import globe
 from report_inputs import BOX, UP, bare_inputs, full_inputs, manifest, page, pyramid, quality
 
 from configs.load import load_config
 from configs.params import ReportParams
 from stages import artifacts
+from stages.artifacts import VertexQuality
 from stages.drawing.overview import overview_svg
 from stages.engine.stage import StageContext
 from stages.engine.workspace import Record
+from stages.geometry.normalisation import rotation_onto
+from stages.geometry.place import Place, given_region
+from stages.geometry.similarity import Similarity
 from stages.geometry.up import y_up_rotation
 from stages.report import THREE, region_corners
+from stages.reporting import view3d
 from stages.reporting.curves import line_chart
 from stages.reporting.numbers import duration
 from stages.reporting.pictures import draw_stills
-from stages.reporting.view3d import NO_VALUE, pack_mesh, pack_overlays, pack_scene, region_lines
+from stages.reporting.view3d import NO_VALUE, light_enough, pack_mesh, pack_overlays, pack_region, pack_scene
 
 ROOT = Path(__file__).parents[1]
 
@@ -193,10 +200,13 @@ def test_measures_are_packed_between_their_ends_and_unknown_ones_marked():
     assert values["invented"] == [254, 254, 254, 254, 0]
 
 
+def caption() -> dict[str, object]:
+    return {"name": "a.jpg", "held_out": True, "error": 0.5, "points": 7}
+
+
 def test_drawn_cameras_look_where_the_photos_look(full):
     scene = artifacts.SCENE.load(full.inputs["train"])
-    caption = {"name": "a.jpg", "held_out": True, "error": 0.5, "points": 7}
-    packed = pack_scene(scene, [caption], (), pyramid())
+    packed = pack_scene(scene, [caption()], (), pyramid())
     camera = packed["cameras"][0]
     assert camera["name"] == "a.jpg"
     turn = y_up_rotation(UP)
@@ -210,12 +220,60 @@ def test_drawn_cameras_look_where_the_photos_look(full):
     np.testing.assert_allclose(ground[:, 1], -0.2, atol=1e-4)
 
 
-def test_the_region_is_its_box_or_the_unit_sphere(full):
-    edges = region_lines(full.read(artifacts.GIVEN_REGION).box_corners())
-    assert edges.shape == (24, 3)
-    np.testing.assert_allclose([edges.min(0), edges.max(0)], BOX)
-    assert set(np.count_nonzero(edges[::2] != edges[1::2], axis=1)) == {1}
-    np.testing.assert_allclose(np.linalg.norm(region_lines(None), axis=1), 1)
+def test_the_view_gets_the_region_in_the_world_and_the_way_from_there(full):
+    poses = Similarity(2.0, rotation_onto(np.array([0.0, 0, 1]), np.array([0.6, 0, 0.8])), np.array([3.0, -4, 7]))
+    world = Similarity(0.5, rotation_onto(np.array([1.0, 0, 0]), np.array([0, 0.8, -0.6])), np.array([31.0, 2, 5]))
+    scene, place = replace(full.read(artifacts.SCENE), poses_from_scene=poses), Place(world, metric=True)
+    sphere = pack_region(scene, place, None)
+    assert (sphere["form"], sphere["radius"], sphere["units"]) == ("sphere", 1.0, "metres")
+    np.testing.assert_allclose(sphere["center"], world.apply(poses.translation))
+    np.testing.assert_allclose(np.subtract(sphere["high"], sphere["low"]), 2)
+    view_from_world = np.array(sphere["view_from_world"]).reshape(4, 4)
+    in_scene = np.array([0.1, -0.2, 0.7])
+    np.testing.assert_allclose(
+        (view_from_world @ [*world.apply(poses.apply(in_scene)), 1])[:3], y_up_rotation(UP) @ in_scene, atol=1e-9
+    )
+    box = pack_region(scene, place, given_region("box", BOX.ravel().tolist(), world))
+    assert box["form"] == "box"
+    np.testing.assert_array_equal([box["low"], box["high"]], BOX)
+
+
+def test_points_that_a_small_region_leaves_out_are_drawn(full):
+    random, scene = np.random.default_rng(1), full.read(artifacts.SCENE)
+    points = np.concatenate([random.normal(size=(40, 3)), 20 + random.random((940, 3)), np.full((20, 3), 1e4)])
+
+    def packed_times(count: int) -> dict[str, Any]:
+        many = np.tile(points, (count, 1)).astype(np.float32)
+        return pack_scene(replace(scene, points=many, point_errors=many[:, 0]), [caption()], (), pyramid())
+
+    packed = packed_times(1)
+    drawn = decode(packed["points"]["positions"], "<u2", 3)
+    assert (len(drawn), packed["points_each"], packed["points_total"]) == (980, 1, 1000)  # all but the stray ones
+    many = packed_times(100)
+    assert many["points_each"] == 3
+    assert len(decode(many["points"]["positions"], "<u2", 3)) == pytest.approx(98_000 / 3, abs=1)
+
+
+def test_a_mesh_too_heavy_for_the_page_is_decimated_with_its_measures(monkeypatch):
+    monkeypatch.setattr(view3d, "MAX_FACES", 2000)
+    atlas = globe()
+    assert len(atlas.faces) > 4000
+    high = (atlas.vertices[:, 2] > 0).astype(float)
+    ones = np.ones(len(high))
+    light, measured = light_enough(atlas, VertexQuality(ones.astype(np.uint16), ones, ones, ones, ones, high))
+    assert 1500 < len(light.faces) <= 2000
+    assert np.abs(np.linalg.norm(light.vertices, axis=1) - 0.5).max() < 0.02
+    clear = np.abs(light.vertices[:, 2]) > 0.05
+    np.testing.assert_array_equal(measured.invented[clear], light.vertices[clear, 2] > 0)
+    assert light_enough(light, measured) == (light, measured)
+
+
+def test_warnings_of_stages_are_on_top_of_the_page(full):
+    sentence, command = "The region's border cuts the <mesh>.", "hineus run --workspace WS --set place.region=auto"
+    warned = manifest("cleanup", warnings=[{"sentence": sentence, "command": command}])
+    html = page(replace(full, manifests={**full.manifests, "cleanup": warned}))
+    assert f"<p>The region&#39;s border cuts the &lt;mesh&gt;.</p><pre>{command}</pre>" in html.split("<h2>")[0]
+    assert 'class="warning"' not in page(full)
 
 
 def test_the_page_says_how_to_run_it_again(full):

@@ -2,17 +2,26 @@
 
 from __future__ import annotations
 
+import html
 import re
+import shlex
 import shutil
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from report_inputs import bare_inputs, full_inputs, page
+from report_inputs import BOX, bare_inputs, full_inputs, page
 
+from configs.texts import read_region
+from hineus_cli.viewing import serving, watch
 from stages import artifacts
 from stages.engine.stage import StageContext
+from stages.engine.workspace import Workspace
+from stages.geometry.normalisation import rotation_onto
+from stages.geometry.place import GivenRegion, Place, given_region
+from stages.geometry.similarity import Similarity
 
 BROWSER = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(BROWSER is None, reason="needs Chromium")]
@@ -91,3 +100,143 @@ def test_without_webgl_the_page_says_so_and_keeps_its_pictures(full):
     assert re.search(r'<p class="soft" id="view-missing">', html)
     assert re.search(r'<div id="view" hidden="">', html)
     assert html.count('alt="The model, view ') == 8
+
+
+def tilted(context: StageContext) -> StageContext:
+    """The same capture, far from its poses' origin, in a world that is turned, of another scale, and far away."""
+    axes = np.eye(3)
+    poses = Similarity(2.3, rotation_onto(axes[2], np.array([0.6, 0, 0.8])), np.array([30.0, -4, 7]))
+    world = Similarity(0.031, rotation_onto(axes[0], np.array([0, 0.8, -0.6])), np.array([310.0, 20, -5]))
+    scene = artifacts.SCENE.load(context.inputs["train"])
+    artifacts.SCENE.save(context.inputs["train"], replace(scene, poses_from_scene=poses))
+    artifacts.WORLD_PLACE.save(context.inputs["place"], Place(world, True, "markers", 0.01))
+    artifacts.GIVEN_REGION.save(context.inputs["place"], None)
+    return context
+
+
+def after_a_while(script: str) -> str:
+    """The end of a page that runs a script once the view is there."""
+    return f"<script>setTimeout(() => {{ {script} }}, 2000);</script></body>"
+
+
+def edited(context: StageContext, script: str = "") -> tuple[GivenRegion, str]:
+    """The region that the page's command would give, and what it says of the sparse points, after a script."""
+    report = artifacts.PAGE.load(context.out)
+    report.write_text(page(context).replace("</body>", after_a_while(script)))
+    dom = browse(context.scratch, f"{report.as_uri()}#edit=region", "--dump-dom").stdout
+    *words, setting = command_in(dom)
+    assert words == ["hineus", "run", "--workspace", "WORKSPACE", "--set"]
+    key, _, text = setting.partition("=")
+    assert key == "place.region"
+    world_from_poses = artifacts.WORLD_PLACE.load(context.inputs["place"]).world_from_poses
+    return given_region(*read_region(text), world_from_poses), re.search(r'id="region-count">(.*?)</p>', dom)[1]
+
+
+def command_in(dom: str) -> list[str]:
+    """The words of the page's command, as a shell reads them."""
+    return shlex.split(html.unescape(re.search(r'<pre id="region-command">(.*?)</pre>', dom)[1]))
+
+
+def says(context: StageContext, region: GivenRegion) -> str:
+    """What the page should say of the sparse points inside a region."""
+    scene = artifacts.SCENE.load(context.inputs["train"])
+    points = scene.poses_from_scene.apply(scene.points)
+    inside = np.linalg.norm(points - region.center, axis=1) < region.radius
+    if region.box is not None:
+        world = region.world_from_poses.apply(points)
+        inside = ((world > region.box[0]) & (world < region.box[1])).all(1)
+    return f"{inside.sum()} of 300 sparse points are inside ({100 * inside.mean():.1f} %)."
+
+
+def test_the_command_of_an_unchanged_region_gives_the_same_sphere(full):
+    region, count = edited(tilted(full))
+    poses_from_scene = artifacts.SCENE.load(full.inputs["train"]).poses_from_scene
+    assert region.box is None
+    assert abs(region.radius - poses_from_scene.scale) < 1e-4 * poses_from_scene.scale
+    assert np.linalg.norm(region.center - poses_from_scene.translation) < 1e-4 * poses_from_scene.scale
+    assert count == says(full, region)
+
+
+def test_the_command_of_an_unchanged_box_gives_the_same_box(full):
+    region, count = edited(full)
+    np.testing.assert_allclose(region.box, BOX, atol=1e-5)
+    assert count == says(full, region)
+
+
+def test_the_command_names_the_workspace_from_its_file_and_from_view(full, tmp_path):
+    workspace = Workspace.open(tmp_path / "it's one", create=True)
+    with workspace.lock():
+        workspace.remember({"photos": None}, "cpu", {})
+    report = artifacts.PAGE.load(workspace.stage_folder("report"))
+    report.parent.mkdir()
+    report.write_text(page(full))
+    with serving(watch(workspace.root, ())) as url:
+        for address in (report.as_uri(), url):
+            dom = browse(full.scratch, address, "--dump-dom").stdout
+            assert command_in(dom)[:4] == ["hineus", "run", "--workspace", str(workspace.root)]
+
+
+TYPE = """
+  const type = (what, value) => {
+    const field = document.querySelector(what);
+    field.value = value;
+    field.dispatchEvent(new Event(what === "#region-form" ? "change" : "input"));
+  };
+"""
+
+
+def test_a_typed_region_is_that_of_the_command(full):
+    typed = """type('[data-region="center"][data-axis="1"]', 20.5); type('[data-region="radius"]', 0.05);"""
+    region, count = edited(tilted(full), TYPE + typed)
+    assert region.radius == pytest.approx(0.05 / 0.031)
+    assert region.world_from_poses.apply(region.center)[1] == pytest.approx(20.5)
+    assert count == says(full, region)
+
+
+def test_a_box_comes_to_where_the_sphere_is(full):
+    before, _ = edited(tilted(full))
+    after, count = edited(full, TYPE + """type("#region-form", "box");""")
+    np.testing.assert_allclose(after.center, before.center, atol=1e-4)
+    np.testing.assert_allclose(np.ptp(after.box, axis=0), 2 * 2.3 * 0.031, rtol=1e-4)
+    assert count == says(full, after)
+
+
+# Moves over the view until the pointer says that it is on a handle of the region, and drags that one.
+DRAG = """
+  const canvas = document.getElementById("viewer");
+  canvas.setPointerCapture = () => {};
+  const box = canvas.getBoundingClientRect();
+  const send = (kind, x, y, buttons) =>
+    canvas.dispatchEvent(new PointerEvent(kind, { clientX: x, clientY: y, buttons, button: 0, bubbles: true }));
+  const handles = [];
+  for (let y = box.top; y < box.bottom; y += 7)
+    for (let x = box.left; x < box.right; x += 7) {
+      send("pointermove", x, y, 0);
+      if (canvas.style.cursor === "move") handles.push([x, y]);
+    }
+  const [x, y] = handles[0];
+  send("pointerdown", x, y, 1);
+  send("pointermove", x - 3, y - 60, 1);
+  send("pointerup", x - 3, y - 60, 0);
+"""
+
+
+def test_a_handle_moves_one_face_of_the_box(full):
+    region, count = edited(full, DRAG)
+    moved = np.abs(region.box - BOX)
+    assert np.count_nonzero(moved > 1e-3) == 1
+    assert region.box[1, 2] > BOX[1, 2] + 0.05  # the uppermost handle is that of the upper face
+    assert count == says(full, region)
+
+
+def test_what_lies_outside_the_region_fades(full):
+    report = artifacts.PAGE.load(full.out)
+    html = page(full)
+    pure = []
+    for top in ("0.9", "-0.15"):  # above the mesh, and below it
+        script = TYPE + f"""type('[data-region="high"][data-axis="2"]', {top});"""
+        report.write_text(html.replace("</body>", after_a_while(script)))
+        red, green, blue = screenshot(full.scratch, f"{report.as_uri()}#edit=region").transpose(2, 0, 1)
+        pure.append(((blue > 180) & (green < 110) & (red < 90)).sum())
+    assert pure[0] > 1000
+    assert pure[1] < 0.01 * pure[0]

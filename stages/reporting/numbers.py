@@ -45,6 +45,14 @@ def headline(
     return [{"label": label, "value": value} for label, value in numbers]
 
 
+def warnings(manifests: Mapping[str, Manifest]) -> list[dict[str, str]]:
+    """What stages found wrong with the result: a "sentence" each and, where there is one, the "command" to try.
+
+    They return them as "warnings" among their numbers.
+    """
+    return [warning for manifest in manifests.values() for warning in manifest.numbers.get("warnings", ())]
+
+
 def describe_where(scene: PosedScene, place: Place, numbers: Mapping[str, Mapping[str, Any]]) -> list[str]:
     """Sentences on the region of interest, the ground, up, the scale and the place.
 

@@ -15,25 +15,42 @@ from stages.artifacts import AtlasMesh, VertexQuality
 from stages.drawing.rendering import look_at
 from stages.geometry.cameras import PinholeCameras, PosedScene
 from stages.geometry.normalisation import perpendicular
-from stages.geometry.place import BOX_EDGES
+from stages.geometry.place import GivenRegion, Place
+from stages.geometry.similarity import Similarity
 from stages.geometry.up import y_up_rotation
 from stages.reporting.next_views import NextView
 from stages.reporting.pictures import jpeg_uri, shrink
 
-# Meshes with more faces than this would make the page too heavy: it then has pictures only.
+# Meshes with more faces than this would make the page too heavy: they are decimated to so many.
 MAX_FACES = 400_000
 TEXTURE_SIDE = 2048
-MAX_POINTS = 20_000
+MAX_POINTS = 40_000
 # Measures are packed as 0..254; this says that a vertex has none.
 NO_VALUE = 255
-# Sparse points beyond this many radii of the region are left out.
-POINTS_REACH = 4.0
+# All sparse points within this many radii of the region are drawn, and of all together the nearest, but for this share:
+# what a small region leaves out is to be seen, and a stray point far away would coarsen the packed positions.
+POINTS_REACH, STRAY = 4.0, 0.02
 # The image plane of a drawn camera is this part of the cameras' median distance away, and less than this many radii.
 FRUSTUM, MAX_FRUSTUM = 0.05, 0.12
 # A camera that is only suggested: its size, and the angle it sees from top to bottom.
 NEXT_SIZE, NEXT_FOV_DEG = (3, 2), 2 * np.degrees(np.arctan(0.4))
 # The grid on the ground: squares a side, and how far it reaches from the mesh's middle, scene units.
 GRID_CELLS, GRID_REACH = 12, 1.2
+
+
+def light_enough(atlas: AtlasMesh, quality: VertexQuality | None) -> tuple[AtlasMesh, VertexQuality | None]:
+    """The mesh, or one of at most about `MAX_FACES` faces with the measures of the nearest vertices."""
+    from scipy.spatial import cKDTree
+
+    from stages.surface.levels_of_detail import lightened
+
+    if len(atlas.faces) <= MAX_FACES:
+        return atlas, quality
+    light = lightened(atlas, MAX_FACES)
+    if quality is not None:
+        nearest = cKDTree(atlas.vertices).query(light.vertices)[1]
+        quality = VertexQuality(**{name: values[nearest] for name, values in vars(quality).items()})
+    return light, quality
 
 
 def pack_mesh(atlas: AtlasMesh, texture: np.ndarray, up: np.ndarray) -> dict[str, Any]:
@@ -72,19 +89,15 @@ def pack_scene(
     captions: Sequence[dict[str, Any]],
     next_views: Sequence[NextView],
     atlas: AtlasMesh,
-    box_corners: np.ndarray | None = None,
 ) -> dict[str, Any]:
-    """Cameras and suggested ones as pyramids, sparse points, a grid on the ground, the region's outline.
+    """Cameras and suggested ones as pyramids, sparse points, a grid on the ground.
 
     Args:
         captions: for each camera of the scene what the view says of it: "name", "held_out", "error", "points".
-        box_corners: see `region_lines`.
     """
     turn, cameras = y_up_rotation(scene.up), scene.cameras
     distance = float(np.median(np.linalg.norm(cameras.centers, axis=1))) if len(cameras) else 1.0
     depth = min(FRUSTUM * distance, MAX_FRUSTUM)
-    points = scene.points[np.linalg.norm(scene.points, axis=1) < POINTS_REACH]
-    thinned = points[:: max(1, -(-len(points) // MAX_POINTS))]
     shapes = [look_at(view.position, view.target, scene.up, *NEXT_SIZE, NEXT_FOV_DEG) for view in next_views]
     return {
         "cameras": [
@@ -99,20 +112,48 @@ def pack_scene(
             }
             for view, shape in zip(next_views, shapes, strict=True)
         ],
-        "points": _pack_positions(thinned @ turn.T) if len(thinned) else None,
+        **_pack_points(scene.points, turn),
         "ground": _plain(_ground_grid(scene, atlas) @ turn.T) if scene.ground is not None else None,
-        "region": _plain(region_lines(box_corners) @ turn.T),
     }
 
 
-def region_lines(box_corners: np.ndarray | None) -> np.ndarray:
-    """Line segments [2 L, 3]: the box of these corners [8, 3], or three great circles of the unit sphere."""
-    if box_corners is not None:
-        return box_corners[np.array(BOX_EDGES).ravel()]
-    angles = np.linspace(0, 2 * np.pi, 65)
-    circle = np.stack([np.cos(angles), np.sin(angles), np.zeros(65)], 1)
-    segments = np.stack([circle[:-1], circle[1:]], 1).reshape(-1, 3)
-    return np.concatenate([np.roll(segments, axis, axis=1) for axis in range(3)])
+def pack_region(scene: PosedScene, place: Place, given: GivenRegion | None) -> dict[str, Any]:
+    """The region in world coordinates, and the way from there into the view.
+
+    The form is that of the given region, else the scene's sphere. The other form is there too, to change to: the sphere
+    about a box, as training has it, or the box about the sphere.
+
+    Returns:
+        "form": "sphere" or "box"; "center", "radius", "low", "high": world units; "units": their name;
+        "view_from_world": [16] row by row.
+    """
+    world_from_scene = scene.world_from_scene(place)
+    center, radius = world_from_scene.translation, world_from_scene.scale
+    box = None if given is None else given.box
+    low, high = (center - radius, center + radius) if box is None else box
+    view_from_scene = Similarity(1.0, y_up_rotation(scene.up), np.zeros(3))
+    return {
+        "form": "sphere" if box is None else "box",
+        "center": center.tolist(),
+        "radius": radius,
+        "low": low.tolist(),
+        "high": high.tolist(),
+        "units": place.units,
+        "view_from_world": view_from_scene.compose(world_from_scene.inverse()).matrix().ravel().tolist(),
+    }
+
+
+def _pack_points(points: np.ndarray, turn: np.ndarray) -> dict[str, Any]:
+    """Sparse points [P, 3], every n-th where they are many, their number in all, and n."""
+    distances = np.linalg.norm(points, axis=1)
+    near = points[distances <= max(POINTS_REACH, np.quantile(distances, 1 - STRAY))] if len(points) else points
+    each = max(1, -(-len(near) // MAX_POINTS))
+    thinned = near[::each]
+    return {
+        "points": _pack_positions(thinned @ turn.T) if len(thinned) else None,
+        "points_each": each,
+        "points_total": len(points),
+    }
 
 
 def _ground_grid(scene: PosedScene, atlas: AtlasMesh) -> np.ndarray:

@@ -31,6 +31,11 @@ def levels_of_detail(atlas: AtlasMesh, count: int) -> Iterator[AtlasMesh]:
         yield _split(*light, atlas)
 
 
+def lightened(atlas: AtlasMesh, faces: int) -> AtlasMesh:
+    """A level of detail of about so many faces, >= 4 and fewer than `atlas` has."""
+    return _split(*next(decimate_textured(atlas.vertices, atlas.faces, atlas.uvs, [faces])), atlas)
+
+
 def _split(vertices: np.ndarray, faces: np.ndarray, corner_uvs: np.ndarray, atlas: AtlasMesh) -> AtlasMesh:
     """An atlas mesh of UVs [3F, 2] for the corners of faces [F, 3]: a vertex for each position and UV."""
     vertices, corner_uvs = vertices.astype(np.float32), np.clip(corner_uvs, 0, 1).astype(np.float32)

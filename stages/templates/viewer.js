@@ -22,6 +22,8 @@
   renderer.setPixelRatio(Math.min(window.devicePixelRatio || 1, 2));
   element("view-controls").hidden = false;
 
+  let waiting = true; // until the texture is there
+
   // ---------------------------------------------------------------- unpacking
   const bytes = (text) => Uint8Array.from(atob(text), (c) => c.charCodeAt(0)).buffer;
   const positions = (packed) => {
@@ -36,6 +38,10 @@
 
   // ---------------------------------------------------------------- the mesh and its measures
   const scene = new THREE.Scene();
+  const eye = new THREE.PerspectiveCamera(40, 1);
+  const sparse = data.points ? positions(data.points) : [];
+  const cloud = { positions: sparse, each: data.points_each, total: data.points_total };
+  const region = addRegion({ given: data.region, cloud, scene, eye, canvas, paint, redraw, home: () => home() });
   const geometry = new THREE.BufferGeometry();
   geometry.setAttribute("position", new THREE.BufferAttribute(positions(data), 3));
   geometry.setAttribute("uv", new THREE.BufferAttribute(new Uint16Array(bytes(data.uvs)), 2, true));
@@ -56,6 +62,7 @@
     shape: new THREE.MeshLambertMaterial({ color: "#c8c8c8", side }),
     measure: new THREE.MeshLambertMaterial({ vertexColors: true, side }),
   };
+  Object.values(materials).forEach(region.dim);
   const mesh = new THREE.Mesh(geometry, materials.texture);
   scene.add(mesh);
 
@@ -96,16 +103,14 @@
     cameras: lines(used.flatMap(pyramid), paint("--camera")),
     held: lines(data.cameras.filter((camera) => camera.held_out).flatMap(pyramid), paint("--held")),
     next: lines(data.next.flatMap(pyramid), paint("--next")),
-    region: lines(data.region, paint("--region")),
+    region: region.lines,
     ground: lines(data.ground || [], paint("--ground")),
-    points: new THREE.Points(),
+    points: new THREE.Points(
+      new THREE.BufferGeometry(),
+      region.dim(new THREE.PointsMaterial({ color: paint("--point"), size: 2, sizeAttenuation: false })),
+    ),
   };
-  if (data.points) {
-    const cloud = new THREE.BufferGeometry();
-    cloud.setAttribute("position", new THREE.BufferAttribute(positions(data.points), 3));
-    const material = new THREE.PointsMaterial({ color: paint("--point"), size: 2, sizeAttenuation: false });
-    layers.points = new THREE.Points(cloud, material);
-  }
+  layers.points.geometry.setAttribute("position", new THREE.BufferAttribute(new Float32Array(sparse), 3));
   scene.add(...Object.values(layers));
   const chosen = lines(new Array(48).fill(0), paint("--ink"));
   chosen.visible = false;
@@ -115,7 +120,7 @@
   // ---------------------------------------------------------------- the eye
   const middle = new THREE.Vector3(...data.low.map((v, i) => v + data.size[i] / 2));
   const radius = Math.hypot(...data.size) / 2 || 1;
-  const eye = new THREE.PerspectiveCamera(40, 1, radius * 0.01, radius * 100);
+  [eye.near, eye.far] = [radius * 0.01, radius * 100];
   const lamp = new THREE.DirectionalLight("#fff", 0.65 * Math.PI);
   eye.add(lamp);
   scene.add(eye, new THREE.AmbientLight("#fff", 0.35 * Math.PI));
@@ -130,12 +135,11 @@
   const home = () => {
     const narrow = Math.max(1, canvas.clientHeight / Math.max(canvas.clientWidth, 1));
     controls.target.copy(middle);
-    eye.position.copy(start).multiplyScalar(radius * 2.6 * narrow).add(middle);
+    eye.position.copy(start).multiplyScalar(Math.max(radius, region.span(middle)) * 2.6 * narrow).add(middle);
     controls.update();
     redraw();
   };
 
-  let waiting = true; // until the texture is there
   function redraw() {
     if (!waiting) requestAnimationFrame(draw);
     waiting = true;
@@ -253,8 +257,10 @@
 
   fit();
   home();
-  // report.html#show=seen&pick=camera-3 opens with that surface and that camera
+  region.start();
+  // report.html#show=seen&pick=camera-3 opens with that surface and that camera, #edit=region with the region's numbers
   const asked = new URLSearchParams(location.hash.slice(1));
+  if (asked.get("edit") === "region") element("region-toggle").click();
   show(asked.get("show") || "texture");
   choose(asked.get("pick") || "");
   const image = new Image();
