@@ -6,14 +6,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from benchmarks import regions
-from benchmarks.captures import kinds
+from benchmarks.captures import kinds, photos
 from benchmarks.captures.model import Capture
 from benchmarks.captures.shapes import block, flat, lump, sheet
 from benchmarks.captures.subject import enclosing_sphere, fit, seen_points
 from benchmarks.captures.tracks import FALSE_SHARE, MAX_ERROR_PX, simulate
 from benchmarks.captures.walks import orbit, shot
+from stages.evaluation.protocols.known_object import load_known_object
 
 BALL = (lump((0, 0, 1), (1, 1, 1), 0.8),)
 
@@ -132,3 +134,24 @@ def test_results_survive_their_file(tmp_path, monkeypatch):
     regions.save_rows(rows, "now")
     assert regions.load_rows("now") == rows
     assert regions.load_rows("older") == {}
+
+
+# ---------------------------------------------------------------- photos
+@pytest.mark.slow
+def test_rendered_photos_show_the_subject_where_the_stated_cameras_have_it(tmp_path, monkeypatch):
+    """A plain white ball on a black floor: its middle is bright, the photo's corner below is not."""
+    pytest.importorskip("mitsuba")
+    monkeypatch.setattr(photos, "LONG_SIDE", 64)
+    ball, floor = (
+        (lump((0, 0, 1), (1, 1, 1), 0.0, (0.9, 0.9, 0.9)),),
+        (flat((0, 0, 0), 40, 40, 0.0, (0.02, 0.02, 0.02)),),
+    )
+    shots = orbit((0, 0, 1), 3.0, (2.5,), np.random.default_rng(2), count=3)
+    photos.render(Capture(ball, floor, shots), "ball", tmp_path)
+    known = load_known_object(tmp_path)
+    np.testing.assert_allclose(known.cameras.extrinsics, shots[:, :3], atol=1e-6)
+    assert known.vertices[:, 2].min() == pytest.approx(0.5, abs=0.01)
+    for i in range(3):
+        pixels = np.asarray(Image.open(tmp_path / "images" / f"{i:03d}.jpg")).mean(2)
+        column, row = known.cameras.project(i, np.array([[0, 0, 1.0]]))[0][0].astype(int)
+        assert pixels[row, column] > 3 * pixels[-4:, :4].mean()
