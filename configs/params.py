@@ -23,10 +23,11 @@ class IngestParams(Section):
     video_frames: int = Field(
         80, ge=2, description="at most this many frames of a video become photos: spread by motion, the sharpest ones"
     )
-    auto_mask: Literal["off", "plain"] = Field(
+    auto_mask: Literal["off", "plain", "salient"] = Field(
         "off",
-        description="plain: photos without a mask get one from their plain background (black cloth, white sweep, "
-        "chroma key); an error where it is not plain",
+        description="masks of photos without one. plain: from their plain background (black cloth, white sweep, chroma "
+        "key), an error where it is not plain; salient: what a network takes for the subject, used where the photos "
+        "agree on it to cut the mesh and find the region; needs `pip install 'hineus[masks]'`",
     )
     leave_out: tuple[str, ...] = Field(
         (), description="photos that no stage sees, as names or patterns (test_*.jpg) relative to the photo folder"

@@ -16,4 +16,4 @@ from stages.artifacts.place import GIVEN_REGION, WORLD_PLACE
 from stages.artifacts.report import PAGE
 from stages.artifacts.sfm import GIVEN_POSES, MODEL, REGISTRATION, GivenPoses, KnownSphere, Registration, Unregistered
 from stages.artifacts.train import FIELD, HELD_OUT, METRICS, PREVIEWS, checkpoint_path, preview_path
-from stages.artifacts.undistort import CAMERAS, OVERVIEW, PINHOLE_PHOTOS, SCENE
+from stages.artifacts.undistort import CAMERAS, OVERVIEW, PINHOLE_PHOTOS, SCENE, SILHOUETTES

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from stages.artifacts.artifact import Artifact, place_artifact
+from stages.artifacts.artifact import Artifact, in_folder, place_artifact
 from stages.artifacts.json_files import Array, Record, read_record, write_record
-from stages.artifacts.pictures import pictures_of
+from stages.artifacts.pictures import Pictures, pictures_of
 from stages.artifacts.place import SimilarityRecord
 from stages.geometry.cameras import PinholeCameras, PosedScene
 from stages.geometry.plane import Plane
@@ -90,6 +90,9 @@ def _load_scene(folder: Path) -> PosedScene:
 
 
 PINHOLE_PHOTOS = pictures_of("undistort")
+# Masks that were guessed and agree with each other. They say where the subject ends, not that nothing is beside it:
+# training sees the whole photos.
+SILHOUETTES = in_folder("undistort", ("silhouettes/*",), lambda folder: Pictures(folder, "silhouettes"), optional=True)
 CAMERAS = Artifact("undistort", (_CAMERAS,), _load_cameras, _save_cameras)
 SCENE = Artifact("undistort", (_CAMERAS, _SCENE, _POINTS), _load_scene, _save_scene)
 # Drawing of cameras, sparse points and the region of interest.
