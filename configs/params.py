@@ -153,7 +153,11 @@ class CleanupParams(Section):
         6, ge=0, description="masks grow by this many pixels before faces outside them are dropped"
     )
     mask_outside: float = Field(
-        0.15, ge=0, le=1, description="a face is outside if it lies off the mask in more than this part of the photos"
+        0.15,
+        ge=0,
+        le=1,
+        description="a face is outside if it lies off the mask in more than this part of the photos; at least 0.3 "
+        "where masks were guessed (`ingest.auto_mask=salient`)",
     )
 
 

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 from PIL import Image
+from typer.testing import CliRunner
 
 from configs.params import IngestParams
+from hineus_cli.app import app
 from stages import artifacts
 from stages.capture import salient
 from stages.engine.stage import StageContext
@@ -94,9 +97,23 @@ def test_the_package_is_not_run_to_find_its_file(tmp_path: Path, monkeypatch):
     assert salient.find_weights() == package / salient.WEIGHTS
 
 
-def test_plain_masks_say_so_too(tmp_path: Path):
-    photos = tmp_path / "photos"
-    assert IngestParams().auto_mask == "off"
+def test_no_mask_is_made_unless_asked(tmp_path: Path):
     image_set, _ = ingest(tmp_path)
-    assert photos.exists()
-    assert {record.made_mask for record in image_set.images} == {""}
+    assert {(record.has_mask, record.made_mask) for record in image_set.images} == {(False, "")}
+
+
+@installed
+@pytest.mark.slow
+def test_another_way_of_making_masks_reads_the_photos_again(tmp_path: Path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "photos").mkdir()
+    for i in range(3):
+        Image.fromarray(picture(i)[0]).save(tmp_path / "photos" / f"{i}.png")
+
+    def action(mode: str) -> str:
+        arguments = ["run", "photos", "--until", "ingest", "--json", "--set", f"ingest.auto_mask={mode}"]
+        result = CliRunner().invoke(app, arguments)
+        assert result.exit_code == 0, result.output
+        return json.loads(result.stdout)["stages"][0]["action"]
+
+    assert [action(mode) for mode in ("off", "salient", "salient", "off")] == ["ran", "ran", "skipped", "ran"]
