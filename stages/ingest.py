@@ -297,9 +297,10 @@ def _take_photo(
     keep = photo.as_is and scale == 1
     if scale < 1:
         rgb = rgb.resize([max(1, round(side * scale)) for side in rgb.size], Image.Resampling.LANCZOS)
-    made = mask is None and make_mask is not None
+    made_mask = ""
     if mask is None and make_mask is not None:
         mask = make_mask(np.asarray(rgb))
+        made_mask = "" if mask is None else context.params.auto_mask
     suffix = None if keep else _encoded_suffix(file, photo.lossy)
     name = names.target(source, suffix)
 
@@ -326,7 +327,7 @@ def _take_photo(
         has_mask=mask is not None,
         sha256=digest,
         gps=gps_position(photo.exif),
-        made_mask=context.params.auto_mask if made and mask is not None else "",
+        made_mask=made_mask,
     )
     return record, seen
 

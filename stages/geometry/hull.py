@@ -16,9 +16,6 @@ if TYPE_CHECKING:
 # A voxel belongs to the hull when it is inside the silhouette in this part of the views it projects into;
 # less than 1, because a mask or a pose may be wrong.
 HULL_AGREEMENT = 0.9
-# A voxel that fewer views than this part have in frame is no part of what they were pointed at. Close-ups and objects
-# larger than the frame are common: the crown of a clock on a wall was in the frame of 40 % of its photos.
-HULL_SEEN = 0.25
 HULL_CELLS = 48
 DISTANCE_CELLS = 64
 # A room's walls before training, in radii of the region: most of it is free, and the sphere lies behind them.
@@ -117,7 +114,8 @@ def _inside_silhouettes(
         visible, on_object = cameras.on_mask(i, points, mask)
         seen += visible
         inside += on_object
-    return (seen >= max(1.0, HULL_SEEN * len(masked))) & (inside >= agreement * seen)
+    # a voxel most views do not see is no part of what they were pointed at
+    return (seen >= max(1.0, 0.5 * len(masked))) & (inside >= agreement * seen)
 
 
 def hull_distances(
