@@ -23,10 +23,11 @@ class IngestParams(Section):
     video_frames: int = Field(
         80, ge=2, description="at most this many frames of a video become photos: spread by motion, the sharpest ones"
     )
-    auto_mask: Literal["off", "plain"] = Field(
+    auto_mask: Literal["off", "plain", "salient"] = Field(
         "off",
-        description="plain: photos without a mask get one from their plain background (black cloth, white sweep, "
-        "chroma key); an error where it is not plain",
+        description="masks of photos without one. plain: from their plain background (black cloth, white sweep, chroma "
+        "key), an error where it is not plain; salient: what a network takes for the subject, used where the photos "
+        "agree on it to cut the mesh and find the region; needs `pip install 'hineus[masks]'`",
     )
     leave_out: tuple[str, ...] = Field(
         (), description="photos that no stage sees, as names or patterns (test_*.jpg) relative to the photo folder"
@@ -152,7 +153,11 @@ class CleanupParams(Section):
         6, ge=0, description="masks grow by this many pixels before faces outside them are dropped"
     )
     mask_outside: float = Field(
-        0.15, ge=0, le=1, description="a face is outside if it lies off the mask in more than this part of the photos"
+        0.15,
+        ge=0,
+        le=1,
+        description="a face is outside if it lies off the mask in more than this part of the photos; at least 0.3 "
+        "where masks were guessed (`ingest.auto_mask=salient`)",
     )
 
 

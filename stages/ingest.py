@@ -13,7 +13,6 @@ import shutil
 from collections import Counter
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from fnmatch import fnmatchcase
 from pathlib import Path, PurePosixPath
 from typing import Any, TypeVar
@@ -22,12 +21,13 @@ import numpy as np
 
 from configs.params import IngestParams
 from stages.artifacts import IMAGE_SET, PHOTOS, ImageRecord, ImageSet, SkippedImage
-from stages.capture.background import PLAIN_PHOTOS, find_background, object_mask
+from stages.capture.background import PLAIN_PHOTOS, plain_mask
 from stages.capture.exif import ORIENTATION, camera_key, focal_px, gps_position
 from stages.capture.listing import NAMED, by_reason, list_captures, name_some
 from stages.capture.masks import check_size, match_masks, read_mask, write_mask
 from stages.capture.photo_reading import UnusableError, read_photo, register_formats
 from stages.capture.quality import Appearance, appearance, find_oddities
+from stages.capture.salient import SalientNetwork
 from stages.capture.video import extract_frames
 from stages.engine.fingerprint import file_sha256
 from stages.engine.stage import Stage, StageContext
@@ -40,6 +40,8 @@ log = logging.getLogger(__name__)
 
 JPEG_QUALITY = 97  # re-encoded lossy photos; visually lossless, about a third of PNG's size
 
+# Photo [H, W, 3] uint8 -> mask [H, W] bool, None where there is nothing to mask.
+MaskMaker = Callable[[np.ndarray], np.ndarray | None]
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
@@ -70,13 +72,13 @@ def run(context: StageContext[IngestParams]) -> dict[str, Any]:
     skipped += copies
 
     mask_files = find_masks(list(unique), masks_folder, poses) if masks_folder else {}
-    names = _Names(unique)
+    names, make_mask = _Names(unique), _mask_maker(params)
     done = 0
 
     def take(path: str) -> tuple[ImageRecord, Appearance] | SkippedImage:
         nonlocal done
         try:
-            return _take_photo(files[path], path, unique[path], mask_files.get(path), names, context)
+            return _take_photo(files[path], path, unique[path], mask_files.get(path), make_mask, names, context)
         except UnusableError as reason:
             return SkippedImage(path, str(reason))
         finally:
@@ -88,7 +90,7 @@ def run(context: StageContext[IngestParams]) -> dict[str, Any]:
     images = sorted((record for record, _ in taken), key=lambda record: record.name)
     skipped += [o for o in outcomes if isinstance(o, SkippedImage)]
     if params.auto_mask == "plain":
-        images, without = _mask_plain_backgrounds(images, context)
+        images, without = _before_plain_backgrounds(images, context)
         skipped += without
     skipped.sort(key=lambda item: item.source)
 
@@ -108,7 +110,8 @@ def run(context: StageContext[IngestParams]) -> dict[str, Any]:
         log.warning("%s", warning)
     masked = sum(record.has_mask for record in images)
     if 0 < masked < len(images):
-        log.warning("only %d of %d photos have a mask (from their alpha channel)", masked, len(images))
+        origin = "nothing stands out in the others" if params.auto_mask == "salient" else "from their alpha channel"
+        log.warning("only %d of %d photos have a mask (%s)", masked, len(images), origin)
     context.write(IMAGE_SET, ImageSet(tuple(images), tuple(skipped)))
     return {
         "images": len(images),
@@ -238,42 +241,48 @@ def _in_threads(function: Callable[[Item], Result], items: Iterable[Item], worke
         return list(pool.map(function, items))
 
 
-def _mask_plain_backgrounds(
+def _mask_maker(params: IngestParams) -> MaskMaker | None:
+    """What makes the masks of photos that come without; None where nothing is to.
+
+    Raises:
+        SystemRequirementError: the network is wanted and not installed.
+    """
+    if params.auto_mask == "salient":
+        return SalientNetwork().mask
+    return plain_mask if params.auto_mask == "plain" else None
+
+
+def _before_plain_backgrounds(
     images: list[ImageRecord], context: StageContext[IngestParams]
 ) -> tuple[list[ImageRecord], list[SkippedImage]]:
-    """Masks for the photos that have none; the few whose background is not plain are left out.
+    """The photos with a mask; the few whose background is not plain, so that none could be made, are left out.
 
     Raises:
         InputError: those are not few.
     """
-    bare = [record for record in images if not record.has_mask]
-    pictures = context.to_write(PHOTOS)
-
-    def masked(record: ImageRecord) -> bool:
-        rgb = pictures.image(record.name)
-        background = find_background(rgb)
-        mask = object_mask(rgb, background) if background.is_plain else None
-        if mask is not None:
-            write_mask(mask, pictures.mask_path(record.name), (record.width, record.height))
-        return mask is not None
-
-    found = dict(zip((record.name for record in bare), _in_threads(masked, bare, context.workers), strict=True))
-    left_out = [record for record in bare if not found[record.name]]
+    bare = [record for record in images if record.made_mask or not record.has_mask]
+    left_out = [record for record in bare if not record.has_mask]
     if len(left_out) > (1 - PLAIN_PHOTOS) * len(bare):
         raise InputError(
             f"The background is plain in {len(bare) - len(left_out)} of {len(bare)} photos (need "
             f"{math.ceil(PLAIN_PHOTOS * len(bare))}), for example not in {left_out[0].source}.",
-            "Run with `--set ingest.auto_mask=off`, or give masks: `--masks FOLDER`.",
+            "Try `--set ingest.auto_mask=salient` or `--set ingest.auto_mask=off`, or give masks: `--masks FOLDER`.",
         )
     for record in left_out:
-        pictures.path(record.name).unlink()
-    kept = [replace(record, has_mask=True) for record in images if record not in left_out]
+        context.to_write(PHOTOS).path(record.name).unlink()
+    kept = [record for record in images if record.has_mask]
     return kept, [SkippedImage(record.source, "its background is not plain") for record in left_out]
 
 
 # ---------------------------------------------------------------- one photo
 def _take_photo(
-    file: Path, source: str, digest: str, mask_file: Path | None, names: _Names, context: StageContext[IngestParams]
+    file: Path,
+    source: str,
+    digest: str,
+    mask_file: Path | None,
+    make_mask: MaskMaker | None,
+    names: _Names,
+    context: StageContext[IngestParams],
 ) -> tuple[ImageRecord, Appearance]:
     from PIL import Image
 
@@ -288,6 +297,10 @@ def _take_photo(
     keep = photo.as_is and scale == 1
     if scale < 1:
         rgb = rgb.resize([max(1, round(side * scale)) for side in rgb.size], Image.Resampling.LANCZOS)
+    made_mask = ""
+    if mask is None and make_mask is not None:
+        mask = make_mask(np.asarray(rgb))
+        made_mask = "" if mask is None else context.params.auto_mask
     suffix = None if keep else _encoded_suffix(file, photo.lossy)
     name = names.target(source, suffix)
 
@@ -314,6 +327,7 @@ def _take_photo(
         has_mask=mask is not None,
         sha256=digest,
         gps=gps_position(photo.exif),
+        made_mask=made_mask,
     )
     return record, seen
 
@@ -342,7 +356,7 @@ def _encode(rgb: Any, target: Path, lossy: bool, exif: Any) -> None:
 
 INGEST: Stage[IngestParams] = Stage(
     name="ingest",
-    version=3,
+    version=4,
     settings=lambda config: config.ingest,
     run=run,
     writes=(PHOTOS, IMAGE_SET),

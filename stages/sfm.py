@@ -24,6 +24,7 @@ from stages.artifacts import (
     Registration,
     Unregistered,
 )
+from stages.capture.salient import INSTALL, find_weights
 from stages.engine.stage import Stage, StageContext
 from stages.errors import InputError, ReconstructionError
 from stages.posing.evidence import MIN_VERIFIED, Evidence
@@ -73,7 +74,7 @@ def run(context: StageContext[SfmParams]) -> dict[str, Any]:
         evidence = Evidence(bench.database())
 
     if best is None:
-        raise _nothing_matched(evidence, names, steps, params)
+        raise _nothing_matched(evidence, names, steps, params, _masks_advice(image_set, params))
     unregistered = tuple(
         Unregistered(
             name=name, reason=evidence.reason(name, best.registered, best.others, bench.verified, bench.agreeing)
@@ -82,7 +83,13 @@ def run(context: StageContext[SfmParams]) -> dict[str, Any]:
         if name not in best.registered
     )
     if len(best.registered) < needed:
-        raise _too_few(len(best.registered), unregistered, needed, _tried(steps), _hint(steps, params))
+        raise _too_few(
+            len(best.registered),
+            unregistered,
+            needed,
+            _tried(steps),
+            _hint(steps, params) + _masks_advice(image_set, params),
+        )
     for item in unregistered:
         log.warning("not registered: %s: %s", item.name, item.reason)
     for prior, found in bench.contradicted(best):
@@ -227,12 +234,23 @@ def _hint(steps: Sequence[Step], params: SfmParams) -> str:
     )
 
 
+def _masks_advice(image_set: ImageSet, params: SfmParams) -> str:
+    """To look at the subject alone, where masks would be looked at and there are none; with the space before it."""
+    if params.masks == "never" or all(record.has_mask for record in image_set.images):
+        return ""
+    missing = "" if find_weights() else f" (after `{INSTALL}`)"
+    return (
+        " If the background moved against the object, masks leave it out: "
+        f"`--set ingest.auto_mask=salient`{missing}, or `--masks FOLDER`."
+    )
+
+
 def _tried(steps: Sequence[Step]) -> str:
     return "Tried " + "; ".join(describe(step) for step in steps) + "."
 
 
 def _nothing_matched(
-    evidence: Evidence, names: list[str], steps: Sequence[Step], params: SfmParams
+    evidence: Evidence, names: list[str], steps: Sequence[Step], params: SfmParams, advice: str
 ) -> ReconstructionError:
     features = sorted(evidence.features.get(name, 0) for name in names)
     median, best = features[len(features) // 2], evidence.best_pair
@@ -250,7 +268,7 @@ def _nothing_matched(
         f"None of the {len(names)} photos could be registered: no pair is good enough to start from "
         f"(best pair: {best} matches; median {median} features a photo). {_tried(steps)}"
     )
-    return ReconstructionError(message, _hint(steps, params))
+    return ReconstructionError(message, _hint(steps, params) + advice)
 
 
 def _needed(total: int, params: SfmParams) -> int:

@@ -6,6 +6,7 @@ poses; how that lies in the world is `place`'s to say.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -19,9 +20,11 @@ from stages.artifacts import (
     FIRST_SCENE,
     GIVEN_POSES,
     GIVEN_REGION,
+    IMAGE_SET,
     MODEL,
     PHOTOS,
     PINHOLE_PHOTOS,
+    SILHOUETTES,
     KnownSphere,
     write_png,
 )
@@ -33,6 +36,7 @@ from stages.geometry.normalisation import into_frame, scene_frame
 from stages.geometry.place import GivenRegion
 from stages.geometry.plane import Plane, find_ground
 from stages.geometry.region import RegionOfInterest, find_region, grown_over
+from stages.geometry.silhouettes import MIN_SHARE, agreeing, silhouette_agreement
 from stages.geometry.up import Up, choose_up, estimate_up
 from stages.posing.undistortion import (
     plan_warp,
@@ -43,6 +47,8 @@ from stages.posing.undistortion import (
     warp_maps,
     warp_mask,
 )
+
+log = logging.getLogger(__name__)
 
 PNG_COMPRESSION = 2  # of 9; twice as fast as the default for a few percent of size
 
@@ -55,9 +61,12 @@ def run(context: StageContext[UndistortParams]) -> dict[str, Any]:
     photos = registered_photos(model)
     warps = {camera_id: plan_warp(camera, context.params.max_side) for camera_id, camera in model.cameras.items()}
     names = png_names([photo.name for photo in photos])
-    masks = _warp_all(context, model, photos, names, warps)
+    records = {record.name: record for record in context.read(IMAGE_SET).images}
+    guessed = [records[photo.name].made_mask == "salient" for photo in photos]
+    masks = _warp_all(context, model, photos, names, warps, guessed)
 
     cameras = posed_cameras(photos, names, warps)
+    masks = _without_doubtful(context, cameras, masks, guessed)
     points, errors, observations = _sparse_points(model, photos)
     known, given = context.read(GIVEN_POSES), context.read(GIVEN_REGION)
     stated = known.region if known else None
@@ -83,6 +92,7 @@ def run(context: StageContext[UndistortParams]) -> dict[str, Any]:
         "width": int(scene.cameras.sizes[:, 0].max()),
         "height": int(scene.cameras.sizes[:, 1].max()),
         "masks": sum(mask is not None for mask in masks),
+        **({"masks_dropped": sum(guessed) - _count(masks, guessed)} if any(guessed) else {}),
         "kind": scene.kind,
         "region_from": region.source,
         "up_from": up.source,
@@ -95,9 +105,14 @@ def run(context: StageContext[UndistortParams]) -> dict[str, Any]:
 
 # ---------------------------------------------------------------- pinhole images
 def _warp_all(
-    context: StageContext[UndistortParams], model: Any, photos: list[Any], names: list[str], warps: dict[int, Any]
+    context: StageContext[UndistortParams],
+    model: Any,
+    photos: list[Any],
+    names: list[str],
+    warps: dict[int, Any],
+    guessed: Sequence[bool],
 ) -> list[np.ndarray | None]:
-    """Write all pinhole images and masks; the masks [H, W] uint8, None where a photo has none."""
+    """Write all pinhole images, and masks that are not guessed; all masks [H, W] uint8, None where there is none."""
     import cv2
 
     taken, written = context.read(PHOTOS), context.to_write(PINHOLE_PHOTOS)
@@ -109,17 +124,18 @@ def _warp_all(
 
     done = 0
 
-    def warp(job: tuple[str, str, int]) -> np.ndarray | None:
+    def warp(job: tuple[str, str, int, bool]) -> np.ndarray | None:
         """Writes one image and its mask; returns the mask."""
         nonlocal done
-        source, name, camera_id = job
+        source, name, camera_id, is_guess = job
         maps = maps_of(camera_id)
         pixels = warp_image(taken.image(source), warps[camera_id], maps, cv2.INTER_CUBIC)
         write_png(written.path(name), pixels, PNG_COMPRESSION)
         mask = taken.mask(source)
         if mask is not None:
             mask = warp_mask(mask, warps[camera_id], maps, context.params.mask_erode)
-            write_png(written.mask_path(name), mask, PNG_COMPRESSION)
+            if not is_guess:
+                write_png(written.mask_path(name), mask, PNG_COMPRESSION)
         done += 1
         context.progress(done, len(photos) + 1, source)
         return mask
@@ -128,10 +144,42 @@ def _warp_all(
     cv2.setNumThreads(1)  # the pool below is the parallelism
     try:
         with ThreadPoolExecutor(max_workers=max(1, context.workers)) as pool:
-            jobs = [(photo.name, name, photo.camera_id) for photo, name in zip(photos, names, strict=True)]
-            return list(pool.map(warp, jobs))
+            sources, lenses = [photo.name for photo in photos], [photo.camera_id for photo in photos]
+            return list(pool.map(warp, zip(sources, names, lenses, guessed, strict=True)))
     finally:
         cv2.setNumThreads(before)
+
+
+def _without_doubtful(
+    context: StageContext[UndistortParams],
+    cameras: PinholeCameras,
+    masks: list[np.ndarray | None],
+    guessed: Sequence[bool],
+) -> list[np.ndarray | None]:
+    """The masks [H, W] uint8 less the guesses that do not fit the others'; the guesses that do are written."""
+    if not any(guessed):
+        return masks
+    believed = agreeing(silhouette_agreement(cameras, masks))
+    kept = [mask if fits or not guess else None for mask, fits, guess in zip(masks, believed, guessed, strict=True)]
+    total, count = sum(guessed), _count(kept, guessed)
+    if count == 0:
+        log.warning(
+            "none of the %d masks that were made is used: fewer than %.0f %% of them show the same thing "
+            "(look at ingest/masks); `--masks FOLDER` takes masks of your own",
+            total, 100 * MIN_SHARE,
+        )  # fmt: skip
+    elif count < total:
+        log.warning("%d of %d masks that were made do not fit the others and are not used", total - count, total)
+    written = context.to_write(SILHOUETTES)
+    for name, mask, guess in zip(cameras.names, kept, guessed, strict=True):
+        if guess and mask is not None:
+            write_png(written.mask_path(name), mask, PNG_COMPRESSION)
+    return kept
+
+
+def _count(masks: Sequence[np.ndarray | None], guessed: Sequence[bool]) -> int:
+    """Guesses that are left."""
+    return sum(mask is not None and guess for mask, guess in zip(masks, guessed, strict=True))
 
 
 # ---------------------------------------------------------------- the scene
@@ -187,10 +235,10 @@ def _find_region(
 
 UNDISTORT: Stage[UndistortParams] = Stage(
     name="undistort",
-    version=6,
+    version=7,
     settings=lambda config: config.undistort,
     run=run,
-    reads=(PHOTOS, MODEL, GIVEN_POSES, GIVEN_REGION),
-    writes=(PINHOLE_PHOTOS, FIRST_SCENE),
+    reads=(PHOTOS, IMAGE_SET, MODEL, GIVEN_POSES, GIVEN_REGION),
+    writes=(PINHOLE_PHOTOS, SILHOUETTES, FIRST_SCENE),
     summary="make pinhole images and find the region of interest",
 )

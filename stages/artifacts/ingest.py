@@ -26,6 +26,8 @@ class ImageRecord:
         has_mask: whether `masks/<name>.png` exists.
         sha256: hash of the source file.
         gps: latitude and longitude in degrees (WGS 84) and altitude in metres, where EXIF has all three.
+        made_mask: the way of `ingest.auto_mask` in which its mask was made; empty where it came with the photo or
+            there is none. What "salient" made is a guess, see `SILHOUETTES`.
     """
 
     name: str
@@ -38,6 +40,7 @@ class ImageRecord:
     has_mask: bool
     sha256: str
     gps: tuple[float, float, float] | None = None
+    made_mask: str = ""
 
 
 @dataclass(frozen=True)

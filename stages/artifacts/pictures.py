@@ -18,9 +18,14 @@ IMAGES, MASKS = "images", "masks"
 
 @dataclass(frozen=True)
 class Pictures:
-    """The pictures in a stage's folder and their masks, each read when asked for."""
+    """The pictures in a stage's folder and their masks, each read when asked for.
+
+    Attributes:
+        kind: the folder of the masks.
+    """
 
     folder: Path
+    kind: str = MASKS
 
     @property
     def images(self) -> Path:
@@ -30,7 +35,7 @@ class Pictures:
     @property
     def masks(self) -> Path:
         """The folder of masks; may not exist."""
-        return self.folder / MASKS
+        return self.folder / self.kind
 
     def path(self, name: str) -> Path:
         return self.images / name

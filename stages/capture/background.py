@@ -69,6 +69,12 @@ def find_background(rgb: np.ndarray) -> Background:
     return Background(colour, float(near.mean()), float(np.median(grain)), spread)
 
 
+def plain_mask(rgb: np.ndarray) -> np.ndarray | None:
+    """`object_mask` of a photo before a plain background; None where that is not plain, too."""
+    background = find_background(rgb)
+    return object_mask(rgb, background) if background.is_plain else None
+
+
 def object_mask(rgb: np.ndarray, background: Background) -> np.ndarray | None:
     """[H, W] bool, True on what stands before the background; None where that is next to nothing or nearly all.
 
@@ -85,7 +91,7 @@ def object_mask(rgb: np.ndarray, background: Background) -> np.ndarray | None:
     # a thread of background colour between object and border must not open the object
     found = cv2.morphologyEx((~outside).astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     found = cv2.morphologyEx(found, cv2.MORPH_CLOSE, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (9, 9)))
-    found = _without_specks(found)
+    found = without_specks(found)
     filled = ~_touching_the_border(found == 0)
     if not MIN_OBJECT <= filled.mean() <= MAX_OBJECT:
         return None
@@ -134,7 +140,7 @@ def _touching_the_border(region: np.ndarray) -> np.ndarray:
     return np.isin(labels, np.unique(rim[rim > 0]))
 
 
-def _without_specks(region: np.ndarray) -> np.ndarray:
+def without_specks(region: np.ndarray) -> np.ndarray:
     import cv2
 
     count, labels, stats, _ = cv2.connectedComponentsWithStats(region, connectivity=8)

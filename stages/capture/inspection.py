@@ -31,7 +31,7 @@ class Inspection:
     Attributes:
         num_bytes: size of all the files.
         oddities: none where the photos were not decoded.
-        plain: whether nearly all backgrounds are plain; False where the photos were not decoded.
+        plain_share: part of the photos whose background is plain; 0 where the photos were not decoded.
     """
 
     photos: tuple[PhotoFile, ...]
@@ -39,7 +39,12 @@ class Inspection:
     skipped: tuple[SkippedImage, ...]
     num_bytes: int
     oddities: Oddities = field(default_factory=Oddities)
-    plain: bool = False
+    plain_share: float = 0.0
+
+    @property
+    def plain(self) -> bool:
+        """Whether nearly all backgrounds are plain."""
+        return self.plain_share >= PLAIN_PHOTOS
 
     @property
     def sizes(self) -> list[tuple[int, int]]:
@@ -82,5 +87,5 @@ def inspect(source: Path, masks_folder: Path | None, video_frames: int, workers:
         skipped=tuple([*skipped, *(item for item in seen if isinstance(item, SkippedImage))]),
         num_bytes=sum((folder / path).stat().st_size for path in [*photos, *videos]),
         oddities=find_oddities([look for _, look, _ in looked_at if look is not None]),
-        plain=bool(looked_at) and sum(plain for _, _, plain in looked_at) >= PLAIN_PHOTOS * len(looked_at),
+        plain_share=sum(plain for _, _, plain in looked_at) / max(len(looked_at), 1),
     )

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int, Integer
 
 # What is nearest in a photo is as far away as this quantile of the points in it; background is farther by this factor.
-NEAR_QUANTILE, MAX_BEHIND = 0.1, 1.5
+NEAR_QUANTILE, MAX_BEHIND = 0.1, 1.6
 # A photo with fewer points does not tell what is near.
 MIN_POINTS = 8
 # This many photos have to look at a point; of a large set, this part of them.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -37,26 +38,76 @@ def visual_hull_sphere(
     Returns:
         Centre and radius, or None where nothing is left after carving.
     """
-    low, high = center - radius, center + radius
-    for _ in range(2):
-        cell = (high - low) / HULL_CELLS
-        axes = [low[k] + (np.arange(HULL_CELLS) + 0.5) * cell[k] for k in range(3)]
-        grid = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
-        inside = _inside_silhouettes(cameras, masks, grid)
-        if not inside.any():
-            return None
-        kept = grid[inside]
-        low, high = kept.min(0) - cell, kept.max(0) + cell
+    hull = carve(cameras, masks, center, radius)
+    if hull is None:
+        return None
+    kept = hull.centers[hull.inside.ravel()]
     hull_center = (kept.min(0) + kept.max(0)) / 2
     # a cell's own half diagonal, because the grid holds centres of cells
-    hull_radius = np.linalg.norm(kept - hull_center, axis=1).max() + np.linalg.norm(cell) / 2
+    hull_radius = np.linalg.norm(kept - hull_center, axis=1).max() + np.linalg.norm(hull.cell) / 2
     return hull_center, float(hull_radius)
 
 
+@dataclass(frozen=True)
+class Hull:
+    """A visual hull on a grid over its own box, a cell wider on each side.
+
+    Attributes:
+        low, high: corners of the grid.
+        inside: cells of the hull, axes x, y, z.
+    """
+
+    low: Float[np.ndarray, " 3"]
+    high: Float[np.ndarray, " 3"]
+    inside: Bool[np.ndarray, "c c c"]
+
+    @property
+    def cell(self) -> Float[np.ndarray, " 3"]:
+        """Sides of a cell."""
+        return (self.high - self.low) / self.inside.shape
+
+    @property
+    def centers(self) -> Float[np.ndarray, "c3 3"]:
+        """Of all cells, in the order of `inside.ravel()`."""
+        axes = [self.low[k] + (np.arange(self.inside.shape[k]) + 0.5) * self.cell[k] for k in range(3)]
+        return np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+
+
+def carve(
+    cameras: PinholeCameras,
+    masks: Sequence[Shaped[np.ndarray, "_ _"] | None],
+    center: Float[np.ndarray, " 3"],
+    radius: float,
+    agreement: float = HULL_AGREEMENT,
+) -> Hull | None:
+    """Visual hull in the cube `center` +- `radius`: on a coarse grid, then once more on the hull's own box.
+
+    Args:
+        masks: as for `visual_hull_sphere`.
+        agreement: a cell is inside if it is on the silhouettes of this part of the views it projects into.
+
+    Returns:
+        None where nothing is left after carving.
+    """
+    low, high = center - radius, center + radius
+    for _ in range(2):
+        hull = Hull(low, high, np.zeros([HULL_CELLS] * 3, bool))
+        grid = hull.centers
+        inside = _inside_silhouettes(cameras, masks, grid, agreement)
+        if not inside.any():
+            return None
+        hull = replace(hull, inside=inside.reshape(hull.inside.shape))
+        low, high = grid[inside].min(0) - hull.cell, grid[inside].max(0) + hull.cell
+    return hull
+
+
 def _inside_silhouettes(
-    cameras: PinholeCameras, masks: Sequence[Shaped[np.ndarray, "_ _"] | None], points: Float[np.ndarray, "p 3"]
+    cameras: PinholeCameras,
+    masks: Sequence[Shaped[np.ndarray, "_ _"] | None],
+    points: Float[np.ndarray, "p 3"],
+    agreement: float = HULL_AGREEMENT,
 ) -> Bool[np.ndarray, " p"]:
-    """Whether points lie inside the silhouettes of nearly all the views they project into."""
+    """Whether points lie inside the silhouettes of this part of the views they project into."""
     seen, inside = np.zeros(len(points)), np.zeros(len(points))
     masked = [(i, mask) for i, mask in enumerate(masks) if mask is not None]
     for i, mask in masked:
@@ -64,7 +115,7 @@ def _inside_silhouettes(
         seen += visible
         inside += on_object
     # a voxel most views do not see is no part of what they were pointed at
-    return (seen >= max(1.0, 0.5 * len(masked))) & (inside >= HULL_AGREEMENT * seen)
+    return (seen >= max(1.0, 0.5 * len(masked))) & (inside >= agreement * seen)
 
 
 def hull_distances(

@@ -52,7 +52,7 @@ STANDING = 0.03
 MAX_GAP = 0.4
 # The ends of a subject, which fewer photos see, reach beyond the points on it: those of an object, which photos leave
 # above and below, and those of a forward capture, which goes on at its sides.
-ATTENDED_MARGIN, FORWARD_MARGIN = 1.18, 1.12
+ATTENDED_MARGIN, FORWARD_MARGIN = 1.25, 1.12
 # Free space around silhouettes' visual hull: 10 % of the radius.
 HULL_MARGIN = 1.1
 # In a room points lie all around the cameras: their directions from the cameras' middle cancel to less than this.
