@@ -53,7 +53,7 @@ def run(context: StageContext[ReportParams]) -> dict[str, Any]:
     """Write report.html. Returns its size in bytes, and how the final mesh meets held-out photos."""
     import jinja2
 
-    from stages.reporting import curves, numbers, photo_table, pictures
+    from stages.reporting import curves, numbers, photo_table, pictures, poses
     from stages.reporting.held_out_photos import compare_held_out
 
     scene, place, atlas = context.read(SCENE), context.read(WORLD_PLACE), context.read(ATLAS_MESH)
@@ -88,6 +88,7 @@ def run(context: StageContext[ReportParams]) -> dict[str, Any]:
         # part of a page, the drawing needs no namespace
         "overview": read_text(context.read(OVERVIEW)).replace(f' xmlns="{SVG}"', ""),
         "where": numbers.describe_where(scene, place, placed),
+        "poses": poses.describe_poses(registration, place),
         "charts": curves.training_charts(context.read(METRICS)),
         "previews": pictures.training_previews(context.read(PREVIEWS)),
         "stages": [numbers.stage_row(manifest) for manifest in manifests.values()],
@@ -168,7 +169,7 @@ def read_text(path: Path) -> str:
 
 REPORT: Stage[ReportParams] = Stage(
     name="report",
-    version=5,
+    version=6,
     settings=lambda config: config.report,
     run=run,
     reads=(
