@@ -306,8 +306,6 @@ def true_centers(folder: Path) -> tuple[list[np.ndarray], float] | None:
 
 def center_error(workspace: Path, data: Path, row: str) -> dict[str, float] | None:
     """Distance of the camera centres of a workspace to the truth, median and largest, in percent of the extent."""
-    from stages.geometry.similarity import align_points
-
     name, _, variant = row.partition("-")
     truth, source = true_centers(data / name), photos_of(data / name)
     if truth is None:
@@ -319,11 +317,18 @@ def center_error(workspace: Path, data: Path, row: str) -> dict[str, float] | No
     if len(pairs) < 3:
         return None
     estimated, true = (np.array(side) for side in zip(*pairs, strict=True))
-    distance = np.linalg.norm(align_points(estimated, true).apply(estimated) - true, axis=1)
+    distance = center_distances(estimated, true)
     return {
         "median": round(100 * float(np.median(distance)) / extent, 4),
         "max": round(100 * float(distance.max()) / extent, 4),
     }
+
+
+def center_distances(found: np.ndarray, true: np.ndarray) -> np.ndarray:
+    """[N] distances of centres [N, 3] to the true ones, after alignment by a similarity."""
+    from stages.geometry.similarity import align_points
+
+    return np.linalg.norm(align_points(found, true).apply(found) - true, axis=1)
 
 
 def known_stem(source: Path, variant: str) -> Callable[[str], str]:

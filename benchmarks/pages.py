@@ -18,6 +18,7 @@ NOT_MEASURED = "Not measured yet."
 # Each has `tables()`: names and Markdown.
 BENCHMARKS = (
     "run_sets", "held_out", "textures", "hard_variants", "ablate", "suites", "growth", "what_to_expect",
+    "last_adjustment",
 )  # fmt: skip
 
 

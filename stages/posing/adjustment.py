@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -246,20 +247,19 @@ def _judge(
     out: np.ndarray,
 ) -> dict[int, LensTrial]:
     """Camera id -> the verdict on a freedom, from the models without and with it."""
-    errors = squared_errors(before, seen, out), squared_errors(after, seen, out)
-    precision = estimate_precision(after, _free(after, freed))
+    old, new = squared_errors(before, seen, out), squared_errors(after, seen, out)
+    in_front = np.isfinite(old) & np.isfinite(new)
     camera_of = np.array([after.images[i].camera_id for i in seen.images], dtype=np.int64)[seen.photo[out]]
+    precision = cache(lambda: estimate_precision(after, _free(after, freed)))  # seconds: only where errors speak for it
     verdicts = {}
     for camera_id in sorted(able):
-        own = (camera_of == camera_id) & np.isfinite(errors[0]) & np.isfinite(errors[1])
-        old, new = errors[0][own], errors[1][own]
-        refused = refuse_by_errors(old, new, seen.photo[out][own]) or refuse_by_lens(
-            freedom,
-            before.cameras[camera_id],
-            after.cameras[camera_id],
-            precision.intrinsics[camera_id] if precision else None,
-        )
-        held_out = float(np.sqrt(old.mean())), float(np.sqrt(new.mean()))
+        own = (camera_of == camera_id) & in_front
+        refused = refuse_by_errors(old[own], new[own], seen.photo[out][own])
+        if not refused:
+            found = precision()
+            standard = found.intrinsics[camera_id] if found else None
+            refused = refuse_by_lens(freedom, before.cameras[camera_id], after.cameras[camera_id], standard)
+        held_out = float(np.sqrt(old[own].mean())), float(np.sqrt(new[own].mean()))
         verdicts[camera_id] = LensTrial(freedom=freedom, held_out_px=held_out, refused=refused)
     return verdicts
 
@@ -270,7 +270,7 @@ def refuse_by_errors(old: Float[np.ndarray, " h"], new: Float[np.ndarray, " h"],
     Args:
         old, new: without and with it. photo: [H] number of each one's photo.
     """
-    gain = 1 - new.sum() / old.sum()
+    gain = 1 - new.sum() / max(old.sum(), np.finfo(float).tiny)
     if gain < MIN_GAIN:
         return f"it changes the held-out squared error by {-100 * gain:+.2f} %, not by -{100 * MIN_GAIN:.0f} % or more"
     numbers = np.unique(photo)
