@@ -135,6 +135,28 @@ def test_with_few_photos_or_observations_nothing_is_freed(few):
     assert last.lenses[0].trials == ()
 
 
+def test_very_many_photos_keep_their_lens(monkeypatch, caplog):
+    monkeypatch.setattr(adjustment, "MOST_PHOTOS", 11)
+    model = mapped(capture(SHIFT))
+    with caplog.at_level("INFO"):
+        assert adjust_last(model, SfmParams(), 1).model is model
+    assert "up to 11 photos" in caplog.text
+
+
+def test_a_point_seen_once_leaves_the_others_their_errors():
+    import pycolmap
+
+    model = mapped(capture(points=100))
+    free = {1: free_parameters(model.cameras[1], True)}
+    whole = estimate_precision(model, free)
+    point = next(iter(model.points3D.values()))
+    element = point.track.elements[0]
+    image = model.images[element.image_id]
+    image.points2D.append(pycolmap.Point2D(image.points2D[element.point2D_idx].xy))
+    model.add_point3D(point.xyz, pycolmap.Track([pycolmap.TrackElement(image.image_id, len(image.points2D) - 1)]))
+    assert estimate_precision(model, free).centers == pytest.approx(whole.centers, rel=0.02)
+
+
 def test_off_leaves_the_lens_and_still_tells_the_error():
     model = mapped(capture(SHIFT))
     last = adjust_last(model, SfmParams(refine_lens="off"), 1)

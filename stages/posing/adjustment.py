@@ -13,6 +13,7 @@ terms are left alone: on surveyed facades they made poses worse.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
@@ -27,12 +28,15 @@ from stages.posing.precision import Observations, Precision, estimate_precision,
 if TYPE_CHECKING:
     from jaxtyping import Float
 
+log = logging.getLogger(__name__)
+
 PRINCIPAL_POINT, K2 = "principal point", "radial k2"
 FREEDOMS = (PRINCIPAL_POINT, K2)
 
 # ---- what is held out
 HELD_OUT_SHARE = 0.2  # of the observations
 KEPT_VIEWS = 3  # a point keeps so many observations: with two, its own error hides in its depth
+MOST_PHOTOS = 1000  # the covariance takes memory with their square: 1.5 GB
 # ---- what is asked of a camera
 MIN_PHOTOS = 5
 MIN_HELD_OUT = 200  # observations
@@ -73,6 +77,9 @@ def adjust_last(model: Any, params: Any, threads: int) -> LastAdjustment:
     """
     freed: Freed = {camera_id: frozenset() for camera_id in _photos_of(model)}
     trials: dict[int, list[LensTrial]] = {}
+    if model.num_reg_images() > MOST_PHOTOS:
+        log.info("the lens stays as it is: the last adjustment is for up to %d photos", MOST_PHOTOS)
+        return LastAdjustment(model, lenses=(), pose_error=None)
     if params.refine_lens == "auto":
         freed, trials = try_freedoms(model, params.seed, threads)
     if any(freed.values()):
@@ -96,9 +103,12 @@ def try_freedoms(model: Any, seed: int, threads: int) -> tuple[Freed, dict[int, 
     out = hold_out(seen, seed)
     freed: Freed = {camera_id: frozenset() for camera_id in _photos_of(model)}
     trials: dict[int, list[LensTrial]] = {}
+    judged = judged_cameras(model, seen, out)
+    if not judged:
+        return freed, trials
     current = bundle_adjust(_without(model, seen, out), freed, threads)
     for freedom in FREEDOMS:
-        able = _able(model, freedom, seen, out)
+        able = {i for i in judged if freedom == PRINCIPAL_POINT or model.cameras[i].model_name == "SIMPLE_RADIAL"}
         if not able:
             continue
         wider = _widened(freed, able, freedom)
@@ -206,13 +216,15 @@ def _without(model: Any, seen: Observations, out: np.ndarray) -> Any:
 
 
 def squared_errors(model: Any, seen: Observations, which: np.ndarray) -> Float[np.ndarray, " h"]:
-    """Squared reprojection errors of these observations, pixels^2; infinite behind a camera."""
+    """Squared reprojection errors of these observations, pixels^2; behind a camera: the frame's diagonal."""
     places = np.array([model.points3D[i].xyz for i in seen.point_ids[seen.point[which]].tolist()]).reshape(-1, 3)
-    errors = np.full(len(which), np.inf)
+    errors = np.empty(len(which))
     for number in np.unique(seen.photo[which]).tolist():
         image, rows = model.images[seen.images[number]], np.flatnonzero(seen.photo[which] == number)
-        pixels = model.cameras[image.camera_id].img_from_cam(image.cam_from_world() * places[rows])
-        errors[rows] = np.nan_to_num(((pixels - seen.pixels[which[rows]]) ** 2).sum(1), nan=np.inf)
+        camera = model.cameras[image.camera_id]
+        pixels = camera.img_from_cam(image.cam_from_world() * places[rows])
+        squares = ((pixels - seen.pixels[which[rows]]) ** 2).sum(1)
+        errors[rows] = np.nan_to_num(squares, nan=camera.width**2 + camera.height**2)
     return errors
 
 
@@ -225,16 +237,19 @@ def _photos_of(model: Any) -> dict[int, list[int]]:
     return photos
 
 
-def _able(model: Any, freedom: str, seen: Observations, out: np.ndarray) -> set[int]:
-    """Cameras with enough photos and observations to judge by, whose model can have the freedom."""
-    camera_of = np.array([model.images[i].camera_id for i in seen.images], dtype=np.int64)[seen.photo[out]]
+def judged_cameras(model: Any, seen: Observations, out: np.ndarray) -> set[int]:
+    """Cameras with enough held-out observations in enough photos to judge by."""
+    camera_of = _camera_of(model, seen, out)
     return {
         camera_id
-        for camera_id, photos in _photos_of(model).items()
-        if len(photos) >= MIN_PHOTOS
-        and (camera_of == camera_id).sum() >= MIN_HELD_OUT
-        and (freedom == PRINCIPAL_POINT or model.cameras[camera_id].model_name == "SIMPLE_RADIAL")
+        for camera_id in np.unique(camera_of).tolist()
+        if (camera_of == camera_id).sum() >= MIN_HELD_OUT
+        and len(np.unique(seen.photo[out][camera_of == camera_id])) >= MIN_PHOTOS
     }
+
+
+def _camera_of(model: Any, seen: Observations, which: np.ndarray) -> np.ndarray:
+    return np.array([model.images[i].camera_id for i in seen.images], dtype=np.int64)[seen.photo[which]]
 
 
 def _judge(
@@ -248,12 +263,11 @@ def _judge(
 ) -> dict[int, LensTrial]:
     """Camera id -> the verdict on a freedom, from the models without and with it."""
     old, new = squared_errors(before, seen, out), squared_errors(after, seen, out)
-    in_front = np.isfinite(old) & np.isfinite(new)
-    camera_of = np.array([after.images[i].camera_id for i in seen.images], dtype=np.int64)[seen.photo[out]]
+    camera_of = _camera_of(after, seen, out)
     precision = cache(lambda: estimate_precision(after, _free(after, freed)))  # seconds: only where errors speak for it
     verdicts = {}
     for camera_id in sorted(able):
-        own = (camera_of == camera_id) & in_front
+        own = camera_of == camera_id
         refused = refuse_by_errors(old[own], new[own], seen.photo[out][own])
         if not refused:
             found = precision()

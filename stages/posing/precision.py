@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
 
 DERIVATIVE_STEP = 1e-6  # relative to the depth or parameter; central differences in double precision
+POINT_DAMPING = 1e-10  # of a point's normal equations, so that one seen without parallax has an inverse, too
 POSE = 6  # rotation, translation: cam_from_world followed by a small motion in the camera's frame
 
 
@@ -117,9 +118,10 @@ def estimate_precision(model: Any, free: dict[int, list[int]]) -> Precision | No
 
     gauge = np.zeros((width, 7))
     gauge[: POSE * len(poses)] = _gauge(rotations, translations)
-    weights = np.sqrt(np.diag(normal))  # Jacobi scaling: poses and intrinsics have units of their own
-    if not (weights > 0).all():
+    scales = np.diag(normal)
+    if not (scales > 0).all():
         return None
+    weights = np.sqrt(scales)  # Jacobi scaling: poses and intrinsics have units of their own
     basis, _ = np.linalg.qr(gauge * weights[:, None])
     scaled = normal / np.outer(weights, weights) + basis @ basis.T
     try:
@@ -206,7 +208,8 @@ def _without_points(by_camera: csr_matrix, by_point: csr_matrix) -> np.ndarray:
     blocks = (by_point.T @ by_point).tobsr((3, 3))
     number = blocks.shape[0] // 3
     order = np.argsort(blocks.indices)  # one block on the diagonal for each point
-    inverse = np.linalg.inv(blocks.data[order] + np.finfo(float).tiny * np.eye(3))
+    damping = POINT_DAMPING * np.trace(blocks.data, axis1=1, axis2=2)[:, None, None] * np.eye(3)
+    inverse = np.linalg.inv((blocks.data + damping)[order])
     inverted = bsr_matrix((inverse, np.arange(number), np.arange(number + 1)), shape=blocks.shape)
     mixed = by_camera.T @ by_point
     return np.asarray((by_camera.T @ by_camera - mixed @ inverted @ mixed.T).todense())
