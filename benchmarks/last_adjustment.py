@@ -45,7 +45,7 @@ class Row:
         error: median and largest distance of camera centres to the truth without and with the last adjustment.
         expected: median of what the covariance says it is, with it; None where it cannot be told.
         freed: what was, of any camera.
-        gain_percent: of the mean squared error of held-out observations of the camera with most photos, by each
+        gain_percent: of the mean error of held-out observations of the camera with most photos, by each
             freedom that was tried, kept or not.
         cpu_s: CPU seconds it took.
     """
@@ -126,8 +126,7 @@ def run_row(row: str, data: Path, models: Path | None) -> Row:
         expected=round(last.pose_error.center * scale / unit, 4) if last.pose_error else None,
         freed=tuple(sorted({freedom for each in last.lenses for freedom in each.freed})),
         gain_percent={
-            trial.freedom: round(100 * (1 - (trial.held_out_px[1] / trial.held_out_px[0]) ** 2), 2)
-            for trial in lens.trials
+            trial.freedom: round(100 * (1 - trial.held_out_px[1] / trial.held_out_px[0]), 2) for trial in lens.trials
         },
         cpu_s=round(seconds, 1),
     )

@@ -110,7 +110,7 @@ def test_a_principal_point_in_the_middle_stays_there():
 
 
 def test_a_second_radial_term_is_found():
-    truth = capture(k=(-0.8, 3.0))  # the points are near the middle of the frames
+    truth = capture(k=(-0.8, 3.0), noise=0.1)  # the points are near the middle of the frames
     model = mapped(truth)
     last = adjust_last(model, SfmParams(), 1)
     (lens,) = last.lenses
@@ -189,6 +189,7 @@ def test_a_gain_must_be_large_and_even():
     assert "0.00 %" in refuse_by_errors(old, old, photo)
     assert "+20.00 %" in refuse_by_errors(old, old * 1.2, photo)
     uneven = np.where(photo == 0, 0.1, 1.0)
+    assert "-0.10 %" in refuse_by_errors(old, old * 0.999, photo)
     assert "1 of 10 photos" in refuse_by_errors(old, uneven, photo)
 
 

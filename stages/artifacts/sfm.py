@@ -23,7 +23,7 @@ class LensTrial(Record):
 
     Attributes:
         freedom: what, in words.
-        held_out_px: root mean square error of the held-out observations without and with it, pixels.
+        held_out_px: mean error of the held-out observations without and with it, pixels.
         refused: why it was not kept, in words; empty where it was.
     """
 
