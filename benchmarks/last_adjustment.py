@@ -23,7 +23,15 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.hard_variants import all_rows, center_distances, code_hash, known_stem, make_photos, true_centers
+from benchmarks.hard_variants import (
+    VARIANTS,
+    all_rows,
+    center_distances,
+    code_hash,
+    known_stem,
+    make_photos,
+    true_centers,
+)
 from benchmarks.pages import NOT_MEASURED, markdown_table, write_tables
 from benchmarks.run_sets import OUT, RESULTS, find_sets, machine, photos_of, run_hineus
 from configs.params import SfmParams
@@ -168,7 +176,7 @@ def adjustment_table(rows: Sequence[Row]) -> str:
     ]  # fmt: skip
     lines = [
         [
-            row.name.replace("_", " "),
+            _shown(row.name),
             *(f"{row.error[key][0]:.3g} {row.unit}" for key in ("without", "with")),
             "-" if row.expected is None else f"{row.expected:.2g} {row.unit}",
             " + ".join(row.freed) or "-",
@@ -178,6 +186,11 @@ def adjustment_table(rows: Sequence[Row]) -> str:
         for row in rows
     ]
     return markdown_table(header, lines)
+
+
+def _shown(name: str) -> str:
+    base, _, variant = name.partition("-")
+    return (f"{base}: {variant}" if variant in VARIANTS else name).replace("_", " ")
 
 
 def _freedoms() -> tuple[str, ...]:
