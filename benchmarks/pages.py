@@ -17,7 +17,7 @@ DOCS = Path(__file__).parent.parent / "docs"
 NOT_MEASURED = "Not measured yet."
 # Each has `tables()`: names and Markdown.
 BENCHMARKS = (
-    "run_sets", "held_out", "textures", "hard_variants", "ablate", "suites", "growth", "what_to_expect",
+    "run_sets", "held_out", "textures", "hard_variants", "ablate", "suites", "growth", "what_to_expect", "regions",
     "last_adjustment",
 )  # fmt: skip
 

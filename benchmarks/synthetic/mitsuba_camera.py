@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.synthetic.model import Part, Scene
+from benchmarks.synthetic.model import Ground, Part, Scene
 from stages.errors import SystemRequirementError
 
 FAST, EVERYWHERE = "llvm_ad_rgb", "scalar_rgb"
@@ -176,11 +176,20 @@ def _surface(finish: str) -> dict[str, Any]:
 
 
 def _surroundings(mi: Any, scene: Scene) -> dict[str, Any]:
-    """The printed ground, plain floor around it, the sky."""
-    ground = scene.ground
+    """The printed ground and plain floor around it, where there is one, and the sky."""
     flat = mi.ScalarTransform4f
     # Mitsuba's map has +y up and turns the other way round.
     turn = flat(np.array([[0, 0, -1.0, 0], [-1.0, 0, 0, 0], [0, 1.0, 0, 0], [0, 0, 0, 1]]))
+    sky = {
+        "type": "envmap",
+        "bitmap": mi.Bitmap(np.ascontiguousarray(scene.sky[:, ::-1])),
+        "to_world": turn,
+    }
+    return {"sky": sky} | ({} if scene.ground is None else _ground(mi, scene.ground))
+
+
+def _ground(mi: Any, ground: Ground) -> dict[str, Any]:
+    flat = mi.ScalarTransform4f
     print_ = {"type": "bitmap", "bitmap": mi.Bitmap(ground.image.astype(np.float32)), "raw": True}
     mean = [float(value) for value in ground.image.reshape(-1, 3).mean(0)]
     return {
@@ -193,10 +202,5 @@ def _surroundings(mi: Any, scene: Scene) -> dict[str, Any]:
             "type": "rectangle",
             "to_world": flat().translate([0, 0, ground.height - FLOOR_DROP]).scale(FLOOR_SIDE / 2),
             "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": mean}},
-        },
-        "sky": {
-            "type": "envmap",
-            "bitmap": mi.Bitmap(np.ascontiguousarray(scene.sky[:, ::-1])),
-            "to_world": turn,
         },
     }

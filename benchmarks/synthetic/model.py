@@ -54,13 +54,13 @@ class Scene:
 
     Attributes:
         parts: what is looked at; together they are the known surface.
-        ground: under it, not part of it.
+        ground: under it, not part of it; None: the parts are all there is.
         sky: radiance [H, 2 H, 3] by direction, row 0 at the zenith, column 0 at +x, towards +y.
         cam_from_world: [N, 4, 4], OpenCV axes.
     """
 
     parts: tuple[Part, ...]
-    ground: Ground
+    ground: Ground | None
     sky: np.ndarray
     cam_from_world: np.ndarray
 

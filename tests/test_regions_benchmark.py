@@ -1,0 +1,134 @@
+"""The benchmark of regions: its simulated points, what is seen of a subject, how a sphere is scored, its tables."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from benchmarks import regions
+from benchmarks.captures import kinds
+from benchmarks.captures.model import Capture
+from benchmarks.captures.shapes import block, flat, lump, sheet
+from benchmarks.captures.subject import enclosing_sphere, fit, seen_points
+from benchmarks.captures.tracks import FALSE_SHARE, MAX_ERROR_PX, simulate
+from benchmarks.captures.walks import orbit, shot
+
+BALL = (lump((0, 0, 1), (1, 1, 1), 0.8),)
+
+
+def ball_on_a_floor(*more) -> Capture:
+    shots = orbit((0, 0, 1), 3.0, (1.5, 2.0), np.random.default_rng(2))
+    return Capture(BALL, (flat((0, 0, 0), 20, 20, 0.5), *more), shots)
+
+
+# ---------------------------------------------------------------- simulated points
+def test_observations_are_of_points_in_the_frame_near_the_true_surfaces():
+    posed = simulate(ball_on_a_floor(), np.random.default_rng(0))
+    assert len(posed.points) > 500
+    image, point = posed.observations.T
+    assert set(point) == set(range(len(posed.points)))
+    inside = 0
+    for i in range(len(posed.cameras)):
+        pixels, depths = posed.cameras.project(i, posed.points[point[image == i]])
+        margin = MAX_ERROR_PX * 3
+        inside += ((depths > 0) & (pixels > -margin).all(1) & (pixels < posed.cameras.sizes[i] + margin).all(1)).sum()
+    assert inside / len(image) > 1 - 2 * FALSE_SHARE
+    from_ball = np.abs(np.linalg.norm(posed.points - [0, 0, 1], axis=1) - 0.5)
+    off = np.minimum(from_ball, np.abs(posed.points[:, 2]))
+    assert np.median(off) < 0.01
+    assert 0.002 < (off > 0.2).mean() < 3 * FALSE_SHARE  # the false ones
+
+
+def test_the_same_random_numbers_give_the_same_points():
+    first, again = (simulate(ball_on_a_floor(), np.random.default_rng(5)) for _ in range(2))
+    np.testing.assert_array_equal(first.points, again.points)
+    np.testing.assert_array_equal(first.observations, again.observations)
+
+
+def test_nothing_is_found_where_there_is_no_texture_or_behind_a_wall():
+    def on_ball(capture: Capture) -> int:
+        points = simulate(capture, np.random.default_rng(0)).points
+        return int((np.linalg.norm(points - [0, 0, 1], axis=1) < 0.55).sum())
+
+    whole = on_ball(ball_on_a_floor())
+    assert on_ball(ball_on_a_floor().plain(0.0)) < 0.05 * whole
+    walls = [sheet((x, y, 2), (x, y, 0), (4, 4), 0.5) for x, y in ((2, 0), (-2, 0), (0, 2), (0, -2))]
+    assert on_ball(ball_on_a_floor(*walls)) < 0.05 * whole
+
+
+# ---------------------------------------------------------------- score
+def test_a_sphere_that_holds_the_subject_scores_all_of_it_and_one_of_half_the_size_less():
+    points = seen_points(ball_on_a_floor())
+    center, radius = enclosing_sphere(points)
+    whole, half = fit(points, center, 1.001 * radius), fit(points, center, 0.5 * radius)
+    assert whole.inside == 100
+    assert whole.sphere_ratio == pytest.approx(1.003, abs=1e-3)
+    assert half.inside < 50
+    assert half.sphere_ratio == pytest.approx(0.125)
+
+
+def test_the_smallest_sphere_about_a_box():
+    corners = np.array([[x, y, z] for x in (0, 2) for y in (0, 3) for z in (0, 6)], dtype=float)
+    center, radius = enclosing_sphere(corners)
+    np.testing.assert_allclose(center, [1, 1.5, 3], atol=0.02)
+    assert radius == pytest.approx(3.5, abs=0.01)
+
+
+def test_only_what_two_photos_see_is_asked_for():
+    behind = np.array([shot((x, -3, 1.2), (0, 0, 1), np.random.default_rng(1)) for x in (-0.2, 0, 0.2)])
+    seen = seen_points(replace(ball_on_a_floor(), cam_from_world=behind))
+    assert (seen[:, 1] < 0.15).all()  # the front
+    single = replace(ball_on_a_floor(), cam_from_world=behind[:1])
+    with pytest.raises(ValueError, match="no photo shows"):
+        seen_points(single)
+    hidden = ball_on_a_floor(block((0, 0, 1), (1.4, 1.4, 1.4), 0.5))
+    with pytest.raises(ValueError, match="no photo shows"):
+        seen_points(hidden)
+
+
+# ---------------------------------------------------------------- captures
+@pytest.mark.parametrize("name", [name for name in kinds.KINDS if "," not in name])
+def test_photos_of_each_capture_show_its_subject_and_give_points(name: str):
+    capture = kinds.make(name)
+    subject = seen_points(capture, 1000)
+    assert len(subject) > 300
+    posed = simulate(capture, np.random.default_rng(0), 200)
+    _, radius = enclosing_sphere(subject)
+    assert len(posed.points) > 150
+    # cameras stand in the open: not within the subject, nor before a wall's back
+    depths = np.linalg.norm(
+        posed.points[posed.observations[:, 1]] - posed.cameras.centers[posed.observations[:, 0]], axis=1
+    )
+    assert np.median(depths) > 0.05 * radius
+
+
+def test_a_plain_capture_differs_from_its_original_in_texture_alone():
+    original, plain = kinds.make("trophy"), kinds.make("trophy, plain")
+    np.testing.assert_array_equal(original.cam_from_world, plain.cam_from_world)
+    assert plain.subject[0].texture == pytest.approx(kinds.PLAIN * original.subject[0].texture)
+    assert plain.surroundings[0].texture == original.surroundings[0].texture
+
+
+# ---------------------------------------------------------------- tables
+def _row(name: str, inside: float, volume: float) -> regions.Row:
+    return regions.Row(regions.MADE_UP, name, "what", inside, volume, 9.0, "object", "words", 0.5, 1000)
+
+
+def test_a_summary_counts_whole_subjects_only_and_a_row_shows_before_and_now():
+    before = {"a": _row("a", 99.99, 2.0), "b": _row("b", 100.0, 6.0)}
+    now = {"a": _row("a", 100.0, 3.0), "b": _row("b", 100.0, 5.0)}
+    lines = regions.summary_table(now, before).splitlines()
+    assert lines[2] == "| made-up | 0.1.0 | 1 of 2 | 99.99 | 4.0 | 6.0 |"
+    assert lines[3] == "| made-up | now | 2 of 2 | 100 | 4.0 | 5.0 |"
+    table = regions.capture_table([now["a"]], before).splitlines()
+    assert table[2] == "| a | what | 99.99 | 2.0 | 100 | 3.0 | 9 | 0.50 | object |"
+
+
+def test_results_survive_their_file(tmp_path, monkeypatch):
+    monkeypatch.setattr(regions, "RESULTS", tmp_path)
+    rows = {"a": _row("a", 99.0, 2.0)}
+    regions.save_rows(rows, "now")
+    assert regions.load_rows("now") == rows
+    assert regions.load_rows("older") == {}
