@@ -1,4 +1,4 @@
-"""Find the poses of sets of photos, and of ten ways to make such a set harder.
+"""Find the poses of sets of photos, and of twelve ways to make such a set harder.
 
 python -m benchmarks.hard_variants DATA                        every row that has no result yet
 python -m benchmarks.hard_variants DATA synth_helmet-blurred   these
@@ -42,6 +42,10 @@ VIDEO_FPS, VIDEO_HOLD = 30, 10  # every photo is shown for a third of a second
 BLUR_SHARE, BLUR_SIGMA = 0.3, 3 / 640  # of the photos; of the width
 CROP, CROP_SCALE = 0.75, 1.2  # of both sides; then enlarged
 GREY, NOISE = 128, 1.2  # of 255
+CUT_LEFT, CUT_TOP = 0.15, 0.1  # of the width, of the height
+# A lens whose distortion eases off towards the corners, as that of wide ones does, at the focal length of the synthetic
+# photos in widths: 10 % inwards at the corner.
+WIDE_FOCAL, WIDE_K1, WIDE_K2 = 1.39, -0.75, 1.25
 
 
 @dataclass(frozen=True)
@@ -177,11 +181,46 @@ def video(photos: list[Photo], folder: Path) -> None:
     writer.release()
 
 
+def off_centre(photos: list[Photo], folder: Path) -> None:
+    """15 % of the width cut off on the left, 10 % of the height at the top: the lens looks off the middle; no EXIF."""
+    for photo in photos:
+        height, width = photo.pixels.shape[:2]
+        _save(folder, photo, photo.pixels[round(CUT_TOP * height) :, round(CUT_LEFT * width) :])
+
+
+def wide_lens(photos: list[Photo], folder: Path) -> None:
+    """Barrel distortion that a single radial term does not describe, no EXIF."""
+    import cv2
+
+    for photo in photos:
+        height, width = photo.pixels.shape[:2]
+        where = distorted_positions(width, height)
+        _save(folder, photo, cv2.remap(photo.pixels, where[..., 0], where[..., 1], cv2.INTER_CUBIC))
+
+
+def distorted_positions(width: int, height: int) -> np.ndarray:
+    """[height, width, 2] float32: where each pixel of the wide lens is in the pinhole photo, pixel centres at integers.
+
+    Its corners are those of the photo.
+    """
+    import pycolmap
+
+    focal, center = WIDE_FOCAL * width, (width / 2, height / 2)
+    corner = np.hypot(*center) / focal
+    shrunk = 1 + WIDE_K1 * corner**2 + WIDE_K2 * corner**4
+    lens = pycolmap.Camera(
+        model="RADIAL", width=width, height=height, params=[focal / shrunk, *center, WIDE_K1, WIDE_K2]
+    )
+    grid = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), -1)
+    rays = np.asarray(lens.cam_from_img(grid.reshape(-1, 2)))
+    return (focal * rays + center - 0.5).reshape(height, width, 2).astype(np.float32)
+
+
 VARIANTS: dict[str, Callable[[list[Photo], Path], None]] = {
     function.__name__: function
     for function in (
         no_exif, rotated, two_cameras, blurred, every_third, black_background, plain_ground, wrong_focal, greyscale,
-        video,
+        video, off_centre, wide_lens,
     )
 }  # fmt: skip
 BASES = {
@@ -267,8 +306,6 @@ def true_centers(folder: Path) -> tuple[list[np.ndarray], float] | None:
 
 def center_error(workspace: Path, data: Path, row: str) -> dict[str, float] | None:
     """Distance of the camera centres of a workspace to the truth, median and largest, in percent of the extent."""
-    from stages.geometry.similarity import align_points
-
     name, _, variant = row.partition("-")
     truth, source = true_centers(data / name), photos_of(data / name)
     if truth is None:
@@ -280,11 +317,18 @@ def center_error(workspace: Path, data: Path, row: str) -> dict[str, float] | No
     if len(pairs) < 3:
         return None
     estimated, true = (np.array(side) for side in zip(*pairs, strict=True))
-    distance = np.linalg.norm(align_points(estimated, true).apply(estimated) - true, axis=1)
+    distance = center_distances(estimated, true)
     return {
         "median": round(100 * float(np.median(distance)) / extent, 4),
         "max": round(100 * float(distance.max()) / extent, 4),
     }
+
+
+def center_distances(found: np.ndarray, true: np.ndarray) -> np.ndarray:
+    """[N] distances of centres [N, 3] to the true ones, after alignment by a similarity."""
+    from stages.geometry.similarity import align_points
+
+    return np.linalg.norm(align_points(found, true).apply(found) - true, axis=1)
 
 
 def known_stem(source: Path, variant: str) -> Callable[[str], str]:
@@ -336,7 +380,7 @@ def run_row(row: str, data: Path, mesh: bool, preset: str, settings: Sequence[st
             failure = _failure(answer)
     stages = {stage["name"]: stage for stage in answer.get("stages", ())}
     placed = "sfm" in stages
-    registration = artifacts.REGISTRATION.load(workspace / "sfm") if placed else {}
+    registration = artifacts.REGISTRATION.load(workspace / "sfm") if placed else artifacts.Registration()
     words = [
         "python -m benchmarks.hard_variants DATA",
         row,
@@ -349,9 +393,9 @@ def run_row(row: str, data: Path, mesh: bool, preset: str, settings: Sequence[st
         machine=machine(),
         code=code_hash(),
         photos=_count(workspace, photos),
-        registered=len(registration.get("registered", ())),
+        registered=len(registration.registered),
         center_error=center_error(workspace, data, row) if placed else None,
-        attempts=tuple(registration.get("ladder", ())),
+        attempts=registration.ladder,
         cpu_s=round(stages["sfm"]["cpu_s"], 1) if placed else None,
         failure=failure,
         score=score,

@@ -59,6 +59,11 @@ class SfmParams(Section):
     camera_model: Literal["SIMPLE_RADIAL", "RADIAL", "OPENCV", "SIMPLE_PINHOLE", "PINHOLE"] = Field(
         "SIMPLE_RADIAL", description="COLMAP camera model that is estimated"
     )
+    refine_lens: Literal["auto", "off"] = Field(
+        "auto",
+        description="a last bundle adjustment of found poses; auto: frees each camera's principal point and radial k2 "
+        "where observations held out of it are met better. off: what mapping found stays",
+    )
     min_registered: int = Field(3, ge=2, description="fewer registered photos than this is an error")
     min_registered_ratio: float = Field(
         0.3, ge=0, le=1, description="registering a smaller part of the photos than this is an error"

@@ -52,7 +52,7 @@ def run(context: StageContext[ReportParams]) -> dict[str, Any]:
     """Write report.html. Returns its size in bytes, and how the final mesh meets held-out photos."""
     import jinja2
 
-    from stages.reporting import curves, numbers, photo_table, pictures
+    from stages.reporting import curves, numbers, photo_table, pictures, poses
     from stages.reporting.held_out_photos import compare_held_out
 
     scene, place, atlas = context.read(SCENE), context.read(WORLD_PLACE), context.read(ATLAS_MESH)
@@ -87,6 +87,7 @@ def run(context: StageContext[ReportParams]) -> dict[str, Any]:
         "overview": overview_svg(scene, region_corners(scene, context.read(GIVEN_REGION))),
         "warnings": numbers.warnings(manifests),
         "where": numbers.describe_where(scene, place, placed),
+        "poses": poses.describe_poses(registration, place),
         "charts": curves.training_charts(context.read(METRICS)),
         "previews": pictures.training_previews(context.read(PREVIEWS)),
         "stages": [numbers.stage_row(manifest) for manifest in manifests.values()],
@@ -169,7 +170,7 @@ def replay(context: StageContext[ReportParams]) -> str:
 
 REPORT: Stage[ReportParams] = Stage(
     name="report",
-    version=6,
+    version=7,
     settings=lambda config: config.report,
     run=run,
     reads=(

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import logging
 import shutil
+import time
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -27,6 +28,7 @@ from stages.artifacts import (
 from stages.capture.salient import INSTALL, find_weights
 from stages.engine.stage import Stage, StageContext
 from stages.errors import InputError, ReconstructionError
+from stages.posing.adjustment import LastAdjustment, adjust_last
 from stages.posing.evidence import MIN_VERIFIED, Evidence
 from stages.posing.known import match_photos
 from stages.posing.ladder import Step, climb, describe, photos_wanted
@@ -96,13 +98,24 @@ def run(context: StageContext[SfmParams]) -> dict[str, Any]:
         log.warning("the EXIF focal length, %.0f px, is wrong: the poses say %.0f px", prior, found)
     if steps[-1].kept and steps[-1].rung == RELAXED:
         log.warning("poses were found with relaxed thresholds only: they are rough, and some may be wrong")
+    last = _adjusted(context, best.model, bench.threads)
     others = len(best.others)
-    return _publish(context, best.model, best.registered, unregistered, params.mapper, bench.matcher, others, steps)
+    return _publish(context, last, best.registered, unregistered, params.mapper, bench.matcher, others, steps)
+
+
+def _adjusted(context: StageContext[SfmParams], model: Any, threads: int) -> LastAdjustment:
+    """The last adjustment of a model that was found, and what it freed and took in the log."""
+    context.progress(1, 1, "the last adjustment")
+    start = time.process_time()
+    last = adjust_last(model, context.params, threads)
+    freed = [f"{' and '.join(lens.freed)} of {lens.photos} photos" for lens in last.lenses if lens.freed]
+    log.info("last adjustment: freed %s (%.1f CPU s)", "; ".join(freed) or "nothing", time.process_time() - start)
+    return last
 
 
 def _publish(
     context: StageContext[SfmParams],
-    model: Any,
+    adjusted: LastAdjustment,
     registered: Iterable[str],
     unregistered: tuple[Unregistered, ...],
     mapper: str,
@@ -113,10 +126,11 @@ def _publish(
     """Write model and registration; returns the numbers of the manifest.
 
     Args:
+        adjusted: the model, and what is known of its exactness.
         others: models that mapping gave beside this one.
         steps: the attempts; none where the poses were given.
     """
-    folder = context.to_write(MODEL)
+    model, folder = adjusted.model, context.to_write(MODEL)
     folder.mkdir(parents=True)
     model.write(str(folder))
     points = model.num_points3D()
@@ -131,6 +145,8 @@ def _publish(
         matcher=matcher,
         kept=next((step.rung for step in reversed(steps) if step.kept), ""),
         ladder=tuple(step.as_dict() for step in steps),
+        lenses=adjusted.lenses,
+        pose_error=adjusted.pose_error,
     )
     context.write(REGISTRATION, registration)
     context.progress(1, 1, "done")
@@ -144,7 +160,10 @@ def _publish(
         "matcher": matcher,
         "focal_px": [round(camera.mean_focal_length(), 1) for camera in model.cameras.values()][:4],
     }
+    if error := adjusted.pose_error:
+        numbers["expected_center_error_percent"] = round(100 * error.center / error.distance, 4)
     if steps:
+        numbers["freed"] = sorted({freedom for lens in adjusted.lenses for freedom in lens.freed})
         numbers |= {"kept": registration.kept, "attempts": len(steps), "ladder": list(registration.ladder)}
     return numbers
 
@@ -179,7 +198,8 @@ def _from_known_poses(context: StageContext[SfmParams]) -> dict[str, Any]:
             progress=context.progress,
         )
     context.write(GIVEN_POSES, GivenPoses(origin=poses.origin.name, region=poses.region))
-    numbers = _publish(context, model, cameras, unregistered, "known poses", matcher)
+    given = LastAdjustment(model, lenses=(), pose_error=None)
+    numbers = _publish(context, given, cameras, unregistered, "known poses", matcher)
     points, error = numbers["points"], numbers["mean_reprojection_error_px"]
     if points < FEW_POINTS * len(cameras):
         log.warning(
@@ -287,7 +307,7 @@ def _too_few(
 
 SFM: Stage[SfmParams] = Stage(
     name="sfm",
-    version=3,
+    version=4,
     settings=lambda config: config.sfm,
     run=run,
     reads=(PHOTOS, IMAGE_SET),

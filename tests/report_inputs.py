@@ -15,6 +15,7 @@ from stages.artifacts import (
     AtlasMesh,
     ImageRecord,
     ImageSet,
+    PoseError,
     Registration,
     SkippedImage,
     Unregistered,
@@ -95,6 +96,7 @@ def full_inputs(context: StageContext) -> StageContext:
         Registration(
             registered=("a.png", "c.png"),
             unregistered=(Unregistered(name="b <odd>.png", reason="only 3 matches"),),
+            pose_error=PoseError(residual_px=0.5, center=0.002, distance=4.0),
         ),
     )
     lines = [{"step": 10 * i, "psnr": 10 + i, "loss": 0.5 / (i + 1), "rgb": None, "mask": 0.0} for i in range(50)]

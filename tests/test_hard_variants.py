@@ -55,11 +55,44 @@ def test_every_variant_changes_photos_and_keeps_their_names(variant, data):
             assert pixels.shape[:2] == ((64, 48) if i % 2 else (48, 64))
         if variant == "two_cameras":
             assert pixels.shape[:2] == ((43, 58) if i % 2 else (48, 64))
+        if variant == "off_centre":
+            assert (pixels == photo.pixels[5:, 10:]).all()
         if variant in ("black_background", "plain_ground"):
             mask = photo.mask
             assert (pixels[mask] == photo.pixels[mask]).all()
             assert abs(pixels[~mask].mean() - (0 if variant == "black_background" else hard.GREY)) < 1
     assert make_photos(f"synth_helmet-{variant}", data) == folder  # made once
+
+
+def test_the_wide_lens_is_one_that_needs_two_radial_terms():
+    where = hard.distorted_positions(640, 480) + 0.5
+    center, focal = np.array([320, 240]), hard.WIDE_FOCAL * 640
+    assert np.abs(where[[0, -1], [0, -1]] - [[0.5, 0.5], [639.5, 479.5]]).max() < 0.6
+    assert where.min() > 0
+    assert (where.max((0, 1)) < [640, 480]).all()
+    pixels = np.stack(np.meshgrid(np.arange(640) + 0.5, np.arange(480) + 0.5), -1)
+    out, true = (np.linalg.norm(each - center, axis=-1) for each in (pixels, where))
+    far = out > 30
+    shrunk, squares = (out / true)[far], (true[far] / focal) ** 2
+    one, two = (np.vander(squares, terms + 1, increasing=True) for terms in (1, 2))
+    rest = [shrunk - each @ np.linalg.lstsq(each, shrunk, rcond=None)[0] for each in (one, two)]
+    assert np.abs(rest[1] * out[far]).max() < 0.02  # pixels
+    assert np.abs(rest[0] * out[far]).max() > 1.0
+
+
+def test_a_row_tells_what_the_workspace_says(data, monkeypatch):
+    from stages import artifacts
+
+    def answer(arguments, answers):
+        folder = hard.FOLDERS / "synth_helmet-no_exif" / "workspace" / "sfm"
+        folder.mkdir(parents=True)
+        artifacts.REGISTRATION.save(folder, artifacts.Registration(registered=("000.png",), ladder=(STEP,)))
+        return {"ok": True, "stages": [{"name": "sfm", "cpu_s": 3.21}]}
+
+    monkeypatch.setattr(hard, "run_hineus", answer)
+    monkeypatch.setattr(hard, "center_error", lambda *_: None)
+    row = hard.run_row("synth_helmet-no_exif", data, mesh=False, preset="cpu")
+    assert (row.photos, row.registered, row.attempts, row.cpu_s) == (7, 1, (STEP,), 3.2)
 
 
 def test_a_third_of_the_photos_is_blurred(data):

@@ -86,6 +86,7 @@ def test_the_page_says_it_all_and_refers_to_nothing_outside(full):
     assert "Permission is hereby granted" in own  # three.js travels with its licence
     for text in (
         "only 3 matches",
+        "Expected error of the camera centres: 0.05 % of the distance (0.002 m)",
         "2 of 3 photos were placed",
         "1 were held out",
         "b &lt;odd&gt;.png",

@@ -48,6 +48,11 @@ def test_rendered_capture_gives_back_its_cameras(tmp_path: Path):
     assert [item.name for item in registration.unregistered] == [f"{len(poses):03d}.png"]
     assert "matches no other photo" in registration.unregistered[0].reason
     assert registration.mean_reprojection_error_px < 1.0
+    (lens,) = registration.lenses
+    assert lens.photos == len(poses)
+    assert lens.params["f"] == pytest.approx(FOCAL, rel=0.02)
+    assert numbers["freed"] == list(lens.freed)
+    assert 0 < numbers["expected_center_error_percent"] < 1
 
     model = pycolmap.Reconstruction(str(artifacts.MODEL.load(out)))
     found = {image.name: image.cam_from_world().matrix() for image in model.images.values()}

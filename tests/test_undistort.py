@@ -31,7 +31,7 @@ from stages.geometry.cameras import PinholeCameras, PosedScene
 from stages.geometry.place import Place, given_region
 from stages.geometry.plane import Plane
 from stages.geometry.similarity import Similarity
-from stages.posing.undistortion import png_names
+from stages.posing.undistortion import plan_warp, png_names, warp_maps
 
 
 def place_of(root: Path) -> Place:
@@ -62,6 +62,28 @@ def test_points_appear_where_the_scene_cameras_project_them(
         assert alone.sum() >= 2
         found = dots_seen(photo, pixels[alone])
         np.testing.assert_allclose(found, pixels[alone], atol=0.15)
+
+
+@pytest.mark.parametrize("max_side", [None, 200])
+@pytest.mark.parametrize("shift", [(96.0, -48.0), (-60.0, 30.0)])
+def test_rays_are_those_of_the_photo_where_the_principal_point_is_off_the_middle(shift, max_side):
+    import pycolmap
+
+    params = [500.0, 320 + shift[0], 240 + shift[1], -0.2, 0.08]
+    camera = pycolmap.Camera(model="RADIAL", width=640, height=480, params=params)
+    warp = plan_warp(camera, max_side)
+    where = np.stack(warp_maps(camera, warp), -1).astype(float) + 0.5  # in the photo, or the reduced one
+    if warp.shrink_to is not None:
+        where *= np.array([camera.width, camera.height]) / warp.shrink_to
+    of_photo = np.asarray(camera.cam_from_img(where.reshape(-1, 2)))
+    pixels = np.stack(np.meshgrid(np.arange(warp.size[0]) + 0.5, np.arange(warp.size[1]) + 0.5), -1).reshape(-1, 2)
+    rays = np.concatenate([pixels, np.ones((len(pixels), 1))], 1) @ np.linalg.inv(warp.intrinsics).T
+    assert camera.mean_focal_length() * np.abs(rays[:, :2] - of_photo).max() < 1e-3  # pixels
+    assert (where > -0.5).all()
+    assert (where < [640.5, 480.5]).all()
+    off = warp.intrinsics[:2, 2] - np.array(warp.size) / 2
+    assert (np.abs(off) > 0.5 * np.abs(shift) * max(warp.size) / 640).all()  # cropping moves it towards the middle
+    assert (np.sign(off) == np.sign(shift)).all()
 
 
 def test_image_pixels_all_come_from_the_photo(tmp_path: Path):

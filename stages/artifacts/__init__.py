@@ -14,6 +14,17 @@ from stages.artifacts.mesh import CLEAN_FULL_MESH, CLEAN_MESH, RAW_MESH
 from stages.artifacts.pictures import IMAGES, MASKS, Pictures, write_png
 from stages.artifacts.place import GIVEN_REGION, WORLD_PLACE
 from stages.artifacts.report import PAGE
-from stages.artifacts.sfm import GIVEN_POSES, MODEL, REGISTRATION, GivenPoses, KnownSphere, Registration, Unregistered
+from stages.artifacts.sfm import (
+    GIVEN_POSES,
+    MODEL,
+    REGISTRATION,
+    GivenPoses,
+    KnownSphere,
+    Lens,
+    LensTrial,
+    PoseError,
+    Registration,
+    Unregistered,
+)
 from stages.artifacts.train import CAMERAS, FIELD, HELD_OUT, METRICS, PREVIEWS, SCENE, checkpoint_path, preview_path
 from stages.artifacts.undistort import FIRST_SCENE, PINHOLE_PHOTOS, SILHOUETTES

@@ -18,6 +18,58 @@ class Unregistered(Record):
     reason: str
 
 
+class LensTrial(Record):
+    """A part of the lens that the last adjustment tried to free.
+
+    Attributes:
+        freedom: what, in words.
+        held_out_px: mean error of the held-out observations without and with it, pixels.
+        refused: why it was not kept, in words; empty where it was.
+    """
+
+    freedom: str
+    held_out_px: tuple[float, float]
+    refused: str
+
+
+class Lens(Record):
+    """The intrinsics of one camera.
+
+    Attributes:
+        photos: how many it took. size: width and height of its frame, pixels.
+        model: COLMAP's name. params: its parameters by COLMAP's names.
+        standard_errors: of those that were adjusted; none where they could not be told.
+        trials: what the last adjustment tried on it.
+    """
+
+    photos: int
+    size: tuple[int, int]
+    model: str
+    params: dict[str, float]
+    standard_errors: dict[str, float]
+    trials: tuple[LensTrial, ...] = ()
+
+    @property
+    def freed(self) -> tuple[str, ...]:
+        """What was freed for good."""
+        return tuple(trial.freedom for trial in self.trials if not trial.refused)
+
+
+class PoseError(Record):
+    """How exact the poses are, from their covariance; what all photos err alike is not in it.
+
+    Attributes:
+        residual_px: a-posteriori standard deviation of a feature's coordinate, pixels.
+        center: median over the photos of their centres' expected error (root mean square, after alignment by a
+            similarity), in the frame of the poses.
+        distance: median distance from a photo to a point it sees, in the same unit.
+    """
+
+    residual_px: float
+    center: float
+    distance: float
+
+
 class Registration(Record):
     """How the photos were placed.
 
@@ -28,6 +80,7 @@ class Registration(Record):
         mapper, matcher: how poses and pairs were found.
         kept: the attempt whose model this is; empty where the poses were given.
         ladder: the attempts, see `stages.posing.ladder.Step`.
+        lenses: of the cameras; none where the poses were given. pose_error: None there, and where it cannot be told.
     """
 
     registered: tuple[str, ...] = ()
@@ -40,6 +93,8 @@ class Registration(Record):
     matcher: str = ""
     kept: str = ""
     ladder: tuple[dict[str, Any], ...] = ()
+    lenses: tuple[Lens, ...] = ()
+    pose_error: PoseError | None = None
 
 
 class KnownSphere(Record):

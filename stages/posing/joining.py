@@ -130,7 +130,7 @@ def align(first: Any, second: Any, common: np.ndarray, seed: int = 0) -> tuple[A
     fits = []
     for distance in SEARCH_DISTANCES:
         search = pycolmap.RANSACOptions()
-        search.max_error, search.random_seed = distance * _view_distance(first), seed
+        search.max_error, search.random_seed = distance * view_distance(first), seed
         found: Any = pycolmap.estimate_sim3d_robust(others, places, search)
         if found is not None:
             first_from_second = found["tgt_from_src"]
@@ -143,7 +143,7 @@ def align(first: Any, second: Any, common: np.ndarray, seed: int = 0) -> tuple[A
     return first_from_second, agreeing
 
 
-def _view_distance(model: Any) -> float:
+def view_distance(model: Any) -> float:
     """Median distance from a photo to a point it sees."""
     distances = [
         np.linalg.norm(point.xyz - model.images[element.image_id].projection_center())
