@@ -12,10 +12,11 @@ from benchmarks import regions
 from benchmarks.captures import kinds, photos
 from benchmarks.captures.model import Capture
 from benchmarks.captures.shapes import block, flat, lump, sheet
-from benchmarks.captures.subject import enclosing_sphere, fit, seen_points
+from benchmarks.captures.subject import fit, seen_points
 from benchmarks.captures.tracks import FALSE_SHARE, MAX_ERROR_PX, simulate
 from benchmarks.captures.walks import orbit, shot
 from stages.evaluation.protocols.known_object import load_known_object
+from stages.geometry.region import enclosing_sphere
 
 BALL = (lump((0, 0, 1), (1, 1, 1), 0.8),)
 

@@ -16,7 +16,11 @@ from stages.capture.masks import read_mask
 from stages.evaluation.alignment import by_cameras
 from stages.evaluation.protocols.known_object import file_stem, has_truth, load_known_object
 from stages.evaluation.surfaces import sample_faces
+from stages.geometry.attention import parallax_deg
 from stages.geometry.cameras import PinholeCameras
+from stages.geometry.plane import find_ground
+from stages.geometry.region import STANDING, enclosing_sphere
+from stages.geometry.up import estimate_up
 from stages.posing import neus
 from stages.posing.undistortion import plan_warp, png_names, posed_cameras, registered_photos, warp_maps, warp_mask
 from stages.surface.triangle_mesh import raycaster
@@ -101,7 +105,7 @@ def points_on_masks(posed: Posed) -> np.ndarray:
 
 
 def central_points(posed: Posed) -> np.ndarray:
-    """Well-found sparse points that at least three of the photos that see them have near their middle."""
+    """Well-found sparse points that at least three photos have near their middle, but for those on the ground."""
     image, point = posed.observations.T
     central = np.zeros(len(posed.points), dtype=int)
     for i in range(len(posed.cameras)):
@@ -109,18 +113,14 @@ def central_points(posed: Posed) -> np.ndarray:
         pixels, _ = posed.cameras.project(i, posed.points[seen])
         near = (np.abs(pixels / posed.cameras.sizes[i] - 0.5) < CENTRAL).all(1)
         np.add.at(central, seen[near], 1)
-    return posed.points[well_found(posed) & (central >= CENTRAL_PHOTOS)]
+    chosen = well_found(posed) & (central >= CENTRAL_PHOTOS)
+    center, radius = enclosing_sphere(posed.points[chosen])
+    ground = find_ground(posed.points, posed.cameras.centers, estimate_up(posed.cameras).direction, center, radius)
+    return posed.points[chosen if ground is None else chosen & (ground.heights(posed.points) > STANDING * radius)]
 
 
 def well_found(posed: Posed) -> np.ndarray:
     """[P] bool: small error, seen by three photos at least, and rays that meet at an angle."""
-    image, point = posed.observations.T
-    rays = posed.points[point] - posed.cameras.centers[image]
-    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    mean = np.zeros_like(posed.points)
-    np.add.at(mean, point, rays)
-    mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-12)
-    least = np.ones(len(mean))
-    np.minimum.at(least, point, np.einsum("mi,mi->m", rays, mean[point]))
-    wide = 2 * np.degrees(np.arccos(np.clip(least, -1, 1))) >= MIN_ANGLE_DEG
-    return wide & (posed.errors < MAX_ERROR_PX) & (np.bincount(point, minlength=len(mean)) >= MIN_TRACK)
+    track = np.bincount(posed.observations[:, 1], minlength=len(posed.points))
+    wide = parallax_deg(posed.cameras, posed.points, posed.observations) >= MIN_ANGLE_DEG
+    return wide & (posed.errors < MAX_ERROR_PX) & (track >= MIN_TRACK)

@@ -9,6 +9,7 @@ import numpy as np
 from benchmarks.captures.model import Capture, joined
 from benchmarks.captures.tracks import sight
 from stages.evaluation.surfaces import sample_faces
+from stages.geometry.region import enclosing_sphere
 from stages.surface.triangle_mesh import raycaster
 
 SAMPLES = 6000
@@ -51,12 +52,3 @@ def fit(points: np.ndarray, center: np.ndarray, radius: float) -> Fit:
     volume = 4 / 3 * np.pi * radius**3
     inside = np.linalg.norm(points - center, axis=1) < radius
     return Fit(100 * float(inside.mean()), float((radius / least) ** 3), float(volume / np.ptp(points, axis=0).prod()))
-
-
-def enclosing_sphere(points: np.ndarray) -> tuple[np.ndarray, float]:
-    """Centre and radius of the smallest sphere about points [P, 3], to a thousandth (Badoiu and Clarkson 2003)."""
-    center = points.mean(0)
-    for step in range(1, 1000):
-        farthest = points[np.argmax(np.sum((points - center) ** 2, axis=1))]
-        center = center + (farthest - center) / (step + 1)
-    return center, float(np.linalg.norm(points - center, axis=1).max())

@@ -61,7 +61,7 @@ MAX_ONE_SIDED = 0.5
 FORWARD_DEPTHS = 4.0
 # Points with fewer neighbours than this within this part of their median distance from the middle are wrong.
 MIN_NEIGHBOURS, MAX_ISOLATION = 2, 0.7
-ENCLOSING_STEPS = 200
+ENCLOSING_STEPS = 1000
 FROM_FRUSTA, FROM_ATTENTION, FROM_POINTS = "the frusta of the cameras", "what the photos look at", "the sparse points"
 IRLS_STEPS = 30
 TINY = 1e-12  # keeps divisions finite; far below any length that occurs
@@ -270,7 +270,7 @@ def _connected(points: Float[np.ndarray, "p 3"], region: RegionOfInterest) -> Fl
 
 
 def enclosing_sphere(points: Float[np.ndarray, "p 3"]) -> tuple[Float[np.ndarray, " 3"], float]:
-    """Nearly the smallest sphere about points (at most 1 % too large).
+    """Nearly the smallest sphere about points (a thousandth too large).
 
     Steps of shrinking length towards the farthest point (Badoiu and Clarkson, "Smaller core-sets for balls", 2003).
     """
