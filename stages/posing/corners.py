@@ -14,10 +14,10 @@ if TYPE_CHECKING:
     from jaxtyping import Float
 
 GRADIENT_SIGMA = 1.0  # pixels: of the blur before gradients; outlines that were cut out have steps
-WINDOW_SIGMA = 2.0  # pixels: of the window in which gradients are gathered
+WINDOW_SIGMA = 1.5  # pixels: of the window in which gradients are gathered
 # The smaller eigenvalue of the structure tensor, against the larger one and as a gradient in grey levels a pixel: less
 # in the one is an edge, along which a point slides, in the other noise.
-MIN_RATIO, MIN_GRADIENT = 0.1, 0.5
+MIN_RATIO, MIN_GRADIENT = 0.03, 0.5
 SPACING = 2  # pixels: a corner is the strongest within a square of this half side
 BORDER = 4  # pixels at the edge of a photo where no corner is looked for
 REFINING_HALF_SIDE, MAX_MOVE = 4, 3.0  # pixels: window of the exact position, and how far it may lie from the peak

@@ -24,7 +24,14 @@ from stages.errors import InputError
 from stages.posing.evidence import MIN_PNP, MIN_VERIFIED
 from stages.posing.joining import join_models
 from stages.posing.ladder import Rung, Solution
-from stages.posing.settings import STATIONARY_PX, feature_options, mapping_options, match_options, verification_options
+from stages.posing.settings import (
+    STATIONARY_PX,
+    expect_corners,
+    feature_options,
+    mapping_options,
+    match_options,
+    verification_options,
+)
 
 log = logging.getLogger(__name__)
 
@@ -40,6 +47,9 @@ RELAXED = "relaxed thresholds"
 # share, matches and angle of the first pair.
 RELAXED_VERIFIED, RELAXED_PNP, RELAXED_PNP_SHARE = 10, 12, 0.1  # 15, 30, 0.25
 RELAXED_INIT_INLIERS, RELAXED_INIT_ANGLE_DEG = 40, 6.0  # 100, 16
+# Corners are few and exact: fewer of them are believed, if they agree within fewer pixels (see `expect_corners`).
+CORNER_VERIFIED, CORNER_PNP = 10, 8
+LEARNED = "corners with learned descriptors"
 # Parts of an attempt's progress, from timings of 47-photo sets.
 PART_FEATURES, PART_MATCHES = 0.3, 0.7
 
@@ -48,15 +58,19 @@ Progress = Callable[[float, float, str], None]
 
 @dataclass(frozen=True)
 class Base:
-    """What an attempt matches on: features, where they are looked for, and whether EXIF focal lengths are believed."""
+    """What an attempt matches on: features, where they are looked for, and whether EXIF focal lengths are believed.
+
+    Corners with learned descriptors take the place of SIFT, affine or not.
+    """
 
     affine: bool = False
+    corners: bool = False
     masked: bool = False
     focal_priors: bool = True
 
     @property
     def file(self) -> str:
-        parts = ["affine" if self.affine else "plain"]
+        parts = ["corners" if self.corners else "affine" if self.affine else "plain"]
         parts += ["masked"] * self.masked + ["no-priors"] * (not self.focal_priors)
         return "-".join(parts) + ".db"
 
@@ -90,7 +104,7 @@ class Workbench:
         self.image_set, self.params = image_set, params
         self.names = frozenset(record.name for record in image_set.images)
         self.threads, self.workers = threads, workers
-        self.cuda = cuda and pycolmap.has_cuda
+        self.cuda, self.torch_cuda = cuda and pycolmap.has_cuda, cuda
         self._progress, self._rung = progress, ""
         self._other = "global" if params.mapper == "incremental" else "incremental"
         self._guided = self._relaxed = self._stationary = False
@@ -119,7 +133,8 @@ class Workbench:
             # became of 11, in 1.2 times the seconds. Pooling over sizes makes it 111, but takes 2.5 times the seconds,
             # and placed no photo that this did not.
             self._rung_of("affine features", partial(self.other_features, affine=True)),
-            self._rung_of("guided matching", self.guided_matching),
+            self._rung_of(LEARNED, self.learned_corners, lambda best: learned_available()),
+            self._rung_of("guided matching", self.guided_matching, self.matched_on_sift),
             self._rung_of(f"{self._other} mapper", self.other_mapper),
             self._rung_of(RELAXED, self.relaxed_thresholds),
         ]
@@ -163,6 +178,12 @@ class Workbench:
         self._features_and_matches(base, best)
         return self._solve(base, self.params.mapper)
 
+    def learned_corners(self, best: Solution | None) -> Solution | None:
+        """Corners, which plain objects have too, matched by what a network sees around them."""
+        base = replace(self._base_of(best), affine=False, corners=True)
+        self._corners_and_matches(base)
+        return self._solve(base, "incremental")
+
     def guided_matching(self, best: Solution | None) -> Solution | None:
         """Photos left out against all others, with more matches along the epipolar lines that were found."""
         self._guided = True
@@ -176,6 +197,10 @@ class Workbench:
         """Photos left out are believed on fewer matches; the others stay where they are."""
         self._relaxed = True
         return self._match_anew(best)
+
+    def matched_on_sift(self, best: Solution | None) -> bool:
+        """COLMAP can match these features itself."""
+        return not self._base_of(best).corners
 
     def priors_are_doubtful(self, best: Solution | None) -> bool:
         """There are EXIF focal lengths, and the poses do badly with them or contradict them."""
@@ -215,11 +240,39 @@ class Workbench:
             self._match_pairs(base, self._pairs_to_try(base, best))
         self._tell(PART_MATCHES, "poses")
 
+    def _corners_and_matches(self, base: Base) -> None:
+        from stages.posing.learned import likely_pairs, write_corners, write_matches
+        from stages.posing.xfeat import load_network, weights_path
+
+        path = weights_path()
+        assert path is not None  # `learned_available`
+        network = load_network(path, "cuda" if self.torch_cuda else "cpu")
+        self._latest = base
+        self._import(base)
+        if not base.focal_priors:
+            forget_focal_priors(self.database(base), self.params.camera_model)
+        masks = self.masks_folder if base.masked else None
+
+        def features(done: float) -> None:
+            self._tell(PART_FEATURES * done, "features")
+
+        def matches(done: float) -> None:
+            self._tell(PART_FEATURES + (PART_MATCHES - PART_FEATURES) * done, "matches")
+
+        descriptors = write_corners(self.database(base), self.images_folder, masks, network, features)
+        pairs = likely_pairs(descriptors, self.params.exhaustive_max)
+        write_matches(self.database(base), descriptors, pairs, matches)
+        self._verify_again(base)
+        self._tell(PART_MATCHES, "poses")
+
     def _match_anew(self, best: Solution | None) -> Solution | None:
         """Match the pairs with photos left out as is set now, and map."""
         import pycolmap
 
         base = self._base_of(best)
+        if base.corners:
+            self._verify_again(base)
+            return self._solve(base, "incremental", best)
         pairs = self._pairs_to_try(base, best)
         with pycolmap.Database.open(self.database(base)) as database:
             for first, second in pairs:
@@ -288,12 +341,14 @@ class Workbench:
     @property
     def verified(self) -> int:
         """So many matches of a pair are enough now."""
-        return RELAXED_VERIFIED if self._relaxed else MIN_VERIFIED
+        least = CORNER_VERIFIED if self._latest.corners else MIN_VERIFIED
+        return min(least, RELAXED_VERIFIED) if self._relaxed else least
 
     @property
     def agreeing(self) -> int:
         """So many 3D points that agree on a photo's position are enough now."""
-        return RELAXED_PNP if self._relaxed else MIN_PNP
+        least = CORNER_PNP if self._latest.corners else MIN_PNP
+        return min(least, RELAXED_PNP) if self._relaxed else least
 
     def _match(self, base: Base) -> None:
         import pycolmap
@@ -322,7 +377,7 @@ class Workbench:
             database.clear_two_view_geometries()
         options = pycolmap.GeometricVerifierOptions()
         options.num_threads = self.threads
-        judged = verification_options(self.params, self.verified, self._stationary)
+        judged = verification_options(self.params, self.verified, self._stationary, base.corners)
         pycolmap.geometric_verification(self.database(base), verifier_options=options, two_view_geometry_options=judged)
 
     # ------------------------------------------------------------ poses
@@ -379,7 +434,9 @@ class Workbench:
         options = mapping_options(self.params, self.threads)
         options.min_model_size = 3  # small captures are captures too
         options.mapper.abs_pose_min_num_inliers = self.agreeing
-        if self._relaxed:
+        if self._latest.corners:
+            expect_corners(options, self.verified)
+        elif self._relaxed:
             options.min_num_matches = self.verified
             options.mapper.abs_pose_min_inlier_ratio = RELAXED_PNP_SHARE
             options.mapper.init_min_num_inliers = RELAXED_INIT_INLIERS
@@ -412,6 +469,13 @@ class Workbench:
             next_image_callback=one_more,
         )
         return list(models.values())
+
+
+def learned_available() -> bool:
+    """Whether the extra `features` is installed."""
+    from stages.posing.xfeat import weights_path
+
+    return weights_path() is not None
 
 
 # ---------------------------------------------------------------- on databases

