@@ -95,6 +95,7 @@ def mapping_options(params: Any, threads: int) -> Any:
 def expect_corners(options: Any, verified: int) -> None:
     """Set `pycolmap.IncrementalPipelineOptions` for features that are corners; verified: matches a pair needs."""
     options.min_num_matches = verified
+    options.structure_less_registration_fallback = False  # few corners are no ground for a pose without points
     mapper, triangulation = options.mapper, options.triangulation
     mapper.init_min_num_inliers, mapper.init_min_tri_angle = CORNER_INIT_INLIERS, CORNER_INIT_ANGLE_DEG
     mapper.init_max_error = CORNER_EPIPOLAR_PX

@@ -49,6 +49,8 @@ RELAXED_VERIFIED, RELAXED_PNP, RELAXED_PNP_SHARE = 10, 12, 0.1  # 15, 30, 0.25
 RELAXED_INIT_INLIERS, RELAXED_INIT_ANGLE_DEG = 40, 6.0  # 100, 16
 # Corners are few and exact: fewer of them are believed, if they agree within fewer pixels (see `expect_corners`).
 CORNER_VERIFIED, CORNER_PNP = 10, 8
+CORNER_SUPPORT = 12  # points that a photo still sees after the adjustment, or its pose was wrong
+CORNER_ROUNDS = 3  # of matching again by the poses found
 LEARNED = "corners with learned descriptors"
 # Parts of an attempt's progress, from timings of 47-photo sets.
 PART_FEATURES, PART_MATCHES = 0.3, 0.7
@@ -181,8 +183,14 @@ class Workbench:
     def learned_corners(self, best: Solution | None) -> Solution | None:
         """Corners, which plain objects have too, matched by what a network sees around them."""
         base = replace(self._base_of(best), affine=False, corners=True)
-        self._corners_and_matches(base)
-        return self._solve(base, "incremental")
+        descriptors = self._corners_and_matches(base)
+        found = self._solve(base, "incremental")
+        for _ in range(CORNER_ROUNDS if found is not None else 0):
+            better = self._matched_by_poses(base, found.model, descriptors)
+            if better is None or len(better.registered) < len(found.registered):
+                break
+            found = better
+        return found
 
     def guided_matching(self, best: Solution | None) -> Solution | None:
         """Photos left out against all others, with more matches along the epipolar lines that were found."""
@@ -240,7 +248,27 @@ class Workbench:
             self._match_pairs(base, self._pairs_to_try(base, best))
         self._tell(PART_MATCHES, "poses")
 
-    def _corners_and_matches(self, base: Base) -> None:
+    def _matched_by_poses(self, base: Base, model: Any, descriptors: Any) -> Solution | None:
+        """Match again where the poses found allow it, and go on from them."""
+        import pycolmap
+
+        from stages.posing.learned import write_guided_matches
+
+        write_guided_matches(self.database(base), descriptors, model)
+        self._verify_again(base)
+        folder = self._new_folder()
+        start = pycolmap.triangulate_points(
+            model,
+            self.database(base),
+            self.images_folder,
+            folder,
+            clear_points=True,
+            options=self._mapping(),
+            refine_intrinsics=False,
+        )
+        return self._solution_of(base, self._map_incremental(base, start))
+
+    def _corners_and_matches(self, base: Base) -> Any:
         from stages.posing.learned import likely_pairs, write_corners, write_matches
         from stages.posing.xfeat import load_network, weights_path
 
@@ -264,6 +292,7 @@ class Workbench:
         write_matches(self.database(base), descriptors, pairs, matches)
         self._verify_again(base)
         self._tell(PART_MATCHES, "poses")
+        return descriptors
 
     def _match_anew(self, best: Solution | None) -> Solution | None:
         """Match the pairs with photos left out as is set now, and map."""
@@ -393,6 +422,14 @@ class Workbench:
             if start is not None and (start.base != base or 2 * len(start.registered) <= len(self.names)):
                 start = None
             models = self._join(base, self._map_incremental(base, start and start.model))
+        return self._solution_of(base, models)
+
+    def _solution_of(self, base: Base, models: list[Any]) -> Solution | None:
+        """The largest model."""
+        if base.corners:
+            for model in models:
+                drop_unsupported(model, CORNER_SUPPORT)
+            models = [model for model in models if model.num_reg_images() > 2]
         if not models:
             return None
         largest = max(models, key=lambda model: (model.num_reg_images(), model.num_points3D()))
@@ -469,6 +506,13 @@ class Workbench:
             next_image_callback=one_more,
         )
         return list(models.values())
+
+
+def drop_unsupported(model: Any, least: int) -> None:
+    """Take photos out of a model that see fewer than so many of its points: their poses were wrong."""
+    for image in [model.images[i] for i in model.reg_image_ids()]:
+        if image.num_points3D < least:
+            model.deregister_frame(image.frame_id)
 
 
 def learned_available() -> bool:

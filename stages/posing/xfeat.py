@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 from torch import nn
-from torch.nn import functional as F
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Integer
@@ -79,7 +78,7 @@ class XFeat(nn.Module):
         sixteenth = self.block4(eighth)
         coarsest = self.block5(sixteenth)
         size = eighth.shape[-2:]
-        coarse = [F.interpolate(x, size, mode="bilinear") for x in (sixteenth, coarsest)]
+        coarse = [nn.functional.interpolate(x, size, mode="bilinear") for x in (sixteenth, coarsest)]
         return self.block_fusion(eighth + coarse[0] + coarse[1])
 
 
@@ -108,22 +107,27 @@ def describe_points(
     height, width = grey.shape
     scale = SIDE / max(height, width)
     size = [max(STRIDE, round(scale * side / STRIDE) * STRIDE) for side in (height, width)]
-    seen = F.interpolate(grey[None, None].float(), size, mode="bicubic", antialias=scale < 1)
-    descriptors = F.normalize(network(seen), dim=1)
+    seen = nn.functional.interpolate(grey[None, None].float(), size, mode="bicubic", antialias=scale < 1)
+    descriptors = nn.functional.normalize(network(seen), dim=1)
     grid = 2 * points / points.new_tensor([width, height]) - 1
-    sampled = F.grid_sample(descriptors, grid[None, None].to(descriptors), mode="bicubic", align_corners=False)
-    return F.normalize(sampled[0, :, 0].T, dim=1)
+    sampled = nn.functional.grid_sample(
+        descriptors, grid[None, None].to(descriptors), mode="bicubic", align_corners=False
+    )
+    return nn.functional.normalize(sampled[0, :, 0].T, dim=1)
 
 
 def mutual_matches(
     first: Float[torch.Tensor, "n 64"], second: Float[torch.Tensor, "m 64"], min_cosine: float = MIN_COSINE
 ) -> Integer[np.ndarray, "k 2"]:
     """Pairs of indices that are each other's most similar descriptors, with at least this cosine between them."""
-    if not (len(first) and len(second)):
+    return mutual_best(first @ second.T, min_cosine)
+
+
+def mutual_best(cosines: Float[torch.Tensor, "n m"], least: float) -> Integer[np.ndarray, "k 2"]:
+    """Indices of the entries that are the largest of both their row and their column, and at least this large."""
+    if 0 in cosines.shape:
         return np.zeros((0, 2), np.uint32)
-    cosines = first @ second.T
     best, partner = cosines.max(1)
-    back = cosines.argmax(0)
-    own = torch.arange(len(first), device=first.device)
-    chosen = own[(back[partner] == own) & (best >= min_cosine)]
+    own = torch.arange(len(cosines), device=cosines.device)
+    chosen = own[(cosines.argmax(0)[partner] == own) & (best >= least)]
     return torch.stack([chosen, partner[chosen]], 1).cpu().numpy().astype(np.uint32)
