@@ -233,6 +233,16 @@ def test_photos_of_plain_blocks_are_placed(tmp_path: Path):
     assert np.median(error) < 0.04  # 1 % of the 4 units that the blocks measure
 
 
+@needs_weights
+def test_where_corners_find_nothing_later_rungs_go_on_with_sift(tmp_path: Path):
+    bench = bench_of_blocks(tmp_path, 3)
+    before = bench._latest
+    bench._corners_and_matches = lambda base: bench._import(base) or setattr(bench, "_latest", base)  # no features
+    assert bench.learned_corners(None) is None
+    assert bench._latest == before
+    assert bench.matched_on_sift(None)
+
+
 # ---------------------------------------------------------------- without the extra
 def test_without_the_extra_the_rung_is_absent_and_hints_name_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     from configs.params import SfmParams

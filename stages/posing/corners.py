@@ -47,9 +47,9 @@ def _eigenvalues(grey: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """[H, W] smaller and larger eigenvalue of the structure tensor."""
     import cv2
 
-    smooth = cv2.GaussianBlur(grey.astype(np.float32), None, GRADIENT_SIGMA)
+    smooth = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), GRADIENT_SIGMA)
     dx, dy = (cv2.Sobel(smooth, cv2.CV_32F, *axis, scale=1 / 8) for axis in ((1, 0), (0, 1)))
-    xx, xy, yy = (cv2.GaussianBlur(product, None, WINDOW_SIGMA) for product in (dx * dx, dx * dy, dy * dy))
+    xx, xy, yy = (cv2.GaussianBlur(product, (0, 0), WINDOW_SIGMA) for product in (dx * dx, dx * dy, dy * dy))
     half, spread = (xx + yy) / 2, np.hypot((xx - yy) / 2, xy)
     return half - spread, half + spread
 
