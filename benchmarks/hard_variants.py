@@ -336,7 +336,7 @@ def run_row(row: str, data: Path, mesh: bool, preset: str, settings: Sequence[st
             failure = _failure(answer)
     stages = {stage["name"]: stage for stage in answer.get("stages", ())}
     placed = "sfm" in stages
-    registration = artifacts.REGISTRATION.load(workspace / "sfm") if placed else {}
+    registration = artifacts.REGISTRATION.load(workspace / "sfm") if placed else None
     words = [
         "python -m benchmarks.hard_variants DATA",
         row,
@@ -349,9 +349,9 @@ def run_row(row: str, data: Path, mesh: bool, preset: str, settings: Sequence[st
         machine=machine(),
         code=code_hash(),
         photos=_count(workspace, photos),
-        registered=len(registration.get("registered", ())),
+        registered=len(registration.registered) if registration else 0,
         center_error=center_error(workspace, data, row) if placed else None,
-        attempts=tuple(registration.get("ladder", ())),
+        attempts=tuple(registration.ladder) if registration else (),
         cpu_s=round(stages["sfm"]["cpu_s"], 1) if placed else None,
         failure=failure,
         score=score,
