@@ -140,7 +140,7 @@ def likely_pairs(descriptors: Descriptors, all_up_to: int) -> list[tuple[int, in
     ids = sorted(descriptors)
     if len(ids) <= all_up_to:
         return list(combinations(ids, 2))
-    means = torch.stack([descriptors[i].mean(0) if len(descriptors[i]) else torch.zeros(64) for i in ids])
+    means = torch.stack([descriptors[i].mean(0) if len(descriptors[i]) else descriptors[i].new_zeros(64) for i in ids])
     cosines = torch.nn.functional.normalize(means, dim=1)
     nearest = (cosines @ cosines.T).fill_diagonal_(-2).topk(min(LIKELY_PARTNERS, len(ids) - 1)).indices.tolist()
     return sorted({(min(ids[i], ids[j]), max(ids[i], ids[j])) for i, partners in enumerate(nearest) for j in partners})

@@ -185,7 +185,16 @@ class Workbench:
     def learned_corners(self, best: Solution | None) -> Solution | None:
         """Corners, which plain objects have too, matched by what a network sees around them."""
         before = self._base_of(best)
-        base = replace(before, affine=False, corners=True)
+        found = None
+        try:
+            found = self._by_corners(replace(before, affine=False, corners=True))
+        finally:
+            if not better(found, best):  # later rungs go on with SIFT
+                self._latest = before
+        return found
+
+    def _by_corners(self, base: Base) -> Solution | None:
+        """Poses by the corners of all photos, and again by what these poses let match."""
         descriptors = self._corners_and_matches(base)
         found = self._solve(base, "incremental")
         for _ in range(CORNER_ROUNDS):
@@ -195,8 +204,6 @@ class Workbench:
             if again is None or len(again.registered) < len(found.registered):
                 break
             found = again
-        if not better(found, best):  # later rungs go on with SIFT
-            self._latest = before
         return found
 
     def guided_matching(self, best: Solution | None) -> Solution | None:
