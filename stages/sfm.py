@@ -34,12 +34,13 @@ from stages.posing.known import match_photos
 from stages.posing.ladder import Step, climb, describe, photos_wanted
 from stages.posing.reading import read_poses
 from stages.posing.triangulation import triangulate
-from stages.posing.workbench import RELAXED, Workbench
+from stages.posing.workbench import RELAXED, Workbench, learned_available
 
 log = logging.getLogger(__name__)
 
 FEW_POINTS = 10  # fewer points than this a photo are worth a warning where the poses are known
 DOUBTFUL_ERROR_PX = 2.0  # COLMAP's own models are below one
+FEATURES_EXTRA = "pip install 'hineus[features]'"
 
 
 def run(context: StageContext[SfmParams]) -> dict[str, Any]:
@@ -98,6 +99,8 @@ def run(context: StageContext[SfmParams]) -> dict[str, Any]:
         log.warning("the EXIF focal length, %.0f px, is wrong: the poses say %.0f px", prior, found)
     if steps[-1].kept and steps[-1].rung == RELAXED:
         log.warning("poses were found with relaxed thresholds only: they are rough, and some may be wrong")
+    if len(steps) > 1 and len(best.registered) < wanted and not learned_available():
+        log.warning("`%s` adds a way to place photos of plain objects", FEATURES_EXTRA)
     last = _adjusted(context, best.model, bench.threads)
     others = len(best.others)
     return _publish(context, last, best.registered, unregistered, params.mapper, bench.matcher, others, steps)
@@ -248,7 +251,7 @@ def _hint(steps: Sequence[Step], params: SfmParams) -> str:
     """What is left to try after these attempts."""
     if params.wanted == 0 and len(steps) == 1:
         return "Try `--set sfm.wanted=0.95`, which goes on with other ways, or add overlapping photos."
-    return (
+    return _features_hint() + (
         "Add photos between those left out and their neighbours, overlapping by two thirds, sharp, with something "
         "printed in the frame; or leave out what `--set sfm.min_registered_ratio=0.1` would do without."
     )
@@ -265,6 +268,10 @@ def _masks_advice(image_set: ImageSet, params: SfmParams) -> str:
     )
 
 
+def _features_hint() -> str:
+    return "" if learned_available() else f"Try `{FEATURES_EXTRA}`, learned features for plain objects. "
+
+
 def _tried(steps: Sequence[Step]) -> str:
     return "Tried " + "; ".join(describe(step) for step in steps) + "."
 
@@ -279,7 +286,7 @@ def _nothing_matched(
             f"None of the {len(names)} photos could be registered: the best pair shares {best} matches, "
             f"need {MIN_VERIFIED} (median {median} features a photo). {_tried(steps)}"
         )
-        hint = (
+        hint = _features_hint() + (
             "Plain surfaces cannot be matched: put the object on something printed, e.g. newspaper, keep "
             "that in the frame, and let neighbouring photos overlap by two thirds."
         )
@@ -307,7 +314,7 @@ def _too_few(
 
 SFM: Stage[SfmParams] = Stage(
     name="sfm",
-    version=4,
+    version=5,
     settings=lambda config: config.sfm,
     run=run,
     reads=(PHOTOS, IMAGE_SET),

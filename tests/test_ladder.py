@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -172,8 +173,8 @@ def test_names_with_spaces_survive_a_list_of_pairs(tmp_path: Path):
 
 
 def test_every_base_has_a_database_of_its_own():
-    bases = [Base(a, m, f) for a in (False, True) for m in (False, True) for f in (False, True)]
-    assert len({base.file for base in bases}) == 8
+    bases = [Base(*flags) for flags in product((False, True), repeat=4) if flags[:2] != (True, True)]
+    assert len({base.file for base in bases}) == 12
 
 
 def test_always_inside_the_masks_needs_masks(tmp_path: Path):
@@ -238,19 +239,20 @@ def test_features_are_found_inside_the_masks_where_asked(tmp_path: Path):
     assert everywhere[:, 0].max() > 120
 
 
-def test_the_rungs_are_those_that_the_capture_allows(tmp_path: Path):
+def test_the_rungs_are_those_that_the_capture_allows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("stages.posing.workbench.learned_available", lambda: True)
     bench = workbench(tmp_path)
     names = [rung.name for rung in bench.rungs() if rung.applies(None)]
     assert names == [
-        "exhaustive matching", "features inside the masks", "affine features", "guided matching", "global mapper",
-        "relaxed thresholds",
+        "exhaustive matching", "features inside the masks", "affine features",
+        "corners with learned descriptors", "guided matching", "global mapper", "relaxed thresholds",
     ]  # fmt: skip
     (tmp_path / "other").mkdir()
     bench = workbench(tmp_path / "other", focal=180.0, matcher="sequential", mapper="global", masks="never")
     names = [rung.name for rung in bench.rungs() if rung.applies(None)]
     assert names == [
-        "sequential matching", "all pairs", "no focal priors", "affine features", "guided matching",
-        "incremental mapper", "relaxed thresholds",
+        "sequential matching", "all pairs", "no focal priors", "affine features",
+        "corners with learned descriptors", "guided matching", "incremental mapper", "relaxed thresholds",
     ]  # fmt: skip
 
 

@@ -10,6 +10,11 @@ from stages.posing.evidence import MIN_VERIFIED
 AFFINE_PEAK = 0.5
 # A match is stationary when it lies at the same place in both photos, within this many pixels (COLMAP's default).
 STATIONARY_PX = 4.0
+# Corners are exact to a part of a pixel, and few: pixels within which they agree with an epipolar geometry, with a 3D
+# point, and at first with a photo's position; degrees between lines of sight that may still be the same point.
+CORNER_EPIPOLAR_PX, CORNER_POINT_PX, CORNER_POSE_PX, CORNER_ANGLE_DEG = 2.0, 2.0, 4.0, 0.5
+CORNER_INIT_INLIERS, CORNER_INIT_ANGLE_DEG = 20, 6.0
+CORNER_TRIALS = 1000  # of RANSAC: most pairs of an object's photos show other sides of it
 
 
 def device(cuda: bool) -> Any:
@@ -57,17 +62,20 @@ def match_options(
     return {"matching_options": options, "verification_options": verification, "device": device(cuda)}
 
 
-def verification_options(params: Any, verified: int = MIN_VERIFIED, moving: bool = False) -> Any:
+def verification_options(params: Any, verified: int = MIN_VERIFIED, moving: bool = False, corners: bool = False) -> Any:
     """What makes a pair of photos believed.
 
     Args:
         params: `configs.params.SfmParams`.
         verified: so many matches that fit one epipolar geometry.
         moving: matches at the same place of both photos do not count.
+        corners: features are corners.
     """
     import pycolmap
 
     options = pycolmap.TwoViewGeometryOptions()
+    if corners:
+        options.ransac.max_error, options.ransac.max_num_trials = CORNER_EPIPOLAR_PX, CORNER_TRIALS
     options.min_num_inliers, options.ransac.random_seed = verified, params.seed
     options.filter_stationary_matches, options.stationary_matches_max_error = moving, STATIONARY_PX
     return options
@@ -82,3 +90,15 @@ def mapping_options(params: Any, threads: int) -> Any:
     options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = params.seed
     options.extract_colors = False
     return options
+
+
+def expect_corners(options: Any, verified: int) -> None:
+    """Set `pycolmap.IncrementalPipelineOptions` for features that are corners; verified: matches a pair needs."""
+    options.min_num_matches = verified
+    options.structure_less_registration_fallback = False  # few corners are no ground for a pose without points
+    mapper, triangulation = options.mapper, options.triangulation
+    mapper.init_min_num_inliers, mapper.init_min_tri_angle = CORNER_INIT_INLIERS, CORNER_INIT_ANGLE_DEG
+    mapper.init_max_error = CORNER_EPIPOLAR_PX
+    mapper.abs_pose_max_error, mapper.filter_max_reproj_error = CORNER_POSE_PX, CORNER_POINT_PX
+    triangulation.create_max_angle_error = triangulation.continue_max_angle_error = CORNER_ANGLE_DEG
+    triangulation.merge_max_reproj_error = triangulation.complete_max_reproj_error = CORNER_POINT_PX
