@@ -314,7 +314,7 @@ def _too_few(
 
 SFM: Stage[SfmParams] = Stage(
     name="sfm",
-    version=5,
+    version=6,
     settings=lambda config: config.sfm,
     run=run,
     reads=(PHOTOS, IMAGE_SET),
