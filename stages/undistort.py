@@ -82,6 +82,7 @@ def run(context: StageContext[UndistortParams]) -> dict[str, Any]:
         kind=region.kind,
         ground=ground and ground.within(poses_from_scene),
         growable=stated is None and given is None and all(mask is None for mask in masks),
+        roi_scale=context.params.roi_scale,
     )
     context.write(FIRST_SCENE, scene)
     context.progress(len(photos) + 1, len(photos) + 1, "done")
@@ -235,7 +236,7 @@ def _find_region(
 
 UNDISTORT: Stage[UndistortParams] = Stage(
     name="undistort",
-    version=7,
+    version=8,
     settings=lambda config: config.undistort,
     run=run,
     reads=(PHOTOS, IMAGE_SET, MODEL, GIVEN_POSES, GIVEN_REGION),
