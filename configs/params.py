@@ -122,6 +122,9 @@ class UndistortParams(Section):
         0, ge=0, description="masks shrink by this many pixels (at the undistorted size), and the object with them"
     )
     roi_scale: float = Field(1.0, gt=0, description="the region of interest found automatically is scaled by this")
+    subject: int = Field(
+        1, ge=1, description="where photos are about things far apart: which of them; 1 is what most photos are about"
+    )
 
 
 class ExtractParams(Section):
