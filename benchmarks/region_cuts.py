@@ -31,7 +31,7 @@ from stages.surface.border import border_cut, region_without_cut
 from stages.surface.triangle_mesh import compact
 from stages.undistort import _find_region
 
-RESULTS = ALL_RESULTS / "region_cuts.json"
+RESULTS = ALL_RESULTS / "regions" / "cuts.json"
 # The found region's radius times this, moved up by this part of it.
 REGIONS = ((1.3, 0.0), (1.0, 0.0), (0.8, 0.0), (0.6, 0.0), (0.4, 0.0), (0.7, 0.3))
 WHOLE = 99.5  # percent of the subject's seen surface inside
