@@ -129,18 +129,19 @@ class _Training:
     def where_nothing_is_cut(self) -> _Training:
         """This one, or one in a larger region if the surface learned so far is cut in the middle of many photos.
 
-        It starts from that surface, with as much of the budget spent.
+        It starts from that surface, with as much of the budget spent; this one is of no use any more then.
         """
         self.looked = True
         region = _grown(self)
         if region is None:
             return self
         scene = region.of(self.scene)
-        trainer = _make_trainer(self.context, scene)
         shape = _shape_within(self.trainer, scene.poses_from_scene, self.scene.poses_from_scene)
+        steps, self.trainer = self.trainer.step_index, None  # its photos would be in memory twice
+        trainer = _make_trainer(self.context, scene)
         error = trainer.start_from(shape)
         log.info("the SDF starts from the shape learned so far, met to %.4f on average", error)
-        trainer.step_index = self.trainer.step_index
+        trainer.step_index = steps
         training = _Training(self.context, scene, trainer, region, True, self.seconds)
         training.save()
         return training
