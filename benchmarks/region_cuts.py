@@ -25,11 +25,11 @@ from benchmarks.captures.tracks import simulate
 from benchmarks.pages import NOT_MEASURED, markdown_table, write_tables
 from benchmarks.run_sets import RESULTS as ALL_RESULTS
 from benchmarks.synthetic.scenes import RECIPES
+from stages.geometry.layout import find_layout
 from stages.geometry.normalisation import into_frame, scene_frame
 from stages.geometry.similarity import Similarity
 from stages.surface.border import border_cut, region_without_cut
 from stages.surface.triangle_mesh import compact
-from stages.undistort import _find_region
 
 RESULTS = ALL_RESULTS / "regions" / "cuts.json"
 # The found region's radius times this, moved up by this part of it.
@@ -61,8 +61,7 @@ def look(name: str) -> Iterator[Row]:
     """The rows of a capture."""
     capture = kinds.make(name) if name in kinds.KINDS else suite.make(name)
     posed, subject = simulate(capture, np.random.default_rng(0)), seen_points(capture)
-    masks = (None,) * len(posed.cameras)
-    region, ground, up = _find_region(posed.cameras, posed.points, posed.observations, masks, None, None, 1.0)
+    region, ground, up = find_layout(posed.cameras, posed.points, posed.observations)
     for scale, moved in REGIONS:
         frame = scene_frame(region.center + moved * region.radius * up.direction, scale * region.radius, up.direction)
         mesh, points = surface_in(capture, frame), frame.inverse().apply(subject)
