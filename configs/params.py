@@ -130,7 +130,12 @@ class UndistortParams(Section):
 class ExtractParams(Section):
     """Neural field to mesh."""
 
-    resolution: int = Field(256, ge=16, le=2048, description="grid cells along the region of interest's side")
+    resolution: int = Field(
+        512,
+        ge=16,
+        le=2048,
+        description="grid cells along the region of interest's side, fewer where photos show no more",
+    )
     block: int = Field(64, ge=8, le=256, description="cells along a side of the blocks evaluated at a time")
 
 
