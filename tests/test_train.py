@@ -330,6 +330,26 @@ def test_a_region_is_looked_at_once_even_if_the_run_is_killed(tmp_path, monkeypa
     np.testing.assert_array_equal(scenes[0].cameras.extrinsics, scenes[1].cameras.extrinsics)
 
 
+@pytest.mark.slow
+def test_a_ball_that_the_region_cuts_comes_out_whole(tmp_path):
+    params = changed(TINY, {"steps": 400, "sampling.rays": 256, "field.sphere_radius": 0.6, "preview_every": 1.0})
+    run_context = context(tmp_path, "out", params)
+    folder = tmp_path / "undistort"
+    first = regrown(artifacts.FIRST_SCENE.load(folder), np.array([0.3, 0.0, 0.0]), 0.5)  # ends at x = -0.2 in the ball
+    artifacts.FIRST_SCENE.save(folder, replace(first, growable=True))
+    numbers = train.run(run_context)
+    assert numbers["region_grown"] > 1.1
+    published = artifacts.SCENE.load(run_context.out)
+    side = np.random.default_rng(0).normal(size=(300, 3)) * [1, 1, 0.4]
+    side *= RADIUS / np.linalg.norm(side, axis=1, keepdims=True)
+    lost = side[side[:, 0] < -0.25]  # on the ball, beyond the first region
+    in_poses = Similarity(2.0, np.eye(3), np.array([1.0, 2, 3])).apply(lost)  # as `sphere_scene` has it
+    places = published.poses_from_scene.inverse().apply(in_poses)
+    assert np.linalg.norm(places, axis=1).max() < 1
+    sdf = load_field(artifacts.FIELD.load(run_context.out)).sdf(places)
+    assert np.median(np.abs(sdf)) * published.poses_from_scene.scale / 2 < 0.03
+
+
 def test_a_region_that_was_given_is_not_looked_at(tmp_path, monkeypatch):
     def refuse(*_: object) -> None:
         raise AssertionError("looked at")
