@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 
 from configs.params import SfmParams
+from stages.artifacts import ImageSet
 from stages.posing.ladder import Rung, Solution, Step, better, climb, describe, photos_wanted
 from stages.posing.workbench import Base, forget_focal_priors, has_still_background
 
@@ -247,6 +249,10 @@ def test_the_rungs_are_those_that_the_capture_allows(tmp_path: Path, monkeypatch
         "exhaustive matching", "features inside the masks", "affine features",
         "corners with learned descriptors", "guided matching", "global mapper", "relaxed thresholds",
     ]  # fmt: skip
+    guessed = tuple(replace(record, made_mask="salient") for record in bench.image_set.images)
+    bench.image_set = ImageSet(guessed)
+    names = [rung.name for rung in bench.rungs() if rung.applies(None)]
+    assert names[1:3] == ["affine features", "features inside the masks"]
     (tmp_path / "other").mkdir()
     bench = workbench(tmp_path / "other", focal=180.0, matcher="sequential", mapper="global", masks="never")
     names = [rung.name for rung in bench.rungs() if rung.applies(None)]
