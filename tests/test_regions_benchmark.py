@@ -117,8 +117,9 @@ def test_a_plain_capture_differs_from_its_original_in_texture_alone():
 @pytest.mark.parametrize("name", ["boulder", "car"])
 def test_a_subject_that_no_photo_shows_whole_is_in_its_region(name: str):
     capture = kinds.make(name)
-    subject, posed = seen_points(capture, 1000), simulate(capture, np.random.default_rng(0), 200)
-    assert not any(capture.cameras.in_frame(i, subject).all() for i in range(len(capture.cameras)))
+    capture = replace(capture, focal=2.2 * capture.focal)
+    subject, posed = seen_points(capture, 1000), simulate(capture, np.random.default_rng(0), 300)
+    assert max(capture.cameras.in_frame(i, subject).mean() for i in range(len(capture.cameras))) < 0.6
     region = regions.region_of(posed)
     assert fit(subject, region.center, region.radius).inside == 100
 
