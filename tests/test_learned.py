@@ -187,7 +187,7 @@ def bench_of_blocks(tmp_path: Path, count: int):
         name = f"{k:02}.png"
         artifacts.write_png(artifacts.Pictures(tmp_path).path(name), blocks(pose, 500.0, (480, 360)))
         records.append(ImageRecord(name, name, 480, 360, None, "camera", 1.0, False, name))
-    (tmp_path / "work").mkdir()
+    (tmp_path / "work").mkdir(parents=True)
     return Workbench(
         tmp_path / "work",
         tmp_path / artifacts.IMAGES,
@@ -231,6 +231,46 @@ def test_photos_of_plain_blocks_are_placed(tmp_path: Path):
     order = [int(Path(image.name).stem) for image in images]
     error = np.linalg.norm(align_points(centers, true[order]).apply(centers) - true[order], axis=1)
     assert np.median(error) < 0.04  # 1 % of the 4 units that the blocks measure
+
+
+@needs_weights
+@pytest.mark.slow
+def test_on_one_thread_corners_give_the_same_model_bit_for_bit(tmp_path: Path):
+    before, models = torch.get_num_threads(), []
+    for threads in (1, 2):  # those that torch was left with
+        torch.set_num_threads(threads)
+        folder = tmp_path / str(threads)
+        try:
+            found = bench_of_blocks(folder, 6).learned_corners(None)
+            assert torch.get_num_threads() == threads
+        finally:
+            torch.set_num_threads(before)
+        assert found is not None
+        assert len(found.registered) == 6
+        written = folder / "model"
+        written.mkdir()
+        found.model.write(str(written))
+        models.append({path.name: path.read_bytes() for path in sorted(written.iterdir())})
+    assert len(models[0]) >= 3
+    assert models[0] == models[1]
+
+
+@needs_weights
+def test_descriptors_are_computed_on_the_threads_of_colmap(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    from stages.posing import learned
+
+    counts = []
+    monkeypatch.setattr(learned, "corners_of", lambda *args: counts.append(torch.get_num_threads()) or NO_CORNERS)
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        bench_of_blocks(tmp_path, 2).learned_corners(None)
+    finally:
+        torch.set_num_threads(before)
+    assert counts == [1, 1]
+
+
+NO_CORNERS = (np.zeros((0, 2)), torch.zeros(0, 64))
 
 
 @needs_weights

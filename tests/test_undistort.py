@@ -181,7 +181,7 @@ def test_png_names_stay_unique():
 # ---------------------------------------------------------------- region, scale and place
 def test_a_given_sphere_is_the_unit_sphere(tmp_path: Path):
     inputs = write_capture(tmp_path, *MODELS[0], masks=False)
-    scene, _, numbers = undistort(inputs, tmp_path, region="sphere 2.5 -1 0.5 0.75", roi_scale=3.0)
+    scene, _, numbers = undistort(inputs, tmp_path, region="sphere 2.5 -1 0.5 0.75", roi_scale=3.0, subject=2)
     assert world_from(scene, tmp_path).scale == 0.75
     np.testing.assert_allclose(world_from(scene, tmp_path).translation, [2.5, -1, 0.5])
     assert artifacts.GIVEN_REGION.load(tmp_path / "place").box is None

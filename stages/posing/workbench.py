@@ -303,9 +303,10 @@ class Workbench:
         def matches(done: float) -> None:
             self._tell(PART_FEATURES + (PART_MATCHES - PART_FEATURES) * done, "matches")
 
-        descriptors = write_corners(self.database(base), self.images_folder, masks, network, features)
-        pairs = likely_pairs(descriptors, self.params.exhaustive_max)
-        write_matches(self.database(base), descriptors, pairs, matches)
+        with torch_threads(self.threads):
+            descriptors = write_corners(self.database(base), self.images_folder, masks, network, features)
+            pairs = likely_pairs(descriptors, self.params.exhaustive_max)
+            write_matches(self.database(base), descriptors, pairs, matches)
         self._verify_again(base)
         self._tell(PART_MATCHES, "poses")
         return descriptors
@@ -528,6 +529,19 @@ def drop_unsupported(model: Any, least: int) -> None:
     for image in [model.images[i] for i in model.reg_image_ids()]:
         if image.num_points3D < least:
             model.deregister_frame(image.frame_id)
+
+
+@contextmanager
+def torch_threads(count: int) -> Iterator[None]:
+    """Torch computes on so many threads for a while: the last bits of a network's sums depend on their number."""
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def learned_available() -> bool:

@@ -6,6 +6,7 @@ Selections are boolean arrays over faces [F] or vertices [V].
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from typing import Any
 
 import numpy as np
 
@@ -55,19 +56,13 @@ def count_views(
     A vertex shows if it projects into the image, faces the camera and the way there is free. One ray per vertex and
     camera, so no face is too small to be found; each vertex tries the cameras it faces best first, and stops early.
     """
-    import open3d as o3d
-
     scene = raycaster(vertices, faces)
     normals = vertex_normals(vertices, faces)
-    # The ray starts this far off the surface, or the faces around the vertex would hide it.
-    offset = 0.5 * median_edge(vertices, faces)
-    starts = (vertices + offset * normals).astype(np.float32)
+    starts = _off_the_surface(vertices, faces, normals)
 
     cosines = np.full((len(vertices), len(cameras)), -1.0, dtype=np.float32)
     for i, center in enumerate(cameras.centers):
-        to_camera = center - vertices
-        cosine = np.einsum("vi,vi->v", to_camera, normals) / np.linalg.norm(to_camera, axis=1)
-        cosines[:, i] = np.where(cameras.in_frame(i, vertices), cosine, -1)
+        cosines[:, i] = np.where(cameras.in_frame(i, vertices), _cosines(vertices, normals, center), -1)
 
     views = np.zeros(len(vertices), dtype=np.int64)
     open_vertices = np.arange(len(vertices))
@@ -80,17 +75,35 @@ def count_views(
         for begin in range(0, len(open_vertices), MAX_RAYS):
             part = slice(begin, begin + MAX_RAYS)
             index = open_vertices[part]
-            # Not normalised: the camera is at distance 1, whatever lies before it hides the vertex.
-            direction = cameras.centers[camera[part]] - starts[index]
-            rays = np.concatenate([starts[index], direction], axis=1).astype(np.float32)
-            hidden = scene.test_occlusions(o3d.core.Tensor(rays), tnear=0.0, tfar=0.999).numpy()
-            views[index[~hidden]] += 1
+            views[index[~_hidden(scene, starts[index], cameras.centers[camera[part]])]] += 1
         open_vertices = open_vertices[views[open_vertices] < enough]
         if progress is not None:
             progress(rank + 1, len(cameras))
         if not len(open_vertices):
             break
     return views
+
+
+def _cosines(points: np.ndarray, normals: np.ndarray, center: np.ndarray) -> np.ndarray:
+    """Of the angles [P] between normals and the ways to a camera centre."""
+    to_camera = center - points
+    cosines: np.ndarray = np.einsum("pi,pi->p", to_camera, normals) / np.linalg.norm(to_camera, axis=1)
+    return cosines
+
+
+def _off_the_surface(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """Where rays from the vertices start [V, 3] float32, so that the faces around a vertex do not hide it."""
+    return (vertices + 0.5 * median_edge(vertices, faces) * normals).astype(np.float32)
+
+
+def _hidden(scene: Any, starts: np.ndarray, centers: np.ndarray) -> np.ndarray:
+    """Which ways from `starts` [N, 3] to camera centres, [N, 3] or [3], are not free."""
+    import open3d as o3d
+
+    # Not normalised: the camera is at distance 1, whatever lies before it hides the vertex.
+    rays = np.concatenate([starts, centers - starts], axis=1).astype(np.float32)
+    hidden: np.ndarray = scene.test_occlusions(o3d.core.Tensor(rays), tnear=0.0, tfar=0.999).numpy()
+    return hidden
 
 
 def spread(faces: np.ndarray, num_vertices: int, chosen: np.ndarray, rings: int) -> np.ndarray:
@@ -141,3 +154,37 @@ def outside_hull(
         seen += framed
         off += framed & ~on_mask
     return (off > max_part * seen) & (off >= np.minimum(min_views, np.maximum(seen, 1)))
+
+
+def shown_on_masks(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    cameras: PinholeCameras,
+    masks: Iterable[tuple[int, np.ndarray]],
+    chosen: np.ndarray,
+    min_part: float,
+    min_views: int = 2,
+) -> np.ndarray:
+    """Vertices [V] bool, among those chosen [V], that photos show on their masks, with nothing before them.
+
+    Where the surface bulges it is off the masks of the photos that look along it, and still all that the others have
+    of the object there: without it they would look through a hole.
+
+    Args:
+        masks: as of `outside_hull`.
+        min_part: a vertex counts if it is on the mask in at least this part of the photos that see it,
+        min_views: and in at least this many of them.
+    """
+    scene, normals, index = raycaster(vertices, faces), vertex_normals(vertices, faces), np.flatnonzero(chosen)
+    starts, points, normals = _off_the_surface(vertices, faces, normals)[index], vertices[index], normals[index]
+    seen, on = np.zeros((2, len(index)), dtype=np.int64)
+    for camera, mask in masks:
+        center = cameras.centers[camera]
+        framed, on_mask = cameras.on_mask(camera, points, mask)
+        facing = np.flatnonzero(framed & (_cosines(points, normals, center) > MIN_COSINE))
+        free = facing[~_hidden(scene, starts[facing], center)]
+        seen[free] += 1
+        on[free] += on_mask[free]
+    shown = np.zeros(len(vertices), dtype=bool)
+    shown[index] = (on >= min_views) & (on >= min_part * seen)
+    return shown
