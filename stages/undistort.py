@@ -70,8 +70,11 @@ def run(context: StageContext[UndistortParams]) -> dict[str, Any]:
     points, errors, observations = sparse_points(model, photos)
     known, given = context.read(GIVEN_POSES), context.read(GIVEN_REGION)
     stated = known.region if known else None
-    subjects = find_subjects(cameras, points, observations) if stated is None and given is None else []
-    about, warnings = _chosen(subjects, [photo.name for photo in photos], context.params.subject)
+    about: np.ndarray | None = None
+    warnings: list[dict[str, str]] = []
+    if stated is None and given is None:
+        subjects = find_subjects(cameras, points, observations)
+        about, warnings = _chosen(subjects, [photo.name for photo in photos], context.params.subject)
     region, ground, up = _find_layout(cameras, points, observations, masks, stated, about)
     region = _set(region, given, context.params.roi_scale)
     poses_from_scene = scene_frame(region.center, region.radius, up.direction)

@@ -115,6 +115,16 @@ def test_a_plain_capture_differs_from_its_original_in_texture_alone():
     assert plain.surroundings[0].texture == original.surroundings[0].texture
 
 
+@pytest.mark.parametrize("name", ["boulder", "car"])
+def test_a_subject_that_no_photo_shows_whole_is_in_its_region(name: str):
+    capture = kinds.make(name)
+    capture = replace(capture, focal=2.2 * capture.focal)
+    subject, posed = seen_points(capture, 1000), simulate(capture, np.random.default_rng(0), 300)
+    assert max(capture.cameras.in_frame(i, subject).mean() for i in range(len(capture.cameras))) < 0.6
+    region = regions.region_of(posed)
+    assert fit(subject, region.center, region.radius).inside == 100
+
+
 # ---------------------------------------------------------------- tables
 def _row(name: str, inside: float, volume: float) -> regions.Row:
     return regions.Row(regions.MADE_UP, name, "what", inside, volume, 9.0, "object", "words", 0.5, 1000)

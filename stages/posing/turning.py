@@ -8,7 +8,7 @@ from __future__ import annotations
 import statistics
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -90,22 +90,25 @@ def _matched(database: Path) -> dict[Names, Pair]:
     with pycolmap.Database.open(database) as opened:
         lenses = {camera.camera_id: camera for camera in opened.read_all_cameras()}
         images = {image.image_id: image for image in opened.read_all_images()}
-        lens_of = {number: lenses[image.camera_id] for number, image in images.items()}
+        places = {i: _places(opened.read_keypoints(i), lenses[image.camera_id]) for i, image in images.items()}
         pair_ids, counts = opened.read_two_view_geometry_num_inliers()
         enough = [pair for pair, count in zip(pair_ids, counts, strict=True) if count >= 2 * MIN_VERIFIED]
         for pair_id in enough[:: -(-len(enough) // MAX_PAIRS) or 1]:
-            ids = pycolmap.pair_id_to_image_pair(pair_id)
-            matches = opened.read_two_view_geometry(*ids).inlier_matches
+            first, second = pycolmap.pair_id_to_image_pair(pair_id)
+            matches = opened.read_two_view_geometry(first, second).inlier_matches
             matches = matches[:: -(-len(matches) // MAX_MATCHES)]
-            first, second = (
-                (opened.read_keypoints(i)[column, :2] - np.array([lens_of[i].width, lens_of[i].height]) / 2)
-                / lens_of[i].mean_focal_length()
-                for i, column in zip(ids, matches.T, strict=True)
+            lens = lenses[images[first].camera_id]
+            pairs[images[first].name, images[second].name] = Pair(
+                places[first][matches[:, 0]],
+                places[second][matches[:, 1]],
+                max(lens.width, lens.height) / lens.mean_focal_length(),
             )
-            lens = lens_of[ids[0]]
-            names = images[ids[0]].name, images[ids[1]].name
-            pairs[names] = Pair(first, second, max(lens.width, lens.height) / lens.mean_focal_length())
     return pairs
+
+
+def _places(keypoints: Float[np.ndarray, "k _"], lens: Any) -> Float[np.ndarray, "k 2"]:
+    """Features in focal lengths from the photo's middle."""
+    return (keypoints[:, :2].astype(np.float64) - np.array([lens.width, lens.height]) / 2) / lens.mean_focal_length()
 
 
 def _unexplained(pair: Pair, factor: float) -> float:
