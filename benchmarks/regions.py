@@ -30,8 +30,9 @@ from benchmarks.pages import NOT_MEASURED, markdown_table, write_tables
 from benchmarks.run_sets import OUT, find_sets, photos_of, run_hineus
 from benchmarks.run_sets import RESULTS as ALL_RESULTS
 from benchmarks.synthetic.scenes import RECIPES
+from stages.geometry.layout import find_layout
 from stages.geometry.region import RegionOfInterest
-from stages.undistort import _find_region
+from stages.geometry.subjects import find_subjects
 
 RESULTS, WORKSPACES = ALL_RESULTS / "regions", OUT / "regions"
 NOW, BEFORE = "now", "0.1.0"
@@ -67,9 +68,9 @@ class Row:
 
 def region_of(posed: Posed) -> RegionOfInterest:
     """The region that undistort finds; all that this benchmark asks of the pipeline."""
-    masks = posed.masks or (None,) * len(posed.cameras)
-    region, _, _ = _find_region(posed.cameras, posed.points, posed.observations, masks, None, None, 1.0)
-    return region
+    subjects = find_subjects(posed.cameras, posed.points, posed.observations)
+    photos = subjects[0].photos if len(subjects) > 1 else None
+    return find_layout(posed.cameras, posed.points, posed.observations, posed.masks, photos=photos).region
 
 
 def measured(group: str, name: str, shows: str, posed: Posed, subject: np.ndarray) -> Row:

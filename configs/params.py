@@ -122,12 +122,20 @@ class UndistortParams(Section):
         0, ge=0, description="masks shrink by this many pixels (at the undistorted size), and the object with them"
     )
     roi_scale: float = Field(1.0, gt=0, description="the region of interest found automatically is scaled by this")
+    subject: int = Field(
+        1, ge=1, description="where photos are about things far apart: which of them; 1 is what most photos are about"
+    )
 
 
 class ExtractParams(Section):
     """Neural field to mesh."""
 
-    resolution: int = Field(256, ge=16, le=2048, description="grid cells along the region of interest's side")
+    resolution: int = Field(
+        512,
+        ge=16,
+        le=2048,
+        description="grid cells along the region of interest's side, fewer where photos show no more",
+    )
     block: int = Field(64, ge=8, le=256, description="cells along a side of the blocks evaluated at a time")
 
 

@@ -159,14 +159,15 @@ def _outside_masks(
 
 def _cut_warnings(vertices: np.ndarray, faces: np.ndarray, scene: PosedScene) -> list[dict[str, str]]:
     """For the report and the log: that the border of the region cuts what photos have in their middle, if it does."""
+    from stages.geometry.normalisation import regrown
     from stages.surface.border import border_cut, region_without_cut
 
     cut = border_cut(vertices, faces, scene.cameras, scene.ground)
     if cut is None:
         return []
-    center, radius = region_without_cut(cut)
+    larger = regrown(scene, *region_without_cut(cut))
     sentence = f"The region of interest cuts what {cut.photos} photos have in their middle."
-    command = f"hineus run --workspace WORKSPACE --set undistort.roi_scale={radius + np.linalg.norm(center):.2f}"
+    command = f"hineus run --workspace WORKSPACE --set undistort.roi_scale={larger.roi_scale:.2f}"
     logger.warning("%s A larger one: `%s`, or set it in the report's 3D view.", sentence, command)
     return [{"sentence": sentence, "command": command}]
 

@@ -7,6 +7,7 @@ the report in the end. So a distance that is measured later changes no training.
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any
 
@@ -18,14 +19,18 @@ from stages.artifacts import GIVEN_POSES, GIVEN_REGION, IMAGE_SET, MODEL, PHOTOS
 from stages.engine.stage import Stage, StageContext
 from stages.errors import ConfigError, InputError
 from stages.geometry.cameras import PinholeCameras
+from stages.geometry.layout import find_layout
 from stages.geometry.place import GivenRegion, Located, Place, given_region, locate
 from stages.geometry.similarity import Similarity
+from stages.geometry.subjects import find_subjects
 from stages.posing.markers import MarkerScale, detect_markers, measure_markers
-from stages.posing.undistortion import plan_warp, posed_cameras, registered_photos
+from stages.posing.undistortion import plan_warp, posed_cameras, registered_photos, sparse_points
 
 log = logging.getLogger(__name__)
 
 MIN_SEEING = 2  # cameras that see a region which the user gave
+# Sparse points in it: false ones are anywhere. Without this many in all, as where poses are given, they tell nothing.
+MIN_HELD, MIN_JUDGED = 10, 100
 MAX_GPS_TILT_DEG = 2.0  # GPS is believed where it knows up to this
 
 
@@ -52,7 +57,8 @@ def run(context: StageContext[PlaceParams]) -> dict[str, Any]:
     elif located is not None and located.tilt_error_deg <= MAX_GPS_TILT_DEG:
         place, up_from = replace(place, up=np.array([0.0, 0.0, 1.0])), "GPS"
     context.write(WORLD_PLACE, place)
-    context.write(GIVEN_REGION, _given_region(cameras, place, params.region))
+    masked = any(record.has_mask for record in context.read(IMAGE_SET).images)
+    context.write(GIVEN_REGION, _given_region(cameras, model, photos, place, params, masked))
     return {
         "units": place.units,
         "scale_from": place.scale_from or "nothing",
@@ -140,32 +146,63 @@ def _compare(factor: float, error: float, this: str, other: str) -> None:
         log.warning("%s and %s disagree on the scale by %.1f %%; the first is used", this, other, 100 * (factor - 1))
 
 
-def _given_region(cameras: PinholeCameras, place: Place, text: str) -> GivenRegion | None:
+def _given_region(
+    cameras: PinholeCameras, model: Any, photos: list[Any], place: Place, params: PlaceParams, masked: bool
+) -> GivenRegion | None:
     """The region of the settings, None where it is to be found.
 
+    Args:
+        masked: masks show the object, so that it may have no sparse points.
+
     Raises:
-        ConfigError: fewer than two cameras see it.
+        ConfigError: fewer than two cameras see it, or hardly any of the sparse points lie in it.
     """
+    text = params.region
     form, numbers = read_region(text)
     if form == "auto":
         return None
     region = given_region(form, numbers, place.world_from_poses)
     places = region.center + region.radius * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
     seen = sum(bool(cameras.in_frame(i, places).any()) for i in range(len(cameras)))
+    points, _, observations = sparse_points(model, photos)
+    held = int(region.holds(points).sum())
+    wrong = ""
     if seen < MIN_SEEING:
+        wrong = f"is seen by {seen} of {len(cameras)} cameras (need {MIN_SEEING})"
+    elif held < MIN_HELD and len(points) >= MIN_JUDGED and not masked:
+        wrong = f"holds {held} of {len(points)} sparse points (need {MIN_HELD})"
+    if wrong:
         centers = place.world_from_poses.apply(cameras.centers)
-        middle = " ".join(f"{value:.4g}" for value in np.median(centers, axis=0))
         raise ConfigError(
-            f"`place.region` = {text} is seen by {seen} of {len(cameras)} cameras (need {MIN_SEEING}).",
-            f"It is in the coordinates of the exported PLY, where the cameras stand about {middle}; "
+            f"`place.region` = {text} {wrong}.",
+            f"It is in the coordinates of the exported PLY, where the cameras stand about "
+            f"{_written(np.median(centers, axis=0))}. {_found_region(cameras, points, observations, place)}"
             "`--set place.region=auto` finds it by itself.",
         )
     return region
 
 
+def _found_region(cameras: PinholeCameras, points: np.ndarray, observations: np.ndarray, place: Place) -> str:
+    """The regions that would be found, as settings; empty where none would."""
+    subjects = find_subjects(cameras, points, observations)
+    found = []
+    for photos in [subject.photos for subject in subjects] if len(subjects) > 1 else [None]:
+        try:
+            region = find_layout(cameras, points, observations, photos=photos).region
+        except ValueError:
+            continue
+        sphere = [*place.world_from_poses.apply(region.center), place.world_from_poses.scale * region.radius]
+        found.append(f"`--set 'place.region=sphere {_written(sphere)}'`")
+    return f"The photos are about {' and '.join(found)}. " if found else ""
+
+
+def _written(numbers: Iterable[float]) -> str:
+    return " ".join(f"{value:.4g}" for value in numbers)
+
+
 PLACE: Stage[PlaceParams] = Stage(
     name="place",
-    version=1,
+    version=2,
     settings=lambda config: config.place,
     run=run,
     reads=(IMAGE_SET, PHOTOS, MODEL, GIVEN_POSES),

@@ -81,7 +81,7 @@ def run(context: StageContext[ReportParams]) -> dict[str, Any]:
     captions = photo_table.camera_captions(results, scene.cameras.names)
     page |= describe_view(scene, place, context.read(GIVEN_REGION), atlas, texture, left(context, QUALITY), captions)
     context.progress(4, steps, "writing the page")
-    placed = {name: manifests[name].numbers for name in ("undistort", "place") if name in manifests}
+    placed = {name: manifests[name].numbers for name in ("undistort", "place", "train") if name in manifests}
     page |= {
         "numbers": numbers.headline(scene, atlas, manifests, page["held_out"]),
         "overview": overview_svg(scene, region_corners(scene, context.read(GIVEN_REGION))),

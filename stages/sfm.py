@@ -34,6 +34,7 @@ from stages.posing.known import match_photos
 from stages.posing.ladder import Step, climb, describe, photos_wanted
 from stages.posing.reading import read_poses
 from stages.posing.triangulation import triangulate
+from stages.posing.turning import from_one_place, parallaxes
 from stages.posing.workbench import RELAXED, Workbench, learned_available
 
 log = logging.getLogger(__name__)
@@ -75,6 +76,7 @@ def run(context: StageContext[SfmParams]) -> dict[str, Any]:
         wanted = photos_wanted(len(names), params.wanted)
         best, steps = climb(bench.rungs(), wanted, max(needed, len(names) // 2))
         evidence = Evidence(bench.database())
+        still = from_one_place(parallaxes(bench.database()))
 
     if best is None:
         raise _nothing_matched(evidence, names, steps, params, _masks_advice(image_set, params))
@@ -103,7 +105,8 @@ def run(context: StageContext[SfmParams]) -> dict[str, Any]:
         log.warning("`%s` adds a way to place photos of plain objects", FEATURES_EXTRA)
     last = _adjusted(context, best.model, bench.threads)
     others = len(best.others)
-    return _publish(context, last, best.registered, unregistered, params.mapper, bench.matcher, others, steps)
+    numbers = _publish(context, last, best.registered, unregistered, params.mapper, bench.matcher, others, steps)
+    return {**numbers, "warnings": _place_warnings(still, len(names))}
 
 
 def _adjusted(context: StageContext[SfmParams], model: Any, threads: int) -> LastAdjustment:
@@ -114,6 +117,18 @@ def _adjusted(context: StageContext[SfmParams], model: Any, threads: int) -> Las
     freed = [f"{' and '.join(lens.freed)} of {lens.photos} photos" for lens in last.lenses if lens.freed]
     log.info("last adjustment: freed %s (%.1f CPU s)", "; ".join(freed) or "nothing", time.process_time() - start)
     return last
+
+
+def _place_warnings(still: Sequence[str], total: int) -> list[dict[str, str]]:
+    """For the report and the log: that most photos were taken from one place (`still`), if they were."""
+    if 2 * len(still) <= total:
+        return []
+    sentence = (
+        f"{len(still)} of {total} photos were taken from one place ({still[0]} to {still[-1]}) and tell no more of the "
+        f"shape than one does: {total - len(still)} are left, 20 or more from all sides give a whole object."
+    )
+    log.warning("%s Add photos from other places.", sentence)
+    return [{"sentence": sentence}]
 
 
 def _publish(

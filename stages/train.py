@@ -10,7 +10,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, NamedTuple
 
 import numpy as np
 
@@ -46,13 +46,10 @@ def run(context: StageContext[TrainParams]) -> dict[str, Any]:
     from stages.neural.trained_field import field_state
 
     _use_threads(context)
-    scene = _scene_in_training(context)
-    training = _Training.begun(context, scene)
-    if scene.growable:
+    training = _Training.begun(context)
+    if not training.looked:
         training.advance(LOOK_AT)
-        grown = _grown(training)
-        if grown is not None:
-            training = training.moved(grown)
+        training = training.where_nothing_is_cut()
     training.advance(1.0)
 
     trainer, params, scene = training.trainer, context.params, training.scene
@@ -74,17 +71,29 @@ def run(context: StageContext[TrainParams]) -> dict[str, Any]:
         "rays_per_second": round(trainer.step_index * params.sampling.rays / max(seconds, 1e-9)),
         "photos": len(trainer.photos),
         "sightings": len(trainer.sightings.weights),
-        "region_grown": round(scene.poses_from_scene.scale / context.read(FIRST_SCENE).poses_from_scene.scale, 3),
+        "region_grown": round(training.region.radius if training.region else 1.0, 3),
         **summary,
     }
 
 
 # ---------------------------------------------------------------- training in one region
+class _Region(NamedTuple):
+    """A region that has grown: a sphere in the frame of the first one."""
+
+    center: tuple[float, float, float]
+    radius: float
+
+    def of(self, scene: PosedScene) -> PosedScene:
+        """The first scene with this region."""
+        return regrown(scene, np.array(self.center), self.radius)
+
+
 @dataclass
 class _Training:
     """A trainer in a scene, and how much of the budget is spent.
 
     Attributes:
+        region: the scene's, where it has grown. looked: no more to be asked whether it should.
         spent: seconds before this process, or this scene.
         started: clock at its start.
     """
@@ -92,30 +101,59 @@ class _Training:
     context: StageContext[TrainParams]
     scene: PosedScene
     trainer: Any
+    region: _Region | None = None
+    looked: bool = False
     spent: float = 0.0
     started: float = field(default_factory=time.monotonic)
 
     @classmethod
-    def begun(cls, context: StageContext[TrainParams], scene: PosedScene) -> _Training:
-        """From the checkpoint where there is one, else from the first shape."""
-        training = cls(context, scene, _make_trainer(context, scene))
-        training.spent = _resume(training.trainer, training.checkpoint, training.metrics)
+    def begun(cls, context: StageContext[TrainParams]) -> _Training:
+        """From the checkpoint where there is one, in the region that it is of; else from the first shape."""
+        scene, saved = context.read(FIRST_SCENE), _checkpoint(context)
+        if saved is None:
+            training = cls(context, scene, _make_trainer(context, scene), looked=not scene.growable)
+            training.metrics.unlink(missing_ok=True)
+        else:
+            region = _Region(*saved["region"]) if saved["region"] else None
+            scene = region.of(scene) if region else scene
+            trainer = _make_trainer(context, scene)
+            training = cls(context, scene, trainer, region, saved["looked"], saved["seconds"])
+            trainer.load_state(saved["trainer"])
+            _cut_after(training.metrics, trainer.step_index)
+            log.info("training goes on from step %d", trainer.step_index)
         if training.trainer.step_index == 0:
             _start_from_shape(training.trainer, scene.cameras)
         training.started = time.monotonic()
         return training
 
-    def moved(self, scene: PosedScene) -> _Training:
-        """In another region, from the shape that was learned in this one; as much of the budget is spent."""
-        trainer = _make_trainer(self.context, scene)
+    def where_nothing_is_cut(self) -> _Training:
+        """This one, or one in a larger region if the surface learned so far is cut in the middle of many photos.
+
+        It starts from that surface, with as much of the budget spent; this one is of no use any more then.
+        """
+        self.looked = True
+        region = _grown(self)
+        if region is None:
+            return self
+        scene = region.of(self.scene)
         shape = _shape_within(self.trainer, scene.poses_from_scene, self.scene.poses_from_scene)
+        steps, self.trainer = self.trainer.step_index, None  # its photos would be in memory twice
+        trainer = _make_trainer(self.context, scene)
         error = trainer.start_from(shape)
         log.info("the SDF starts from the shape learned so far, met to %.4f on average", error)
-        trainer.step_index = self.trainer.step_index
-        artifacts.SCENE.save(self.context.scratch, scene)
-        training = _Training(self.context, scene, trainer, self.seconds)
-        _save(trainer, training.checkpoint, training.seconds)
+        trainer.step_index = steps
+        training = _Training(self.context, scene, trainer, region, True, self.seconds)
+        training.save()
         return training
+
+    def save(self) -> None:
+        """Write the checkpoint beside the old one, then take its place: a kill leaves one of the two whole."""
+        import torch
+
+        partial = self.checkpoint.with_suffix(".partial")
+        state = {"trainer": self.trainer.state(), "region": self.region and tuple(self.region), "looked": self.looked}
+        torch.save({**state, "seconds": self.seconds}, partial)
+        os.replace(partial, self.checkpoint)
 
     @property
     def checkpoint(self) -> Path:
@@ -149,7 +187,7 @@ class _Training:
                     context.progress(progress, 1.0, f"PSNR {numbers_out['psnr']:.1f} dB")
                     _check(numbers_out, trainer.step_index)
                 if time.monotonic() - saved > CHECKPOINT_EVERY:
-                    _save(trainer, self.checkpoint, self.seconds)
+                    self.save()
                     saved = time.monotonic()
                 if progress - previewed >= context.params.preview_every:
                     _preview(trainer, context.scratch, progress)
@@ -172,15 +210,8 @@ def _make_trainer(context: StageContext[TrainParams], scene: PosedScene) -> Any:
 
 
 # ---------------------------------------------------------------- a region that grows
-def _scene_in_training(context: StageContext[TrainParams]) -> PosedScene:
-    """The scene as undistort framed it, or as it had grown before a kill."""
-    if (context.scratch / artifacts.SCENE.files[0]).exists():
-        return artifacts.SCENE.load(context.scratch)
-    return context.read(FIRST_SCENE)
-
-
-def _grown(training: _Training) -> PosedScene | None:
-    """The scene with a larger region, where the surface learned so far is cut in the middle of many photos."""
+def _grown(training: _Training) -> _Region | None:
+    """A larger region, where the surface learned so far is cut in the middle of many photos."""
     from stages.surface.border import border_cut, region_without_cut
 
     scene = training.scene
@@ -190,7 +221,8 @@ def _grown(training: _Training) -> PosedScene | None:
         return None
     center, radius = region_without_cut(cut)
     log.info("the region cuts what %d photos have in their middle: it grows to %.2f of its radius", cut.photos, radius)
-    return regrown(scene, center, radius)
+    x, y, z = center.tolist()
+    return _Region((x, y, z), float(radius))
 
 
 def _shape_within(trainer: Any, poses_from_new: Similarity, poses_from_old: Similarity) -> np.ndarray:
@@ -298,30 +330,22 @@ def _check(numbers: dict[str, float], step: int) -> None:
         )  # fmt: skip
 
 
-def _save(trainer: Any, path: Path, seconds: float) -> None:
-    """Write the checkpoint beside the old one, then take its place: a kill leaves one of the two whole."""
+def _checkpoint(context: StageContext[TrainParams]) -> dict[str, Any] | None:
+    """What `_Training.save` wrote; None where there is nothing to go on from."""
     import torch
 
-    partial = path.with_suffix(".partial")
-    torch.save({"trainer": trainer.state(), "seconds": seconds}, partial)
-    os.replace(partial, path)
+    path = artifacts.checkpoint_path(context.scratch)
+    if not path.exists():
+        return None
+    saved: dict[str, Any] = torch.load(path, map_location=context.device, weights_only=True)
+    return saved
 
 
-def _resume(trainer: Any, checkpoint: Path, metrics: Path) -> float:
-    """Go on from a checkpoint if there is one; returns the seconds already spent. Later metric lines are cut."""
-    import torch
-
-    if not checkpoint.exists():
-        metrics.unlink(missing_ok=True)
-        return 0.0
-    state = torch.load(checkpoint, map_location=trainer.device, weights_only=True)
-    trainer.load_state(state["trainer"])
+def _cut_after(metrics: Path, step: int) -> None:
+    """Leave out the metric lines after a step: they will be written again."""
     lines = metrics.read_text(encoding="utf-8").splitlines() if metrics.exists() else []
     # The lines up to the checkpoint were flushed before it was written; a kill may have cut a later one in half.
-    kept = lines[: trainer.step_index // LOG_EVERY]
-    metrics.write_text("".join(f"{line}\n" for line in kept), encoding="utf-8")
-    log.info("training goes on from step %d", trainer.step_index)
-    return float(state["seconds"])
+    metrics.write_text("".join(f"{line}\n" for line in lines[: step // LOG_EVERY]), encoding="utf-8")
 
 
 def _preview(trainer: Any, folder: Path, progress: float) -> None:
@@ -344,7 +368,7 @@ def _last_numbers(metrics: Path) -> dict[str, float]:
 
 TRAIN: Stage[TrainParams] = Stage(
     name="train",
-    version=4,
+    version=5,
     settings=lambda config: config.train,
     run=run,
     reads=(FIRST_SCENE, PINHOLE_PHOTOS),

@@ -29,20 +29,20 @@ from stages.artifacts import (
     write_png,
 )
 from stages.engine.stage import Stage, StageContext
-from stages.errors import ReconstructionError
-from stages.geometry.attention import attended
+from stages.errors import ConfigError, ReconstructionError
 from stages.geometry.cameras import PinholeCameras, PosedScene
+from stages.geometry.layout import Layout, find_layout
 from stages.geometry.normalisation import into_frame, scene_frame
 from stages.geometry.place import GivenRegion
-from stages.geometry.plane import Plane, find_ground
-from stages.geometry.region import RegionOfInterest, find_region, grown_over
+from stages.geometry.region import RegionOfInterest
 from stages.geometry.silhouettes import MIN_SHARE, agreeing, silhouette_agreement
-from stages.geometry.up import Up, choose_up, estimate_up
+from stages.geometry.subjects import Subject, find_subjects
 from stages.posing.undistortion import (
     plan_warp,
     png_names,
     posed_cameras,
     registered_photos,
+    sparse_points,
     warp_image,
     warp_maps,
     warp_mask,
@@ -67,10 +67,16 @@ def run(context: StageContext[UndistortParams]) -> dict[str, Any]:
 
     cameras = posed_cameras(photos, names, warps)
     masks = _without_doubtful(context, cameras, masks, guessed)
-    points, errors, observations = _sparse_points(model, photos)
+    points, errors, observations = sparse_points(model, photos)
     known, given = context.read(GIVEN_POSES), context.read(GIVEN_REGION)
     stated = known.region if known else None
-    region, ground, up = _find_region(cameras, points, observations, masks, stated, given, context.params.roi_scale)
+    about: np.ndarray | None = None
+    warnings: list[dict[str, str]] = []
+    if stated is None and given is None:
+        subjects = find_subjects(cameras, points, observations)
+        about, warnings = _chosen(subjects, [photo.name for photo in photos], context.params.subject)
+    region, ground, up = _find_layout(cameras, points, observations, masks, stated, about)
+    region = _set(region, given, context.params.roi_scale)
     poses_from_scene = scene_frame(region.center, region.radius, up.direction)
     scene = PosedScene(
         cameras=into_frame(cameras, poses_from_scene),
@@ -82,6 +88,7 @@ def run(context: StageContext[UndistortParams]) -> dict[str, Any]:
         kind=region.kind,
         ground=ground and ground.within(poses_from_scene),
         growable=stated is None and given is None and all(mask is None for mask in masks),
+        roi_scale=context.params.roi_scale,
     )
     context.write(FIRST_SCENE, scene)
     context.progress(len(photos) + 1, len(photos) + 1, "done")
@@ -100,6 +107,7 @@ def run(context: StageContext[UndistortParams]) -> dict[str, Any]:
         "points": len(points),
         "points_inside": int(inside.sum()),
         "camera_distance": round(float(np.median(np.linalg.norm(scene.cameras.centers, axis=1))), 3),
+        "warnings": warnings,
     }
 
 
@@ -182,60 +190,73 @@ def _count(masks: Sequence[np.ndarray | None], guessed: Sequence[bool]) -> int:
     return sum(mask is not None and guess for mask, guess in zip(masks, guessed, strict=True))
 
 
-# ---------------------------------------------------------------- the scene
-def _sparse_points(model: Any, photos: list[Any]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points [P, 3] in the frame of the poses, errors [P], observations [M, 2] (image index, point index)."""
-    index_of = {photo.image_id: i for i, photo in enumerate(photos)}
-    ids = sorted(model.points3D)
-    points = np.array([model.points3D[i].xyz for i in ids], dtype=np.float64).reshape(-1, 3)
-    errors = np.array([model.points3D[i].error for i in ids], dtype=np.float32)
-    seen = {
-        (index_of[element.image_id], k)
-        for k, i in enumerate(ids)
-        for element in model.points3D[i].track.elements
-        if element.image_id in index_of
-    }
-    return points, errors, np.array(sorted(seen), dtype=np.int32).reshape(-1, 2)
+# ---------------------------------------------------------------- what the photos are about
+def _chosen(
+    subjects: Sequence[Subject], names: Sequence[str], number: int
+) -> tuple[np.ndarray | None, list[dict[str, str]]]:
+    """Photos of the subject of this number (from 1), None where all are; and for the report, that there are others.
+
+    Raises:
+        ConfigError: there are not so many subjects.
+    """
+    if number > max(1, len(subjects)):
+        raise ConfigError(
+            f"`undistort.subject` is {number}, but the photos are about {max(1, len(subjects))} that lie far apart.",
+            "Try `--set undistort.subject=1`.",
+        )
+    if len(subjects) < 2:
+        return None, []
+    taken, warnings = subjects[number - 1], []
+    for k, other in enumerate(subjects, 1):
+        if k != number:
+            away = float(np.linalg.norm(other.sphere[0] - taken.sphere[0])) / taken.sphere[1]
+            sentence = (
+                f"Only what {len(taken.photos)} photos are about is reconstructed ({_named(names, taken)}). "
+                f"{len(other.photos)} others ({_named(names, other)}) are about something {away:.0f} times its "
+                "radius away."
+            )
+            command = f"hineus run --workspace WORKSPACE --set undistort.subject={k}"
+            log.warning("%s Its model: `%s`, in a copy of the workspace to keep both.", sentence, command)
+            warnings.append({"sentence": sentence, "command": command})
+    return taken.photos, warnings
 
 
-def _find_region(
+def _named(names: Sequence[str], subject: Subject) -> str:
+    """The first and the last photo of a subject."""
+    return f"{names[subject.photos[0]]} to {names[subject.photos[-1]]}"
+
+
+def _find_layout(
     cameras: PinholeCameras,
     points: np.ndarray,
     observations: np.ndarray,
     masks: Sequence[np.ndarray | None],
     stated: KnownSphere | None,
-    given: GivenRegion | None,
-    scale: float,
-) -> tuple[RegionOfInterest, Plane | None, Up]:
-    """Region, ground and up in the frame of the poses, that of the cameras and points [P, 3].
-
-    Args:
-        stated: what the given poses say. given: what the user says, which wins.
-        scale: of the region that is found.
-    """
-    held, about = estimate_up(cameras), attended(cameras, points, observations)
+    photos: np.ndarray | None,
+) -> Layout:
+    """As `find_layout`; `stated` is what the given poses say."""
     sphere = RegionOfInterest(stated.center, stated.radius, "object", stated.source) if stated else None
     try:
-        region = find_region(cameras, points, about, masks, sphere)
+        return find_layout(cameras, points, observations, masks, sphere, photos)
     except ValueError as error:
         raise ReconstructionError(
             f"No region of interest found from {len(cameras)} cameras and {len(points)} points ({error}).",
             "Photograph the object from more sides, try `--set sfm.matcher=exhaustive`, or say where it is: "
             "`--set 'place.region=sphere X Y Z RADIUS'`.",
         ) from error
-    ground = find_ground(points, cameras.centers, held.direction, region.center, region.radius)
-    region = grown_over(region, points[about], ground)
-    if given is not None:
-        source = "the given sphere" if given.box is None else "the given box"
-        region = RegionOfInterest(given.center, given.radius, region.kind, source)
-    else:
-        region = replace(region, radius=region.radius * scale)
-    return region, ground, choose_up(held, None if ground is None else ground.normal)
+
+
+def _set(region: RegionOfInterest, given: GivenRegion | None, scale: float) -> RegionOfInterest:
+    """The region as the user wants it: `given`, or as it was found but for its scale."""
+    if given is None:
+        return replace(region, radius=region.radius * scale)
+    source = "the given sphere" if given.box is None else "the given box"
+    return RegionOfInterest(given.center, given.radius, region.kind, source)
 
 
 UNDISTORT: Stage[UndistortParams] = Stage(
     name="undistort",
-    version=7,
+    version=8,
     settings=lambda config: config.undistort,
     run=run,
     reads=(PHOTOS, IMAGE_SET, MODEL, GIVEN_POSES, GIVEN_REGION),

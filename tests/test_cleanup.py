@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from rigs import scene_without_points, three_rings
+from rigs import capture, ring, scene_without_points, three_rings
 
 from configs.params import CleanupParams
 from stages import artifacts
@@ -18,6 +18,7 @@ from stages.geometry.place import given_region
 from stages.geometry.plane import Plane
 from stages.geometry.similarity import Similarity
 from stages.surface import selection, triangle_mesh
+from stages.surface.border import GROWTH
 from stages.surface.decimation import decimate
 from stages.surface.isosurface import extract_isosurface
 from stages.surface.solids import extract_solid
@@ -475,3 +476,17 @@ def test_stage_crops_to_the_box_of_the_world(stage):
 def test_stage_says_when_the_box_is_empty(stage):
     with pytest.raises(ReconstructionError, match="inside the box"):
         stage(*ball(), region=given_region("box", (0.7, 0.7, 0.7, 0.8, 0.8, 0.8), Similarity.identity()))
+
+
+def test_a_mesh_that_the_region_cuts_is_warned_of_with_a_larger_region(stage):
+    rod = extract_isosurface(lambda p: np.maximum(np.linalg.norm(p[:, :2], axis=1) - 0.15, -p[:, 2]), 64)
+    above = capture(ring(np.array([0, 0, 0.7]), distance=2.25, pitch_deg=15))
+    numbers, *_ = stage(rod.vertices, rod.faces, scene_extras={"cameras": above, "roi_scale": 0.5})
+    [warning] = numbers["warnings"]
+    assert "cuts what 12 photos have in their middle" in warning["sentence"]
+    scale = float(warning["command"].split("--set undistort.roi_scale=")[1])
+    assert 0.5 * (1 + GROWTH) - 0.02 < scale < 0.5 * (1 + GROWTH) + 0.05  # times the region that was found
+
+
+def test_a_whole_mesh_is_not_warned_of(stage):
+    assert stage(*ball())[0]["warnings"] == []

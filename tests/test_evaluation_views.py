@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from sphere_scene import RADIUS, render, ring_of_cameras, write_undistorted
+from sphere_scene import RADIUS, render, ring_of_cameras, sphere_scene, write_undistorted
 from train_settings import small
 from typer.testing import CliRunner
 
@@ -196,6 +196,7 @@ def workspace(tmp_path: Path) -> Workspace:
         fields = Fields(field_shape(PARAMS, len(cameras), background=False))
         torch.save(field_state(fields), artifacts.FIELD.load(out))
         artifacts.HELD_OUT.save(out, [cameras.names[i] for i in (2, 6)])
+        artifacts.SCENE.save(out, sphere_scene(cameras))
 
     publish(opened, "train", train, PARAMS.model_dump(mode="json"))
     publish(opened, "atlas", lambda out: artifacts.ATLAS_MESH.save(out, patch_of_the_ball()))

@@ -108,9 +108,11 @@ def test_a_regrown_scene_is_the_same_capture():
         scene_without_points(into_frame(cameras, first), first),
         points=first.inverse().apply(points).astype(np.float32),
         growable=True,
+        roi_scale=0.8,
     )
     grown = regrown(scene, np.array([0.5, 0.0, 0.0]), 1.5)
     assert (grown.poses_from_scene.scale, grown.growable) == (3.0, False)
+    assert grown.roi_scale == pytest.approx(0.8 * (0.5 + 1.5))
     np.testing.assert_allclose(grown.poses_from_scene.apply(grown.points), points, atol=1e-5)
     np.testing.assert_allclose(grown.poses_from_scene.apply(grown.cameras.centers), cameras.centers, atol=1e-9)
     for i in (0, 5):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from benchmarks import regions
+from benchmarks import region_cuts, regions
 from benchmarks.captures import kinds, photos
 from benchmarks.captures.model import Capture
 from benchmarks.captures.shapes import block, flat, lump, sheet
@@ -17,6 +17,7 @@ from benchmarks.captures.tracks import FALSE_SHARE, MAX_ERROR_PX, simulate
 from benchmarks.captures.walks import orbit, shot
 from stages.evaluation.protocols.known_object import load_known_object
 from stages.geometry.region import enclosing_sphere
+from stages.geometry.similarity import Similarity
 
 BALL = (lump((0, 0, 1), (1, 1, 1), 0.8),)
 
@@ -114,6 +115,16 @@ def test_a_plain_capture_differs_from_its_original_in_texture_alone():
     assert plain.surroundings[0].texture == original.surroundings[0].texture
 
 
+@pytest.mark.parametrize("name", ["boulder", "car"])
+def test_a_subject_that_no_photo_shows_whole_is_in_its_region(name: str):
+    capture = kinds.make(name)
+    capture = replace(capture, focal=2.2 * capture.focal)
+    subject, posed = seen_points(capture, 1000), simulate(capture, np.random.default_rng(0), 300)
+    assert max(capture.cameras.in_frame(i, subject).mean() for i in range(len(capture.cameras))) < 0.6
+    region = regions.region_of(posed)
+    assert fit(subject, region.center, region.radius).inside == 100
+
+
 # ---------------------------------------------------------------- tables
 def _row(name: str, inside: float, volume: float) -> regions.Row:
     return regions.Row(regions.MADE_UP, name, "what", inside, volume, 9.0, "object", "words", 0.5, 1000)
@@ -156,3 +167,35 @@ def test_rendered_photos_show_the_subject_where_the_stated_cameras_have_it(tmp_p
         pixels = np.asarray(Image.open(tmp_path / "images" / f"{i:03d}.jpg")).mean(2)
         column, row = known.cameras.project(i, np.array([[0, 0, 1.0]]))[0][0].astype(int)
         assert pixels[row, column] > 3 * pixels[-4:, :4].mean()
+
+
+# ---------------------------------------------------------------- regions that cut
+def test_a_surface_is_cut_at_the_region_and_has_both_sides():
+    beam = block((0, 0, 0), (4.0, 0.5, 0.5), 1.0)
+    capture = Capture((beam,), (), kinds.make("trophy").cam_from_world)
+    vertices, faces = region_cuts.surface_in(capture, Similarity(2.0, np.eye(3), np.array([1.0, 0, 0])))
+    assert 0.95 < np.linalg.norm(vertices, axis=1).max() < 1
+    assert vertices[:, 0].max() == pytest.approx(0.5)  # the block ends at 2 metres
+    corners = vertices[faces]
+    assert np.linalg.norm(corners - np.roll(corners, 1, 1), axis=2).max() <= region_cuts.LONGEST_EDGE
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    np.testing.assert_allclose(normals.sum(0), 0, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_a_region_that_holds_half_a_relief_is_found_to_cut_it():
+    rows = {(row.scale, row.moved): row for row in region_cuts.look("relief")}
+    assert len(rows) == len(region_cuts.REGIONS)
+    assert rows[1.0, 0.0].radius == 1.0
+    assert rows[0.6, 0.0].inside < 95
+    assert rows[0.6, 0.0].photos >= 3
+    assert rows[0.6, 0.0].inside_then == 100
+
+
+def test_the_table_of_cuts_counts_captures():
+    def row(inside: float, radius: float, then: float) -> region_cuts.Row:
+        return region_cuts.Row("a", 0.8, 0.0, inside, 5, radius, then)
+
+    rows = [row(90, 1.5, 100), row(90, 1.5, 95), row(90, 1.0, 90), row(100, 1.0, 100), row(100, 1.2, 100)]
+    line = next(line for line in region_cuts.cuts_table(rows).splitlines() if line.startswith("| 0.8"))
+    assert line == "| 0.8 of the radius | 3 | 2 | 1 | 2 | 1 |"

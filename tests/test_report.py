@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from globe import globe
 from report_inputs import BOX, UP, bare_inputs, full_inputs, manifest, page, pyramid, quality
+from rigs import scene_without_points, three_rings
 
 from configs.load import load_config
 from configs.params import ReportParams
@@ -29,7 +30,7 @@ from stages.geometry.up import y_up_rotation
 from stages.report import THREE, region_corners
 from stages.reporting import view3d
 from stages.reporting.curves import line_chart
-from stages.reporting.numbers import duration
+from stages.reporting.numbers import describe_where, duration
 from stages.reporting.pictures import draw_stills
 from stages.reporting.view3d import NO_VALUE, light_enough, pack_mesh, pack_overlays, pack_region, pack_scene
 
@@ -267,6 +268,16 @@ def test_a_mesh_too_heavy_for_the_page_is_decimated_with_its_measures(monkeypatc
     clear = np.abs(light.vertices[:, 2]) > 0.05
     np.testing.assert_array_equal(measured.invented[clear], light.vertices[clear, 2] > 0)
     assert light_enough(light, measured) == (light, measured)
+
+
+def test_it_is_said_where_the_region_grew():
+    def said(**train: float) -> str:
+        scene = scene_without_points(three_rings())
+        return " ".join(describe_where(scene, Place(Similarity.identity()), {"train": train}))
+
+    assert "It grew to 1.44 times its radius in training" in said(region_grown=1.437)
+    assert "It grew" not in said(region_grown=1.0)
+    assert "It grew" not in said()
 
 
 def test_warnings_of_stages_are_on_top_of_the_page(full):

@@ -18,7 +18,9 @@ from configs.training import TrainParams
 from stages import artifacts, train
 from stages.engine.stage import StageContext
 from stages.errors import InputError
-from stages.geometry.hull import hull_distances
+from stages.geometry.hull import cube, hull_distances
+from stages.geometry.normalisation import regrown
+from stages.geometry.similarity import Similarity
 from stages.neural import acceleration, encodings
 from stages.neural import fields as fields_module
 from stages.neural.fields import contract
@@ -26,6 +28,9 @@ from stages.neural.sightings import Sightings
 from stages.neural.trained_field import load_field
 from stages.neural.trainer import Trainer
 from stages.neural.training_photos import Photos
+from stages.surface import border
+from stages.surface.border import BorderCut, region_without_cut
+from stages.surface.triangle_mesh import vertex_normals
 
 
 def test_rays_see_the_pixels_they_were_drawn_from():
@@ -147,6 +152,34 @@ EVERYTHING = {
 }  # fmt: skip
 
 
+class KilledError(Exception):
+    pass
+
+
+def run_and_kill(run_context: StageContext, monkeypatch: pytest.MonkeyPatch, at: int) -> None:
+    """Train until the step `at` is to be made."""
+    original = Trainer.step
+
+    def step_until_killed(self, progress):
+        if self.step_index == at:
+            raise KilledError
+        return original(self, progress)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Trainer, "step", step_until_killed)
+        with pytest.raises(KilledError):
+            train.run(run_context)
+
+
+def assert_same_training(one: StageContext, other: StageContext) -> None:
+    curves = [metric_lines(artifacts.METRICS.load(c.out)) for c in (one, other)]
+    assert curves[0] == curves[1]
+    assert [line["step"] for line in curves[0]] == list(range(5, 61, 5))
+    fields = [load_field(artifacts.FIELD.load(c.out)) for c in (one, other)]
+    points = np.random.default_rng(0).uniform(-1, 1, (50, 3))
+    assert np.array_equal(fields[0].sdf(points), fields[1].sdf(points))
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("settings", [{}, EVERYTHING], ids=["default", "everything"])
 def test_a_killed_run_goes_on_with_the_same_loss_curve(tmp_path, monkeypatch, settings):
@@ -156,33 +189,13 @@ def test_a_killed_run_goes_on_with_the_same_loss_curve(tmp_path, monkeypatch, se
     whole = context(tmp_path, "whole", params)
     numbers = train.run(whole)
     assert numbers["steps"] == TINY.steps
-
-    class KilledError(Exception):
-        pass
-
     killed = context(tmp_path, "killed", params)
-    original = Trainer.step
-
-    def step_until_killed(self, progress):
-        if self.step_index == 37:
-            raise KilledError
-        return original(self, progress)
-
-    monkeypatch.setattr(Trainer, "step", step_until_killed)
-    with pytest.raises(KilledError):
-        train.run(killed)
-    monkeypatch.setattr(Trainer, "step", original)
+    run_and_kill(killed, monkeypatch, at=37)
     assert artifacts.checkpoint_path(killed.scratch).exists()
     with artifacts.METRICS.load(killed.scratch).open("a") as file:
         file.write('{"step": 40, "progr')  # what a kill leaves of a line that was being written
     train.run(killed)
-    curves = [metric_lines(artifacts.METRICS.load(c.out)) for c in (whole, killed)]
-    assert curves[0] == curves[1]
-    assert [line["step"] for line in curves[0]] == list(range(5, 61, 5))
-
-    fields = [load_field(artifacts.FIELD.load(c.out)) for c in (whole, killed)]
-    points = np.random.default_rng(0).uniform(-1, 1, (50, 3))
-    assert np.array_equal(fields[0].sdf(points), fields[1].sdf(points))
+    assert_same_training(whole, killed)
     assert list(artifacts.PREVIEWS.load(whole.out).iterdir())
 
 
@@ -268,6 +281,116 @@ def test_gradients_far_from_one_are_warned_of_now_and_then(caplog):
     assert not caplog.records
     train._check(numbers, train.SETTLED)
     assert "mean length of 0.40" in caplog.text
+
+
+# ---------------------------------------------------------------- a region that grows
+CUT = BorderCut(np.array([[0.0, 0, 0.97], [0, 0.1, 0.95]]), photos=5)
+LARGER = region_without_cut(CUT)
+
+
+def growing(tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch, cut: BorderCut | None) -> StageContext:
+    """A training whose region may grow, and is found to be cut like this."""
+    monkeypatch.setattr(train, "LOG_EVERY", 5)
+    monkeypatch.setattr(train, "CHECKPOINT_EVERY", 0)
+    monkeypatch.setattr(border, "border_cut", lambda *_: cut)
+    run_context = context(tmp_path, name, changed(TINY, {"preview_every": 1.0}))
+    folder = tmp_path / "undistort"
+    artifacts.FIRST_SCENE.save(folder, replace(artifacts.FIRST_SCENE.load(folder), growable=True))
+    return run_context
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("at", [7, 12, 37], ids=["before the look", "just after it", "later"])
+def test_a_region_grows_once_and_a_killed_run_goes_on_in_it(tmp_path, monkeypatch, at):
+    whole = growing(tmp_path, "whole", monkeypatch, CUT)
+    numbers = train.run(whole)
+    assert numbers["steps"] == TINY.steps
+    assert numbers["region_grown"] == pytest.approx(LARGER[1], abs=1e-3)
+    first, published = whole.read(artifacts.FIRST_SCENE), artifacts.SCENE.load(whole.out)
+    expected = regrown(first, *LARGER)
+    assert published.poses_from_scene.scale == pytest.approx(LARGER[1] * first.poses_from_scene.scale)
+    np.testing.assert_allclose(published.cameras.extrinsics, expected.cameras.extrinsics)
+    np.testing.assert_allclose(published.points, expected.points, atol=1e-6)
+
+    killed = growing(tmp_path, "killed", monkeypatch, CUT)
+    run_and_kill(killed, monkeypatch, at)
+    train.run(killed)
+    assert_same_training(whole, killed)
+    np.testing.assert_array_equal(artifacts.SCENE.load(killed.out).cameras.extrinsics, published.cameras.extrinsics)
+
+
+@pytest.mark.slow
+def test_a_region_is_looked_at_once_even_if_the_run_is_killed(tmp_path, monkeypatch):
+    killed = growing(tmp_path, "killed", monkeypatch, None)
+    run_and_kill(killed, monkeypatch, at=37)
+    monkeypatch.setattr(border, "border_cut", lambda *_: CUT)
+    numbers = train.run(killed)
+    assert numbers["region_grown"] == 1.0
+    scenes = artifacts.SCENE.load(killed.out), killed.read(artifacts.FIRST_SCENE)
+    np.testing.assert_array_equal(scenes[0].cameras.extrinsics, scenes[1].cameras.extrinsics)
+
+
+@pytest.mark.slow
+def test_a_ball_that_the_region_cuts_comes_out_whole(tmp_path):
+    params = changed(TINY, {"steps": 400, "sampling.rays": 256, "field.sphere_radius": 0.6, "preview_every": 1.0})
+    run_context = context(tmp_path, "out", params)
+    folder = tmp_path / "undistort"
+    first = regrown(artifacts.FIRST_SCENE.load(folder), np.array([0.3, 0.0, 0.0]), 0.5)  # ends at x = -0.2 in the ball
+    artifacts.FIRST_SCENE.save(folder, replace(first, growable=True))
+    numbers = train.run(run_context)
+    assert numbers["region_grown"] > 1.1
+    published = artifacts.SCENE.load(run_context.out)
+    side = np.random.default_rng(0).normal(size=(300, 3)) * [1, 1, 0.4]
+    side *= RADIUS / np.linalg.norm(side, axis=1, keepdims=True)
+    lost = side[side[:, 0] < -0.25]  # on the ball, beyond the first region
+    in_poses = Similarity(2.0, np.eye(3), np.array([1.0, 2, 3])).apply(lost)  # as `sphere_scene` has it
+    places = published.poses_from_scene.inverse().apply(in_poses)
+    assert np.linalg.norm(places, axis=1).max() < 1
+    sdf = load_field(artifacts.FIELD.load(run_context.out)).sdf(places)
+    assert np.median(np.abs(sdf)) * published.poses_from_scene.scale / 2 < 0.03
+
+
+def test_a_region_that_was_given_is_not_looked_at(tmp_path, monkeypatch):
+    def refuse(*_: object) -> None:
+        raise AssertionError("looked at")
+
+    monkeypatch.setattr(border, "border_cut", refuse)
+    run_context = context(tmp_path, "out", changed(TINY, {"steps": 5}))
+    assert train.run(run_context)["region_grown"] == 1.0
+
+
+def test_the_coarse_surface_faces_outwards():
+    trainer = make_trainer()
+    trainer._refresh_cache(trainer.moment(0.0))
+    vertices, faces = trainer.coarse_surface()
+    used = np.unique(faces)
+    np.testing.assert_allclose(np.linalg.norm(vertices[used], axis=1), TINY.field.sphere_radius, atol=0.02)
+    assert (vertex_normals(vertices, faces)[used] * vertices[used]).sum(1).min() > 0
+    trainer.cache.values.fill_(1.0)  # nothing there
+    assert [len(part) for part in trainer.coarse_surface()] == [0, 0]
+
+
+@pytest.mark.parametrize(("center", "radius"), [((0.0, 0, 0), 1.5), ((0.3, -0.1, 0.2), 1.8)])
+def test_a_shape_keeps_its_distances_in_a_larger_region(center, radius):
+    trainer = make_trainer()  # its SDF is a ball about the middle
+    old = Similarity(2.0, np.eye(3), np.array([1.0, 2, 3]))
+    new = old.compose(Similarity(radius, np.eye(3), np.array(center)))
+    shape = train._shape_within(trainer, new, old)
+    in_poses = np.linalg.norm(new.apply(cube()) - old.translation, axis=-1) - 2.0 * TINY.field.sphere_radius
+    np.testing.assert_allclose(shape * new.scale, in_poses, atol=0.02)
+
+
+@pytest.mark.slow
+def test_a_trainer_that_takes_over_starts_from_the_shape_with_its_grid_up_to_date():
+    first, second = make_trainer(), make_trainer()
+    larger = Similarity(1.5, np.eye(3), np.zeros(3))
+    assert second.start_from(train._shape_within(first, larger, Similarity.identity())) < 0.02
+    second.step_index = 160  # at which a grid that is up to date would only be refreshed near the surface
+    second._refresh_cache(second.moment(0.5))
+    radius = np.linalg.norm(second.cache.points(torch.arange(24**3)).numpy(), axis=1)
+    found = second.cache.values.flatten().numpy()
+    ball = TINY.field.sphere_radius / 1.5
+    assert np.abs(found - (radius - ball))[radius < 1].mean() < 0.05
 
 
 # ---------------------------------------------------------------- the visual hull

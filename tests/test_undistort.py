@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import fields, replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -23,7 +25,9 @@ from dotted_capture import (
     undistort,
     write_capture,
 )
+from rigs import dome_on_a_table, sightings
 
+from configs.params import PlaceParams
 from stages import artifacts
 from stages.artifacts import ImageSet
 from stages.errors import ConfigError, InputError, WorkspaceError
@@ -31,6 +35,7 @@ from stages.geometry.cameras import PinholeCameras, PosedScene
 from stages.geometry.place import Place, given_region
 from stages.geometry.plane import Plane
 from stages.geometry.similarity import Similarity
+from stages.place import _given_region
 from stages.posing.undistortion import plan_warp, png_names, warp_maps
 
 
@@ -176,7 +181,7 @@ def test_png_names_stay_unique():
 # ---------------------------------------------------------------- region, scale and place
 def test_a_given_sphere_is_the_unit_sphere(tmp_path: Path):
     inputs = write_capture(tmp_path, *MODELS[0], masks=False)
-    scene, _, numbers = undistort(inputs, tmp_path, region="sphere 2.5 -1 0.5 0.75", roi_scale=3.0)
+    scene, _, numbers = undistort(inputs, tmp_path, region="sphere 2.5 -1 0.5 0.75", roi_scale=3.0, subject=2)
     assert world_from(scene, tmp_path).scale == 0.75
     np.testing.assert_allclose(world_from(scene, tmp_path).translation, [2.5, -1, 0.5])
     assert artifacts.GIVEN_REGION.load(tmp_path / "place").box is None
@@ -188,6 +193,51 @@ def test_a_region_that_no_camera_sees_is_refused(tmp_path: Path):
     with pytest.raises(ConfigError, match=r"sphere 2 50 0.5 1 is seen by 0 of 8 cameras \(need 2\)") as caught:
         undistort(inputs, tmp_path, region="sphere 2 50 0.5 1")
     assert "where the cameras stand about" in caught.value.hint
+
+
+class PosedModel:
+    """Of a pycolmap model what sparse points are read from."""
+
+    def __init__(self, points: np.ndarray, observations: np.ndarray) -> None:
+        photos = [[] for _ in points]
+        for image, point in observations:
+            photos[point].append(SimpleNamespace(image_id=int(image)))
+        self.points3D = {
+            k: SimpleNamespace(xyz=xyz, error=0.5, track=SimpleNamespace(elements=seen))
+            for k, (xyz, seen) in enumerate(zip(points, photos, strict=True))
+        }
+
+
+def given(region: str, masked: bool = False, count: int = 1800):
+    """A region of the settings for a dome of radius 2 about (10, 0, 2); the frame of the poses is half as large."""
+    cameras, points = dome_on_a_table()
+    points = points[:count]
+    photos = [SimpleNamespace(image_id=i) for i in range(len(cameras))]
+    place = Place(Similarity(2.0, np.eye(3), np.array([10.0, 0, 0])))
+    model = PosedModel(points, sightings(cameras, points))
+    return _given_region(cameras, model, photos, place, PlaceParams(region=region), masked)
+
+
+AIR = "sphere 10 0 4.6 0.25"  # above the dome
+
+
+def test_a_region_that_holds_no_points_is_refused_with_the_one_that_would_be_found():
+    with pytest.raises(ConfigError, match=r"sphere 10 0 4.6 0.25 holds 0 of 1800 sparse points \(need 10\)") as caught:
+        given(AIR)
+    command = re.search(r"`--set 'place.region=(sphere [^']+)'`", caught.value.hint)[1]
+    x, y, z, radius = (float(number) for number in command.split()[1:])
+    assert np.linalg.norm(np.array([x, y, z]) - [10, 0, 2]) < 0.2
+    assert 2.0 < radius < 4.4
+    assert given(command).radius == pytest.approx(radius / 2)
+    with pytest.raises(ConfigError, match=r"box 9.5 -0.5 4.2 10.5 0.5 5 holds 0 of 1800"):
+        given("box 9.5 -0.5 4.2 10.5 0.5 5")
+
+
+def test_a_region_without_points_is_taken_where_masks_tell_or_there_are_hardly_any():
+    assert given(AIR, masked=True).radius == 0.125
+    assert given(AIR, count=60).radius == 0.125
+    assert given(AIR, count=0).radius == 0.125
+    assert given("sphere 10 0 2 2.1").radius == 1.05
 
 
 def test_a_given_box_is_kept_for_the_crop(tmp_path: Path):

@@ -22,9 +22,16 @@ from stages.geometry.plane import find_ground
 from stages.geometry.region import STANDING, enclosing_sphere
 from stages.geometry.up import estimate_up
 from stages.posing import neus
-from stages.posing.undistortion import plan_warp, png_names, posed_cameras, registered_photos, warp_maps, warp_mask
+from stages.posing.undistortion import (
+    plan_warp,
+    png_names,
+    posed_cameras,
+    registered_photos,
+    sparse_points,
+    warp_maps,
+    warp_mask,
+)
 from stages.surface.triangle_mesh import raycaster
-from stages.undistort import _sparse_points
 
 # A sparse point that is surely what the photos are about: this many that see it have it in the middle half of both
 # directions, and the rays of two of them meet at this angle.
@@ -46,7 +53,7 @@ def load_posed(workspace: Path, masks: dict[str, Path] | None = None) -> Posed:
     photos = registered_photos(model)
     warps = {number: plan_warp(camera, UndistortParams().max_side) for number, camera in model.cameras.items()}
     cameras = posed_cameras(photos, png_names([photo.name for photo in photos]), warps)
-    points, errors, observations = _sparse_points(model, photos)
+    points, errors, observations = sparse_points(model, photos)
     if masks is None:
         return Posed(cameras, points, errors, observations)
     warped = []

@@ -40,6 +40,7 @@ class _PlaneRecord(Record):
 class _SceneRecord(Record):
     kind: str
     growable: bool
+    roi_scale: float
     up: Array
     poses_from_scene: SimilarityRecord
     ground: _PlaneRecord | None
@@ -85,6 +86,7 @@ def _load_scene(folder: Path) -> PosedScene:
         up=record.up,
         kind=record.kind,
         growable=record.growable,
+        roi_scale=record.roi_scale,
         ground=None if record.ground is None else Plane(**dict(record.ground)),
         **sparse,
     )

@@ -112,6 +112,7 @@ class PosedScene:
         kind: "object" (cameras around one thing) or "forward" (a room, a facade, a survey flight).
         ground: plane of the ground or table in the scene frame, or None where none was found.
         growable: whether the region may grow where it turns out to cut what the photos show: it was found, not given.
+        roi_scale: the `undistort.roi_scale` that would have made a region which holds this one.
     """
 
     cameras: PinholeCameras
@@ -123,6 +124,7 @@ class PosedScene:
     kind: str = "object"
     ground: Plane | None = None
     growable: bool = False
+    roi_scale: float = 1.0
 
     def world_from_scene(self, place: Place) -> Similarity:
         """To the frame of the results."""

@@ -56,4 +56,5 @@ def regrown(scene: PosedScene, center: Float[np.ndarray, " 3"], radius: float) -
         points=old_from_new.inverse().apply(scene.points).astype(np.float32),
         ground=scene.ground and scene.ground.within(old_from_new),
         growable=False,
+        roi_scale=scene.roi_scale * (float(np.linalg.norm(center)) + radius),
     )

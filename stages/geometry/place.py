@@ -118,6 +118,13 @@ class GivenRegion:
         picks = np.array([[i >> k & 1 for k in range(3)] for i in range(8)])
         return self.world_from_poses.inverse().apply(np.take_along_axis(self.box, picks, axis=0))
 
+    def holds(self, points: Float[np.ndarray, "p 3"]) -> Bool[np.ndarray, " p"]:
+        """Which points, in the frame of the poses, lie in the sphere, or in the box where there is one."""
+        if self.box is None:
+            return np.linalg.norm(points - self.center, axis=1) < self.radius
+        world = self.world_from_poses.apply(points)
+        return ((world > self.box[0]) & (world < self.box[1])).all(1)
+
     def sides(self, poses_from_scene: Similarity) -> list[tuple[Float[np.ndarray, " 3"], float]]:
         """Planes (normal, offset) in the scene frame with the box above them; none where there is no box."""
         if self.box is None:

@@ -206,7 +206,7 @@ def _around_points(
     if not len(chosen) or _one_sidedness(cameras, chosen) < MAX_ONE_SIDED:
         distances, _ = cKDTree(cameras.centers).query(points)
         chosen, source = points[distances <= FORWARD_DEPTHS * np.median(distances)], FROM_POINTS
-    chosen = _without_strays(chosen)
+    chosen = without_strays(chosen)
     center, radius = enclosing_sphere(chosen)
     if radius <= 0:
         raise ValueError(f"got sparse points within a radius of {radius}, expected a positive one")
@@ -233,7 +233,7 @@ def grown_over(region: RegionOfInterest, points: Float[np.ndarray, "p 3"], groun
         return region
     if ground is not None:
         points = _connected(points[ground.heights(points) > STANDING * region.radius], region)
-    points = _without_strays(points)
+    points = without_strays(points)
     if not (np.linalg.norm(points - region.center, axis=1) > region.radius / ATTENDED_MARGIN).any():
         return region
     center, radius = enclosing_sphere(points)
@@ -241,7 +241,7 @@ def grown_over(region: RegionOfInterest, points: Float[np.ndarray, "p 3"], groun
     return RegionOfInterest(center, radius, region.kind, FROM_ATTENTION)
 
 
-def _without_strays(points: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "k 3"]:
+def without_strays(points: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "k 3"]:
     """The points that have others near."""
     from scipy.spatial import cKDTree
 

@@ -210,7 +210,8 @@ class Trainer:
         if self.step_index - self.cache_step < every:
             return
         refreshes = self.step_index // every
-        full = self.step_index <= 4 * every or refreshes % 8 == 0
+        # at first: of the training, or of a trainer that takes over from another
+        full = self.step_index <= 4 * every or refreshes % 8 == 0 or self.cache_step < 0
         band = None if full else 4 * self.cache.cell
         self.cache.refresh(lambda p: self.fields.sdf.sdf(p, moment.levels), band)
         self.cache_step = self.step_index
@@ -224,11 +225,13 @@ class Trainer:
         return torch.cat([self.fields.sdf.sdf(part, levels) for part in parts]).cpu().numpy()
 
     def coarse_surface(self) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:
-        """Vertices and faces of the surface in the sampler's grid, within the region."""
+        """Vertices of the surface in the sampler's grid; its faces that lie within the region, turned outwards."""
         from skimage.measure import marching_cubes
 
         grid = self.cache.values[0, 0].cpu().numpy().transpose(2, 1, 0)
-        vertices, faces, _, _ = marching_cubes(grid, 0.0, gradient_direction="ascent")
+        if grid.min() >= 0 or grid.max() <= 0:
+            return np.zeros((0, 3)), np.zeros((0, 3), dtype=int)
+        vertices, faces, _, _ = marching_cubes(grid, 0.0, gradient_direction="descent")
         vertices = vertices * self.cache.cell - 1
         inside = (np.linalg.norm(vertices, axis=1) < 1)[faces].all(1)
         return vertices, faces[inside]

@@ -132,3 +132,18 @@ def posed_cameras(photos: Sequence[Any], names: Sequence[str], warps: Mapping[in
         intrinsics=np.stack([warps[photo.camera_id].intrinsics for photo in photos]),
         extrinsics=np.stack([photo.cam_from_world().matrix() for photo in photos]),
     )
+
+
+def sparse_points(model: Any, photos: Sequence[Any]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points [P, 3] in the frame of the poses, errors [P], observations [M, 2] (image index, point index)."""
+    index_of = {photo.image_id: i for i, photo in enumerate(photos)}
+    ids = sorted(model.points3D)
+    points = np.array([model.points3D[i].xyz for i in ids], dtype=np.float64).reshape(-1, 3)
+    errors = np.array([model.points3D[i].error for i in ids], dtype=np.float32)
+    seen = {
+        (index_of[element.image_id], k)
+        for k, i in enumerate(ids)
+        for element in model.points3D[i].track.elements
+        if element.image_id in index_of
+    }
+    return points, errors, np.array(sorted(seen), dtype=np.int32).reshape(-1, 2)

@@ -32,6 +32,7 @@ from stages.posing.settings import (
     match_options,
     verification_options,
 )
+from stages.posing.turning import check_parallax
 
 log = logging.getLogger(__name__)
 
@@ -166,6 +167,7 @@ class Workbench:
     def first(self, best: Solution | None) -> Solution | None:
         """The chosen matcher and mapper."""
         self._features_and_matches(self._latest, best)
+        check_parallax(self.database())
         return self._solve(self._latest, self.params.mapper)
 
     def all_pairs(self, best: Solution | None) -> Solution | None:

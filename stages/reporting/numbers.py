@@ -57,7 +57,7 @@ def describe_where(scene: PosedScene, place: Place, numbers: Mapping[str, Mappin
     """Sentences on the region of interest, the ground, up, the scale and the place.
 
     Args:
-        numbers: of the stages undistort and place.
+        numbers: of the stages undistort, place and train.
     """
     found = numbers.get("undistort", {})
     sentences = [
@@ -65,6 +65,8 @@ def describe_where(scene: PosedScene, place: Place, numbers: Mapping[str, Mappin
         f"{' m' if place.metric else ''}, from {found.get('region_from', 'elsewhere')}. Sparse points inside it are "
         "green, cameras blue."
     ]
+    if (grown := numbers.get("train", {}).get("region_grown", 1.0)) > 1:
+        sentences.append(f"It grew to {grown:.2f} times its radius in training, where its border had cut the surface.")
     if scene.ground is not None:
         sentences.append(f"The ground (dashed) holds {100 * scene.ground.share:.0f} % of the sparse points near it.")
     if up_from := numbers.get("place", {}).get("up_from") or found.get("up_from"):

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from stages.geometry.attention import MIN_LOOKING
+from stages.geometry.attention import MIN_LOOKING, NEAR_QUANTILE
 from stages.geometry.cameras import PinholeCameras
 from stages.geometry.plane import Plane
 from stages.geometry.region import merged_spheres
@@ -16,15 +17,19 @@ from stages.surface.triangle_mesh import raycaster, vertex_normals
 NEAR_BORDER = 0.93
 # The middle of a photo: this part of its width and height.
 MIDDLE = 0.5
-# The border cuts where this part of the photos have it in their middle. What a subject stands on or hangs at goes on
-# beyond the border everywhere, but lies in the middle of few photos.
-MANY_PHOTOS = 0.2
+# The border cuts where this part of the photos have it in their middle, and not behind what they are about: a wall goes
+# on beyond the border, too, and slanting photos have its far side in their middle. What is nearest in the middle is as
+# far away as `NEAR_QUANTILE` of it; background is farther by this factor.
+MANY_PHOTOS, MAX_BEHIND = 0.1, 1.4
+RAYS = 12  # across the middle, to look how far that is
 # The ground goes on, too: what is not this high above it (in radii of the region) does not count.
 ABOVE_GROUND = 0.06
 # What is cut goes on for about this many radii of the region.
 GROWTH = 0.5
 # So many places along the border are looked at; fewer than this part of them may be wrong.
 MAX_PLACES, MIN_CUT, MAX_MERGED = 1500, 0.01, 100
+# A photo shows the cut if it shows this part of the places: the far side of a subject is always hidden.
+MIN_SHOWN = 0.1
 
 
 @dataclass(frozen=True)
@@ -33,7 +38,7 @@ class BorderCut:
 
     Attributes:
         places: [K, 3] on the mesh near the border, scene frame.
-        photos: number of photos with most of them in the middle.
+        photos: number of photos with some of them in the middle.
     """
 
     places: np.ndarray
@@ -44,7 +49,9 @@ def border_cut(
     vertices: np.ndarray, faces: np.ndarray, cameras: PinholeCameras, ground: Plane | None
 ) -> BorderCut | None:
     """Where a mesh of the scene ends at the region's border in the middle of many photos; None: nowhere."""
-    near = np.linalg.norm(vertices, axis=1) > NEAR_BORDER
+    near = np.zeros(len(vertices), dtype=bool)
+    near[faces] = True  # vertices without a face are no surface
+    near &= np.linalg.norm(vertices, axis=1) > NEAR_BORDER
     if ground is not None:
         near &= ground.heights(vertices) > ABOVE_GROUND
     rows = np.flatnonzero(near)
@@ -55,7 +62,7 @@ def border_cut(
     cut = views.sum(1) >= max(MIN_LOOKING, MANY_PHOTOS * len(cameras))
     if cut.sum() <= MIN_CUT * MAX_PLACES:
         return None
-    return BorderCut(vertices[rows[cut]], int((views[cut].mean(0) > 0.5).sum()))
+    return BorderCut(vertices[rows[cut]], int((views[cut].mean(0) > MIN_SHOWN).sum()))
 
 
 def region_without_cut(cut: BorderCut) -> tuple[np.ndarray, float]:
@@ -67,7 +74,7 @@ def region_without_cut(cut: BorderCut) -> tuple[np.ndarray, float]:
 
 
 def _in_the_middle(vertices: np.ndarray, faces: np.ndarray, rows: np.ndarray, cameras: PinholeCameras) -> np.ndarray:
-    """Which cameras [N] see which of the vertices `rows` [K] in the middle of their photo; [K, N] bool."""
+    """Which cameras [N] have which of the vertices `rows` [K] in the middle of their photo, not far behind; [K, N]."""
     import open3d as o3d
 
     scene = raycaster(vertices, faces)
@@ -76,9 +83,23 @@ def _in_the_middle(vertices: np.ndarray, faces: np.ndarray, rows: np.ndarray, ca
     for i, center in enumerate(cameras.centers):
         pixels, depth = cameras.project(i, places)
         off = 2 * np.abs(pixels / cameras.sizes[i] - 0.5).max(1)
-        chosen = np.flatnonzero((depth > 0) & (off < MIDDLE) & (((center - places) * normals).sum(1) > 0))
+        here = (depth > 0) & (depth < MAX_BEHIND * _near_depth(scene, cameras, i)) & (off < MIDDLE)
+        chosen = np.flatnonzero(here & (((center - places) * normals).sum(1) > 0))
         # From the camera: at 1 it meets the place itself.
         rays = np.concatenate([np.broadcast_to(center, (len(chosen), 3)), places[chosen] - center], axis=1)
         hidden = scene.test_occlusions(o3d.core.Tensor(rays.astype(np.float32)), tnear=0.0, tfar=0.98).numpy()
         seen[chosen[~hidden], i] = True
     return seen
+
+
+def _near_depth(scene: Any, cameras: PinholeCameras, index: int) -> float:
+    """Depth of what is nearest in the middle of a photo; infinite where there is nothing."""
+    import open3d as o3d
+
+    across = 0.5 + MIDDLE * (np.linspace(0, 1, RAYS) - 0.5)
+    pixels = np.stack(np.meshgrid(across, across), -1).reshape(-1, 2) * cameras.sizes[index]
+    origins, directions = cameras.rays(index, pixels)
+    rays = np.concatenate([origins, directions], axis=1).astype(np.float32)
+    depth = scene.cast_rays(o3d.core.Tensor(rays))["t_hit"].numpy() * (directions @ cameras.forward[index])
+    met = np.isfinite(depth)
+    return float(np.quantile(depth[met], NEAR_QUANTILE)) if met.any() else np.inf
