@@ -222,7 +222,7 @@ def _seen_faces(vertices: np.ndarray, faces: np.ndarray, seen: np.ndarray, param
 
 CLEANUP: Stage[CleanupParams] = Stage(
     name="cleanup",
-    version=9,
+    version=10,
     settings=lambda config: config.cleanup,
     run=run,
     reads=(SCENE, PINHOLE_PHOTOS, SILHOUETTES, GIVEN_REGION, RAW_MESH),

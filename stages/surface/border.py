@@ -27,7 +27,7 @@ ABOVE_GROUND = 0.06
 # What is cut goes on for about this many radii of the region.
 GROWTH = 0.5
 # So many places along the border are looked at; fewer than this part of them may be wrong.
-MAX_PLACES, MIN_CUT, MAX_MERGED = 1500, 0.01, 100
+MAX_PLACES, MIN_CUT, MAX_MERGED = 1500, 0.02, 100
 # A photo shows the cut if it shows this part of the places: the far side of a subject is always hidden.
 MIN_SHOWN = 0.1
 
