@@ -61,7 +61,7 @@ MAX_ONE_SIDED = 0.5
 FORWARD_DEPTHS = 4.0
 # Points with fewer neighbours than this within this part of their median distance from the middle are wrong.
 MIN_NEIGHBOURS, MAX_ISOLATION = 2, 0.7
-ENCLOSING_STEPS = 1000
+ENCLOSING_STEPS, MAX_OUTER = 1000, 5000
 FROM_FRUSTA, FROM_ATTENTION, FROM_POINTS = "the frusta of the cameras", "what the photos look at", "the sparse points"
 IRLS_STEPS = 30
 TINY = 1e-12  # keeps divisions finite; far below any length that occurs
@@ -274,9 +274,10 @@ def enclosing_sphere(points: Float[np.ndarray, "p 3"]) -> tuple[Float[np.ndarray
 
     Steps of shrinking length towards the farthest point (Badoiu and Clarkson, "Smaller core-sets for balls", 2003).
     """
-    center = points.mean(0)
+    center = (points.min(0) + points.max(0)) / 2
+    outer = points[np.argsort(((points - center) ** 2).sum(1))[-MAX_OUTER:]]  # of a million, the others touch nothing
     for step in range(1, ENCLOSING_STEPS):
-        farthest = points[np.argmax(((points - center) ** 2).sum(1))]
+        farthest = outer[np.argmax(((outer - center) ** 2).sum(1))]
         center = center + (farthest - center) / (step + 1)
     return center, float(np.linalg.norm(points - center, axis=1).max())
 
