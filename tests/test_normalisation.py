@@ -107,6 +107,7 @@ def test_a_regrown_scene_is_the_same_capture():
     scene = replace(
         scene_without_points(into_frame(cameras, first), first),
         points=first.inverse().apply(points).astype(np.float32),
+        point_errors=np.zeros(len(points), np.float32),
         growable=True,
         roi_scale=0.8,
     )

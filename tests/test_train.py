@@ -332,7 +332,16 @@ def test_a_region_is_looked_at_once_even_if_the_run_is_killed(tmp_path, monkeypa
 
 @pytest.mark.slow
 def test_a_ball_that_the_region_cuts_comes_out_whole(tmp_path):
-    params = changed(TINY, {"steps": 400, "sampling.rays": 256, "field.sphere_radius": 0.6, "preview_every": 1.0})
+    params = changed(
+        TINY,
+        {
+            "steps": 400,
+            "sampling.rays": 256,
+            "sampling.cache_resolution": 48,
+            "field.sphere_radius": 0.6,
+            "preview_every": 1.0,
+        },
+    )
     run_context = context(tmp_path, "out", params)
     folder = tmp_path / "undistort"
     first = regrown(artifacts.FIRST_SCENE.load(folder), np.array([0.3, 0.0, 0.0]), 0.5)  # ends at x = -0.2 in the ball

@@ -14,8 +14,6 @@ from stages.geometry.region import meeting_point
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Shaped
 
-    Masks = Sequence[Shaped[np.ndarray, "_ _"] | None]
-
 # What is measured in docs/benchmarks/auto-masks.md: where a silhouette's IoU with the hull is below this, so is its IoU
 # with the truth, and where fewer agree than this part, they agree on a part of the thing.
 MIN_IOU, MIN_SHARE = 0.8, 2 / 3
@@ -27,7 +25,9 @@ JUDGED_SIDE = 64  # pixels along the longest side that are looked at
 STEPS_PER_CELL = 1.0  # along a line of sight
 
 
-def silhouette_agreement(cameras: PinholeCameras, masks: Masks) -> Float[np.ndarray, " n"]:
+def silhouette_agreement(
+    cameras: PinholeCameras, masks: Sequence[Shaped[np.ndarray, "_ _"] | None]
+) -> Float[np.ndarray, " n"]:
     """How well each silhouette fits the others': its IoU with the outline of their visual hull, in [0, 1].
 
     Silhouettes that fit badly lose their say in the hull, which is carved anew from the others, see `ROUNDS`.
@@ -63,7 +63,9 @@ def agreeing(scores: Float[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
     return fit & (np.count_nonzero(fit) >= MIN_SHARE * np.count_nonzero(~np.isnan(scores)))
 
 
-def _cube_around(cameras: PinholeCameras, masks: Masks) -> tuple[Float[np.ndarray, " 3"], float] | None:
+def _cube_around(
+    cameras: PinholeCameras, masks: Sequence[Shaped[np.ndarray, "_ _"] | None]
+) -> tuple[Float[np.ndarray, " 3"], float] | None:
     """Centre and half side of a cube around what the silhouettes show: the rays through their middles meet there."""
     origins, directions, reaches = [], [], []
     for i, mask in enumerate(masks):
@@ -77,7 +79,7 @@ def _cube_around(cameras: PinholeCameras, masks: Masks) -> tuple[Float[np.ndarra
         half = 0.5 * float(np.hypot(columns.max() - columns.min(), rows.max() - rows.min()))
         reaches.append(half / cameras.intrinsics[i, 0, 0])
     try:
-        center, _ = meeting_point(np.array(origins), np.array(directions))
+        center, _ = meeting_point(np.reshape(origins, (-1, 3)), np.reshape(directions, (-1, 3)))
     except ValueError:  # too few, or parallel
         return None
     distances = np.linalg.norm(np.array(origins) - center, axis=1)
