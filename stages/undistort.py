@@ -78,6 +78,8 @@ def run(context: StageContext[UndistortParams]) -> dict[str, Any]:
     region, ground, up = _find_layout(cameras, points, observations, masks, stated, about)
     region = _set(region, given, context.params.roi_scale)
     poses_from_scene = scene_frame(region.center, region.radius, up.direction)
+    # A region that somebody chose, or made smaller, stays as it is.
+    chosen = stated is not None or given is not None or any(mask is not None for mask in masks)
     scene = PosedScene(
         cameras=into_frame(cameras, poses_from_scene),
         poses_from_scene=poses_from_scene,
@@ -87,7 +89,7 @@ def run(context: StageContext[UndistortParams]) -> dict[str, Any]:
         up=np.array([0.0, 0.0, 1.0]),
         kind=region.kind,
         ground=ground and ground.within(poses_from_scene),
-        growable=stated is None and given is None and all(mask is None for mask in masks),
+        growable=not chosen and context.params.roi_scale >= 1,
         roi_scale=context.params.roi_scale,
     )
     context.write(FIRST_SCENE, scene)
@@ -256,7 +258,7 @@ def _set(region: RegionOfInterest, given: GivenRegion | None, scale: float) -> R
 
 UNDISTORT: Stage[UndistortParams] = Stage(
     name="undistort",
-    version=8,
+    version=9,
     settings=lambda config: config.undistort,
     run=run,
     reads=(PHOTOS, IMAGE_SET, MODEL, GIVEN_POSES, GIVEN_REGION),

@@ -188,6 +188,16 @@ def test_a_given_sphere_is_the_unit_sphere(tmp_path: Path):
     assert numbers["region_from"] == "the given sphere"
 
 
+@pytest.mark.parametrize(
+    ("params", "masks", "growable"),
+    [({}, False, True), ({"roi_scale": 1.5}, False, True), ({"roi_scale": 0.5}, False, False), ({}, True, False),
+     ({"region": "sphere 2.5 -1 0.5 0.75"}, False, False)],
+)  # fmt: skip
+def test_a_region_that_somebody_chose_or_made_smaller_does_not_grow(tmp_path: Path, params, masks, growable):
+    inputs = write_capture(tmp_path, *MODELS[0], masks=masks)
+    assert undistort(inputs, tmp_path, **params)[0].growable == growable
+
+
 def test_a_region_that_no_camera_sees_is_refused(tmp_path: Path):
     inputs = write_capture(tmp_path, *MODELS[0], masks=False)
     with pytest.raises(ConfigError, match=r"sphere 2 50 0.5 1 is seen by 0 of 8 cameras \(need 2\)") as caught:
