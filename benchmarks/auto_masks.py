@@ -9,7 +9,6 @@ Results go to benchmarks/results/auto_masks/NAME.json, where NAME is the folder'
 
 from __future__ import annotations
 
-import argparse
 import sys
 import time
 from collections.abc import Sequence
@@ -18,9 +17,9 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.pages import NOT_MEASURED, markdown_table, write_tables
+from benchmarks.pages import NOT_MEASURED, markdown_table
 from benchmarks.run_sets import RESULTS as ALL_RESULTS
-from benchmarks.run_sets import machine, photos_of
+from benchmarks.run_sets import machine, measure_folders, photos_of
 from configs.params import CleanupParams
 from stages import artifacts
 from stages.geometry.cameras import PinholeCameras
@@ -158,19 +157,7 @@ def tables() -> dict[str, str]:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folders", type=Path, nargs="*", help="sets with true cameras, or workspaces")
-    parser.add_argument("--table-only", action="store_true", help="measure nothing")
-    arguments = parser.parse_args()
-    if not arguments.folders and not arguments.table_only:
-        parser.error("name folders, or --table-only")
-    RESULTS.mkdir(parents=True, exist_ok=True)
-    for folder in arguments.folders:
-        print(f"{folder}: masks", file=sys.stderr, flush=True)
-        result = measure(folder)
-        artifacts.write_json(RESULTS / f"{result['name']}.json", result)
-    write_tables(tables())
-    return 0
+    return measure_folders(__doc__, "sets with true cameras, or workspaces", "masks", RESULTS, measure, tables)
 
 
 if __name__ == "__main__":

@@ -304,20 +304,24 @@ def true_centers(folder: Path) -> tuple[list[np.ndarray], float] | None:
     return None
 
 
-def center_error(workspace: Path, data: Path, row: str) -> dict[str, float] | None:
-    """Distance of the camera centres of a workspace to the truth, median and largest, in percent of the extent."""
+def true_centers_of_row(row: str, data: Path, names: Sequence[str]) -> tuple[list[np.ndarray], float] | None:
+    """Camera centres [3] of these photos of a row, and the object's extent; None where not known."""
     name, _, variant = row.partition("-")
     truth, source = true_centers(data / name), photos_of(data / name)
     if truth is None:
         return None
-    centers, extent = truth
-    stems, stem_of = _stems(source), known_stem(source, variant)
+    by_stem, stem_of = dict(zip(_stems(source), truth[0], strict=True)), known_stem(source, variant)
+    return [by_stem[stem_of(photo)] for photo in names], truth[1]
+
+
+def center_error(workspace: Path, data: Path, row: str) -> dict[str, float] | None:
+    """Distance of the camera centres of a workspace to the truth, median and largest, in percent of the extent."""
     found = _found_centers(artifacts.MODEL.load(workspace / "sfm"))
-    pairs = [(center, centers[stems.index(stem_of(name))]) for name, center in found.items()]
-    if len(pairs) < 3:
+    truth = true_centers_of_row(row, data, list(found))
+    if truth is None or len(found) < 3:
         return None
-    estimated, true = (np.array(side) for side in zip(*pairs, strict=True))
-    distance = center_distances(estimated, true)
+    centers, extent = truth
+    distance = center_distances(np.array(list(found.values())), np.array(centers))
     return {
         "median": round(100 * float(np.median(distance)) / extent, 4),
         "max": round(100 * float(distance.max()) / extent, 4),

@@ -8,15 +8,14 @@ Results go to benchmarks/results/held_out/NAME.json, where NAME is the workspace
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from benchmarks.pages import NOT_MEASURED, markdown_table, write_tables
+from benchmarks.pages import NOT_MEASURED, markdown_table
 from benchmarks.run_sets import RESULTS as ALL_RESULTS
-from benchmarks.run_sets import machine
+from benchmarks.run_sets import machine, measure_folders
 from stages import artifacts
 
 RESULTS = ALL_RESULTS / "held_out"
@@ -62,19 +61,7 @@ def tables() -> dict[str, str]:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("workspaces", type=Path, nargs="*", help="made with --hold-out")
-    parser.add_argument("--table-only", action="store_true", help="measure nothing")
-    arguments = parser.parse_args()
-    if not arguments.workspaces and not arguments.table_only:
-        parser.error("name workspaces, or --table-only")
-    RESULTS.mkdir(parents=True, exist_ok=True)
-    for workspace in arguments.workspaces:
-        print(f"{workspace}: drawing", file=sys.stderr, flush=True)
-        result = measure(workspace)
-        artifacts.write_json(RESULTS / f"{result['name']}.json", result)
-    write_tables(tables())
-    return 0
+    return measure_folders(__doc__, "workspaces made with --hold-out", "drawing", RESULTS, measure, tables)
 
 
 if __name__ == "__main__":

@@ -28,9 +28,8 @@ from benchmarks.hard_variants import (
     all_rows,
     center_distances,
     code_hash,
-    known_stem,
     make_photos,
-    true_centers,
+    true_centers_of_row,
 )
 from benchmarks.pages import NOT_MEASURED, markdown_table, write_tables
 from benchmarks.run_sets import OUT, RESULTS, find_sets, machine, photos_of, run_hineus
@@ -86,16 +85,12 @@ def known_centers(row: str, data: Path, names: Sequence[str]) -> tuple[dict[str,
     Raises:
         ValueError: the cameras are not known.
     """
-    name, _, variant = row.partition("-")
     if surveyed := surveyed_centers(data / row):
         return surveyed, 1e-3, "mm"
-    if (truth := true_centers(data / name)) is None:
+    if (truth := true_centers_of_row(row, data, names)) is None:
         raise ValueError(f"the cameras of {row} are not known")
     centers, extent = truth
-    source = photos_of(data / name)
-    stem_of = known_stem(source, variant)
-    by_stem = dict(zip((Path(path.name).stem for path in sorted(source.iterdir())), centers, strict=True))
-    return {each: by_stem[stem_of(each)] for each in names}, extent / 100, "%"
+    return dict(zip(names, centers, strict=True)), extent / 100, "%"
 
 
 # ---------------------------------------------------------------- one row

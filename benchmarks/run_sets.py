@@ -346,6 +346,36 @@ def _text(value: Any) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
+def measure_folders(
+    doc: str | None,
+    folders: str,
+    doing: str,
+    results: Path,
+    measure: Callable[[Path], dict[str, Any]],
+    tables: Callable[[], dict[str, str]],
+) -> int:
+    """The command of a benchmark that measures folders one by one; returns its exit code.
+
+    Args:
+        doc: the module's, for --help. folders: what they are. doing: what is done with one, for stderr.
+        results: where `measure`'s result of a folder goes, by its "name".
+        tables: made from all results, and written.
+    """
+    parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folders", type=Path, nargs="*", help=folders)
+    parser.add_argument("--table-only", action="store_true", help="measure nothing")
+    arguments = parser.parse_args()
+    if not arguments.folders and not arguments.table_only:
+        parser.error(f"name {folders}, or --table-only")
+    results.mkdir(parents=True, exist_ok=True)
+    for folder in arguments.folders:
+        print(f"{folder}: {doing}", file=sys.stderr, flush=True)
+        result = measure(folder)
+        artifacts.write_json(results / f"{result['name']}.json", result)
+    write_tables(tables())
+    return 0
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("data", type=Path, nargs="?", help="folder of sets")

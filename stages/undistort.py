@@ -72,14 +72,15 @@ def run(context: StageContext[UndistortParams]) -> dict[str, Any]:
     stated = known.region if known else None
     about: np.ndarray | None = None
     warnings: list[dict[str, str]] = []
-    if stated is None and given is None:
+    found = stated is None and given is None
+    if found:
         subjects = find_subjects(cameras, points, observations)
         about, warnings = _chosen(subjects, [photo.name for photo in photos], context.params.subject)
     region, ground, up = _find_layout(cameras, points, observations, masks, stated, about)
     region = _set(region, given, context.params.roi_scale)
     poses_from_scene = scene_frame(region.center, region.radius, up.direction)
-    # A region that somebody chose, or made smaller, stays as it is.
-    chosen = stated is not None or given is not None or any(mask is not None for mask in masks)
+    # A region that somebody chose, or made smaller, stays as it is; and masks are believed.
+    growable = found and context.params.roi_scale >= 1 and all(mask is None for mask in masks)
     scene = PosedScene(
         cameras=into_frame(cameras, poses_from_scene),
         poses_from_scene=poses_from_scene,
@@ -89,7 +90,7 @@ def run(context: StageContext[UndistortParams]) -> dict[str, Any]:
         up=np.array([0.0, 0.0, 1.0]),
         kind=region.kind,
         ground=ground and ground.within(poses_from_scene),
-        growable=not chosen and context.params.roi_scale >= 1,
+        growable=growable,
         roi_scale=context.params.roi_scale,
     )
     context.write(FIRST_SCENE, scene)

@@ -26,8 +26,8 @@ RAYS = 12  # across the middle, to look how far that is
 ABOVE_GROUND = 0.06
 # What is cut goes on for about this many radii of the region.
 GROWTH = 0.5
-# So many places along the border are looked at; fewer than this part of them may be wrong.
-MAX_PLACES, MIN_CUT, MAX_MERGED = 1500, 0.02, 100
+# So many places along the border are looked at; so few that seem to be cut may be wrong.
+MAX_PLACES, MAX_WRONG, MAX_MERGED = 1500, 30, 100
 # A photo shows the cut if it shows this part of the places: the far side of a subject is always hidden.
 MIN_SHOWN = 0.1
 
@@ -60,7 +60,7 @@ def border_cut(
         return None
     views = _in_the_middle(vertices, faces, rows, cameras)
     cut = views.sum(1) >= max(MIN_LOOKING, MANY_PHOTOS * len(cameras))
-    if cut.sum() <= MIN_CUT * MAX_PLACES:
+    if cut.sum() <= MAX_WRONG:
         return None
     return BorderCut(vertices[rows[cut]], int((views[cut].mean(0) > MIN_SHOWN).sum()))
 
