@@ -91,11 +91,10 @@ def _against_truth(
 
 def _cut(mesh: Path, cameras: PinholeCameras, masks: Sequence[tuple[int, np.ndarray]]) -> list[list[float]]:
     """Percent of the object's surface that is cut off and of the table beside it that is left, for each of `PARTS`."""
-    import cv2
     import trimesh
     from scipy.spatial import cKDTree
 
-    from stages.surface.selection import outside_hull
+    from stages.surface.selection import outside_hull, widened
 
     surface = np.asarray(trimesh.sample.sample_surface(trimesh.load(mesh, process=False), SURFACE_POINTS, seed=0)[0])
     side = np.linspace(-TABLE_REACH, TABLE_REACH, TABLE_SIDE)
@@ -103,8 +102,7 @@ def _cut(mesh: Path, cameras: PinholeCameras, masks: Sequence[tuple[int, np.ndar
     table += [*surface.mean(0)[:2], 0]
     table = table[cKDTree(surface[:, :2]).query(table[:, :2])[0] > BESIDE]
     margin = CleanupParams().mask_margin
-    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * margin + 1, 2 * margin + 1))
-    grown = [(i, cv2.dilate(mask.astype(np.uint8), kernel) > 0) for i, mask in masks]
+    grown = [(i, widened(mask, margin)) for i, mask in masks]
     return [
         [
             round(100 * float(outside_hull(surface, cameras, grown, part).mean()), 2),

@@ -29,12 +29,14 @@ from benchmarks.hard_variants import (
     center_distances,
     code_hash,
     make_photos,
+    true_centers,
     true_centers_of_row,
 )
 from benchmarks.pages import NOT_MEASURED, markdown_table, write_tables
 from benchmarks.run_sets import OUT, RESULTS, find_sets, machine, photos_of, run_hineus
 from configs.params import SfmParams
 from stages import artifacts
+from stages.posing.adjustment import FREEDOMS, adjust_last
 
 ROWS = RESULTS / "last_adjustment"
 FOLDERS = OUT / "last_adjustment"
@@ -79,6 +81,10 @@ def surveyed_centers(folder: Path) -> dict[str, np.ndarray]:
     return {name: values[21:24] for name, values in numbers.items()}
 
 
+def has_known_centers(row: str, data: Path) -> bool:
+    return bool(surveyed_centers(data / row)) or true_centers(data / row.partition("-")[0]) is not None
+
+
 def known_centers(row: str, data: Path, names: Sequence[str]) -> tuple[dict[str, np.ndarray], float, str]:
     """Centres of these photos of a row, how many of their unit the errors' unit is, and that unit's name.
 
@@ -102,8 +108,6 @@ def run_row(row: str, data: Path, models: Path | None) -> Row:
         ValueError: its cameras are not known.
     """
     import pycolmap
-
-    from stages.posing.adjustment import adjust_last
 
     if models is None:
         models = FOLDERS
@@ -139,16 +143,20 @@ def _centers(model: Any) -> dict[str, np.ndarray]:
     return {model.images[i].name: np.array(model.images[i].projection_center()) for i in model.reg_image_ids()}
 
 
+def _paired(found: dict[str, np.ndarray], truth: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Centres [N, 3] found and true of the photos that have both."""
+    names = sorted(found.keys() & truth.keys())
+    return np.array([found[name] for name in names]), np.array([truth[name] for name in names])
+
+
 def _scale(found: dict[str, np.ndarray], truth: dict[str, np.ndarray]) -> float:
     from stages.geometry.similarity import align_points
 
-    names = sorted(found.keys() & truth.keys())
-    return align_points(np.array([found[n] for n in names]), np.array([truth[n] for n in names])).scale
+    return align_points(*_paired(found, truth)).scale
 
 
 def _error(found: dict[str, np.ndarray], truth: dict[str, np.ndarray], unit: float) -> tuple[float, float]:
-    names = sorted(found.keys() & truth.keys())
-    distances = center_distances(np.array([found[n] for n in names]), np.array([truth[n] for n in names])) / unit
+    distances = center_distances(*_paired(found, truth)) / unit
     return round(float(np.median(distances)), 4), round(float(distances.max()), 4)
 
 
@@ -175,7 +183,7 @@ def adjustment_table(rows: Sequence[Row]) -> str:
             *(f"{row.error[key][0]:.3g} {row.unit}" for key in ("without", "with")),
             "-" if row.expected is None else f"{row.expected:.2g} {row.unit}",
             " + ".join(row.freed) or "-",
-            *(f"{row.gain_percent[key]:.2f}" if key in row.gain_percent else "-" for key in _freedoms()),
+            *(f"{row.gain_percent[key]:.2f}" if key in row.gain_percent else "-" for key in FREEDOMS),
             f"{row.cpu_s:.1f}",
         ]
         for row in rows
@@ -186,12 +194,6 @@ def adjustment_table(rows: Sequence[Row]) -> str:
 def _shown(name: str) -> str:
     base, _, variant = name.partition("-")
     return (f"{base}: {variant}" if variant in VARIANTS else name).replace("_", " ")
-
-
-def _freedoms() -> tuple[str, ...]:
-    from stages.posing.adjustment import FREEDOMS
-
-    return FREEDOMS
 
 
 def tables() -> dict[str, str]:
@@ -215,7 +217,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             parser.error("name a folder of sets, or --table-only")
         data = arguments.data.resolve()
         done = set() if arguments.again else {row.name for row in load_rows()}
-        for row in arguments.rows or all_rows(find_sets(data, ())):
+        for row in arguments.rows or [row for row in all_rows(find_sets(data, ())) if has_known_centers(row, data)]:
             if row in done:
                 print(f"{row}: has a result (--again measures it anew)", file=sys.stderr)
                 continue

@@ -11,7 +11,6 @@ is its true surface within the region.
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
@@ -25,6 +24,7 @@ from benchmarks.captures.tracks import simulate
 from benchmarks.pages import NOT_MEASURED, markdown_table, write_tables
 from benchmarks.run_sets import RESULTS as ALL_RESULTS
 from benchmarks.synthetic.scenes import RECIPES
+from stages import artifacts
 from stages.geometry.layout import find_layout
 from stages.geometry.normalisation import into_frame, scene_frame
 from stages.geometry.similarity import Similarity
@@ -113,7 +113,7 @@ def _cells(scale: float, moved: float, rows: Sequence[Row]) -> list[str]:
 
 
 def load_rows() -> list[Row]:
-    return [Row(**row) for row in json.loads(RESULTS.read_text(encoding="utf-8"))] if RESULTS.exists() else []
+    return [Row(**row) for row in artifacts.read_json(RESULTS)] if RESULTS.exists() else []
 
 
 def tables() -> dict[str, str]:
@@ -134,8 +134,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             for row in look(name):
                 rows.append(row)
                 print(row, file=sys.stderr, flush=True)
-        text = json.dumps([asdict(row) for row in rows], indent=1)
-        RESULTS.write_text(text + "\n", encoding="utf-8")
+        artifacts.write_json(RESULTS, [asdict(row) for row in rows])
     write_tables(tables())
     return 0
 

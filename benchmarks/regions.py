@@ -13,7 +13,6 @@ are not measured again stay. Workspaces of sets lie in benchmarks/out/regions/, 
 from __future__ import annotations
 
 import argparse
-import json
 import statistics
 import sys
 from collections.abc import Iterator, Sequence
@@ -30,6 +29,7 @@ from benchmarks.pages import NOT_MEASURED, markdown_table, write_tables
 from benchmarks.run_sets import OUT, find_sets, photos_of, run_hineus
 from benchmarks.run_sets import RESULTS as ALL_RESULTS
 from benchmarks.synthetic.scenes import RECIPES
+from stages import artifacts
 from stages.geometry.layout import find_layout
 from stages.geometry.region import RegionOfInterest
 from stages.geometry.subjects import find_subjects
@@ -115,27 +115,18 @@ def measure(data: Path | None, workspaces: Path, only: Sequence[str]) -> Iterato
 def _set_rows(name: str, folder: Path, workspace: Path) -> Iterator[Row]:
     """A set as it is, and with its masks where it has some."""
     posed, masks = sets.load_posed(workspace), sets.find_masks(folder)
-    subject, source = sets.subject_of(folder, workspace, posed)
+    masked = None if masks is None else sets.load_posed(workspace, masks)
+    subject, source = sets.subject_of(folder, posed, masked)
     yield measured(PROXY if source == sets.BY_PROXY else SETS, name, source, posed, subject)
-    if masks is not None:
-        yield measured(SETS, f"{name}, masks", source, sets.load_posed(workspace, masks), subject)
+    if masked is not None:
+        yield measured(SETS, f"{name}, masks", source, masked, subject)
 
 
 def _workspace(folder: Path, workspace: Path) -> Path:
     """The workspace of a set, with its photos posed; as it is where they are already."""
     if not (workspace / "sfm" / "manifest.json").is_file():
-        run_hineus(
-            [
-                "run",
-                str(photos_of(folder)),
-                "--workspace",
-                str(workspace),
-                "--until",
-                "sfm",
-                "--deterministic",
-                "--json",
-            ]
-        )
+        until = ["--until", "sfm", "--deterministic", "--json"]
+        run_hineus(["run", str(photos_of(folder)), "--workspace", str(workspace), *until])
     return workspace
 
 
@@ -143,14 +134,13 @@ def _workspace(folder: Path, workspace: Path) -> Path:
 def load_rows(version: str) -> dict[str, Row]:
     """All rows measured with a version of the code, by name."""
     path = RESULTS / f"{version}.json"
-    rows = json.loads(path.read_text(encoding="utf-8")) if path.exists() else []
+    rows = artifacts.read_json(path) if path.exists() else []
     return {row["name"]: Row(**row) for row in rows}
 
 
 def save_rows(rows: dict[str, Row], version: str) -> None:
     RESULTS.mkdir(parents=True, exist_ok=True)
-    text = json.dumps([asdict(row) for row in rows.values()], indent=1)
-    (RESULTS / f"{version}.json").write_text(text + "\n", encoding="utf-8")
+    artifacts.write_json(RESULTS / f"{version}.json", [asdict(row) for row in rows.values()])
 
 
 # ---------------------------------------------------------------- tables

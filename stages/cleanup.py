@@ -44,12 +44,11 @@ GUESSED_SHOWN = 0.3
 
 def _masks(folders: Sequence[Pictures], cameras: PinholeCameras, margin: int) -> Iterator[tuple[int, np.ndarray]]:
     """Index and widened mask [H, W] bool of every photo that has one in one of the folders."""
-    import cv2
+    from stages.surface.selection import widened
 
-    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * margin + 1, 2 * margin + 1))
     for index, name in enumerate(cameras.names):
         for mask in (mask for folder in folders if (mask := folder.mask(name)) is not None):
-            yield index, cv2.dilate(mask, kernel) > 127
+            yield index, widened(mask > 127, margin)
 
 
 def run(context: StageContext[CleanupParams]) -> dict[str, Any]:

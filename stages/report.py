@@ -79,12 +79,13 @@ def run(context: StageContext[ReportParams]) -> dict[str, Any]:
     )
     context.progress(3, steps, "packing the 3D view")
     captions = photo_table.camera_captions(results, scene.cameras.names)
-    page |= describe_view(scene, place, context.read(GIVEN_REGION), atlas, texture, left(context, QUALITY), captions)
+    region = context.read(GIVEN_REGION)
+    page |= describe_view(scene, place, region, atlas, texture, left(context, QUALITY), captions)
     context.progress(4, steps, "writing the page")
     placed = {name: manifests[name].numbers for name in ("undistort", "place", "train") if name in manifests}
     page |= {
         "numbers": numbers.headline(scene, atlas, manifests, page["held_out"]),
-        "overview": overview_svg(scene, region_corners(scene, context.read(GIVEN_REGION))),
+        "overview": overview_svg(scene, region_corners(scene, region)),
         "warnings": numbers.warnings(manifests),
         "where": numbers.describe_where(scene, place, placed),
         "poses": poses.describe_poses(registration, place),
@@ -140,7 +141,6 @@ def describe_view(
     return {
         "advice": advice,
         "faces_shown": len(shown.faces) if shown is not atlas else None,
-        "overlays": overlays,
         "viewer": {
             **view3d.pack_mesh(shown, texture, scene.up),
             **view3d.pack_scene(scene, captions, advice.views if advice else (), shown),

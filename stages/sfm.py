@@ -76,7 +76,8 @@ def run(context: StageContext[SfmParams]) -> dict[str, Any]:
         wanted = photos_wanted(len(names), params.wanted)
         best, steps = climb(bench.rungs(), wanted, max(needed, len(names) // 2))
         evidence = Evidence(bench.database())
-        still = from_one_place(parallaxes(bench.database()))
+        # of the same matches as at first, where nothing else was tried
+        still = from_one_place(bench.parallaxes if len(steps) == 1 else parallaxes(bench.database()))
 
     if best is None:
         raise _nothing_matched(evidence, names, steps, params, _masks_advice(image_set, params))

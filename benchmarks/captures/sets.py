@@ -75,13 +75,12 @@ def find_masks(folder: Path) -> dict[str, Path] | None:
     return None
 
 
-def subject_of(folder: Path, workspace: Path, posed: Posed) -> tuple[np.ndarray, str]:
+def subject_of(folder: Path, posed: Posed, masked: Posed | None) -> tuple[np.ndarray, str]:
     """Points [P, 3] of the subject of a set in the frame of `posed`, and what they are."""
     if has_truth(folder):
         return known_surface(folder, posed.cameras), BY_MESH
-    masks = find_masks(folder)
-    if masks is not None:
-        return points_on_masks(load_posed(workspace, masks)), BY_MASKS
+    if masked is not None:
+        return points_on_masks(masked), BY_MASKS
     return central_points(posed), BY_PROXY
 
 

@@ -115,9 +115,7 @@ def sheet(
     return Thing(vertices + np.array(center), faces, texture, color)
 
 
-def room(
-    center: Vector, sides: Vector, walls: float, floor: float, color: tuple[float, float, float] = PLASTER
-) -> tuple[Thing, ...]:
+def room(center: Vector, sides: Vector, walls: float, floor: float) -> tuple[Thing, ...]:
     """Floor and four walls, seen from within; `center` on the floor; textures of walls and floor.
 
     The ceiling is open: it would be plain, and light comes in there.
@@ -126,10 +124,10 @@ def room(
     wide, deep, high = sides
     return (
         flat(center, wide, deep, floor, WOOD),
-        sheet((x - wide / 2, y, z + high / 2), (1, 0, 0), (deep, high), walls, color),
-        sheet((x + wide / 2, y, z + high / 2), (-1, 0, 0), (deep, high), walls, color),
-        sheet((x, y - deep / 2, z + high / 2), (0, 1, 0), (wide, high), walls, color),
-        sheet((x, y + deep / 2, z + high / 2), (0, -1, 0), (wide, high), walls, color),
+        sheet((x - wide / 2, y, z + high / 2), (1, 0, 0), (deep, high), walls),
+        sheet((x + wide / 2, y, z + high / 2), (-1, 0, 0), (deep, high), walls),
+        sheet((x, y - deep / 2, z + high / 2), (0, 1, 0), (wide, high), walls),
+        sheet((x, y + deep / 2, z + high / 2), (0, -1, 0), (wide, high), walls),
     )
 
 
@@ -139,9 +137,9 @@ def flat(center: Vector, wide: float, deep: float, texture: float, color: tuple[
     return Thing(corners + np.array(center), np.array([[0, 1, 2], [0, 2, 3]]), texture, color)
 
 
-def ground(side: float, texture: float, color: tuple[float, float, float] = STONE, center: Vector = (0, 0, 0)) -> Thing:
+def ground(side: float, texture: float, color: tuple[float, float, float] = STONE) -> Thing:
     """A level square."""
-    return flat(center, side, side, texture, color)
+    return flat((0, 0, 0), side, side, texture, color)
 
 
 def wood(rng: np.random.Generator, count: int, near: float, far: float) -> tuple[Thing, ...]:

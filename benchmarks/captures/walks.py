@@ -40,16 +40,14 @@ def on_circle(
 
 def orbit(
     target: Vector, radius: float, heights: Sequence[float], rng: np.random.Generator,
-    span_deg: float = 360.0, count: int = 24, framed: tuple[float, float] = (0.0, 0.0), toward_deg: float = -90.0,
+    span_deg: float = 360.0, count: int = 24, framed: tuple[float, float] = (0.0, 0.0),
 ) -> np.ndarray:  # fmt: skip
     """Photos from a circle about `target` that look at it; see `on_circle`, `shot`."""
-    eyes = on_circle(target, radius, heights, span_deg, count, toward_deg)
+    eyes = on_circle(target, radius, heights, span_deg, count)
     return np.array([shot(eye, target, rng, framed) for eye in eyes])
 
 
-def rows(
-    xs: Iterable[float], heights: Iterable[float], distance: float, rng: np.random.Generator, wall: float = 0.0
-) -> np.ndarray:
-    """Photos straight at a wall (the plane y = `wall`) from `distance` before it, towards -y, row by row."""
+def rows(xs: Iterable[float], heights: Iterable[float], distance: float, rng: np.random.Generator) -> np.ndarray:
+    """Photos straight at a wall (the plane y = 0) from `distance` before it, towards -y, column by column."""
     heights = tuple(heights)
-    return np.array([shot((x, wall - distance, z), (x, wall, z), rng) for x in xs for z in heights])
+    return np.array([shot((x, -distance, z), (x, 0, z), rng) for x in xs for z in heights])

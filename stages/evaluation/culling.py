@@ -7,7 +7,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from stages.geometry.cameras import PinholeCameras
-from stages.surface.selection import outside_hull
+from stages.surface.selection import outside_hull, widened
 from stages.surface.triangle_mesh import raycaster
 
 # The way from a point to a camera starts this part of it off the point, whose own surface would hide it.
@@ -48,11 +48,8 @@ def inside_masks(
         masks: camera and [H, W] bool.
         grow: pixels by which masks are widened first.
     """
-    import cv2
-
-    brush = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * grow + 1, 2 * grow + 1))
-    widened = ((i, cv2.dilate(mask.astype(np.uint8), brush) > 0) for i, mask in masks)
-    return ~outside_hull(points, cameras, widened, max_part=0.0, min_views=1)
+    grown = ((i, widened(mask, grow)) for i, mask in masks)
+    return ~outside_hull(points, cameras, grown, max_part=0.0, min_views=1)
 
 
 def inside_box(points: np.ndarray, box: np.ndarray) -> np.ndarray:

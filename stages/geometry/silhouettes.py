@@ -14,8 +14,8 @@ from stages.geometry.region import meeting_point
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Shaped
 
-# What is measured in docs/benchmarks/auto-masks.md: where a silhouette's IoU with the hull is below this, so is its IoU
-# with the truth, and where fewer agree than this part, they agree on a part of the thing.
+# Measured in docs/benchmarks/auto-masks.md: where so large a part of the silhouettes agree with the hull, each that
+# does has an IoU of 0.84 or more with the truth; where fewer do, they may agree on a part of the thing.
 MIN_IOU, MIN_SHARE = 0.8, 2 / 3
 # Agreement that carves the hull, and the IoU below which a silhouette has no say in the next one. The first hulls must
 # stand up to silhouettes of something else, and are too large for that.

@@ -14,6 +14,7 @@ terms are left alone: on surveyed facades they made poses worse.
 from __future__ import annotations
 
 import logging
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
@@ -76,19 +77,19 @@ def adjust_last(model: Any, params: Any, threads: int) -> LastAdjustment:
         params: `configs.params.SfmParams`.
         threads: one for the same result every time.
     """
-    freed: Freed = {camera_id: frozenset() for camera_id in _photos_of(model)}
-    trials: dict[int, list[LensTrial]] = {}
     if model.num_reg_images() > MOST_PHOTOS:
         log.info("the lens stays as it is: the last adjustment is for up to %d photos", MOST_PHOTOS)
         return LastAdjustment(model, lenses=(), pose_error=None)
+    freed: Freed = {camera_id: frozenset() for camera_id in _photo_counts(model)}
+    trials: dict[int, list[LensTrial]] = {}
     if params.refine_lens == "auto":
         freed, trials = try_freedoms(model, params.seed, threads)
     if any(freed.values()):
         model = bundle_adjust(model, freed, threads)
     precision = estimate_precision(model, _free(model, freed))
     lenses = tuple(
-        _describe_lens(model.cameras[camera_id], len(photos), tuple(trials.get(camera_id, ())), precision)
-        for camera_id, photos in _photos_of(model).items()
+        _describe_lens(model.cameras[camera_id], photos, tuple(trials.get(camera_id, ())), precision)
+        for camera_id, photos in _photo_counts(model).items()
     )
     if precision is None:
         return LastAdjustment(model, lenses, None)
@@ -102,9 +103,9 @@ def try_freedoms(model: Any, seed: int, threads: int) -> tuple[Freed, dict[int, 
     """What each camera of a pycolmap model keeps, and what was tried, camera by camera."""
     seen = observations_of(model)
     out = hold_out(seen, seed)
-    freed: Freed = {camera_id: frozenset() for camera_id in _photos_of(model)}
+    freed: Freed = {camera_id: frozenset() for camera_id in _photo_counts(model)}
     trials: dict[int, list[LensTrial]] = {}
-    judged = judged_cameras(model, seen, out)
+    judged = judged_cameras(seen, out)
     if not judged:
         return freed, trials
     current = bundle_adjust(_without(model, seen, out), freed, threads)
@@ -230,27 +231,20 @@ def reprojection_errors(model: Any, seen: Observations, which: np.ndarray) -> Fl
 
 
 # ---------------------------------------------------------------- judging
-def _photos_of(model: Any) -> dict[int, list[int]]:
-    """Camera id -> ids of its photos."""
-    photos: dict[int, list[int]] = {}
-    for image_id in sorted(model.reg_image_ids()):
-        photos.setdefault(model.images[image_id].camera_id, []).append(image_id)
-    return photos
+def _photo_counts(model: Any) -> dict[int, int]:
+    """Camera id -> how many photos it took."""
+    return Counter(model.images[image_id].camera_id for image_id in sorted(model.reg_image_ids()))
 
 
-def judged_cameras(model: Any, seen: Observations, out: np.ndarray) -> set[int]:
+def judged_cameras(seen: Observations, out: np.ndarray) -> set[int]:
     """Cameras with enough held-out observations in enough photos to judge by."""
-    camera_of = _camera_of(model, seen, out)
+    camera_of = seen.camera[out]
     return {
         camera_id
         for camera_id in np.unique(camera_of).tolist()
         if (camera_of == camera_id).sum() >= MIN_HELD_OUT
         and len(np.unique(seen.photo[out][camera_of == camera_id])) >= MIN_PHOTOS
     }
-
-
-def _camera_of(model: Any, seen: Observations, which: np.ndarray) -> np.ndarray:
-    return np.array([model.images[i].camera_id for i in seen.images], dtype=np.int64)[seen.photo[which]]
 
 
 def _judge(
@@ -264,7 +258,7 @@ def _judge(
 ) -> dict[int, LensTrial]:
     """Camera id -> the verdict on a freedom, from the models without and with it."""
     old, new = reprojection_errors(before, seen, out), reprojection_errors(after, seen, out)
-    camera_of = _camera_of(after, seen, out)
+    camera_of = seen.camera[out]
     precision = cache(lambda: estimate_precision(after, _free(after, freed)))  # seconds: only where errors speak for it
     verdicts = {}
     for camera_id in sorted(able):

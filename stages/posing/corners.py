@@ -24,7 +24,7 @@ REFINING_HALF_SIDE, MAX_MOVE = 4, 3.0  # pixels: window of the exact position, a
 MAX_CORNERS = 2048
 
 
-def find_corners(grey: Float[np.ndarray, "h w"], max_corners: int = MAX_CORNERS) -> Float[np.ndarray, "n 2"]:
+def find_corners(grey: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "n 2"]:
     """Corners in pixels, the strongest first; the middle of the top left pixel is (0.5, 0.5).
 
     Args:
@@ -38,7 +38,7 @@ def find_corners(grey: Float[np.ndarray, "h w"], max_corners: int = MAX_CORNERS)
     inside = np.zeros_like(chosen)
     inside[BORDER:-BORDER, BORDER:-BORDER] = True
     rows, columns = np.nonzero(chosen & inside)
-    order = np.argsort(-smaller[rows, columns], kind="stable")[:max_corners]
+    order = np.argsort(-smaller[rows, columns], kind="stable")[:MAX_CORNERS]
     peaks = np.stack([columns[order], rows[order]], 1).astype(np.float32)
     return _refined(grey, peaks) + 0.5
 

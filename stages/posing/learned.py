@@ -65,7 +65,7 @@ def corners_of(photo: Path, mask: Path | None, network: XFeat) -> tuple[np.ndarr
 def write_matches(
     database: Path, descriptors: Descriptors, pairs: Iterable[tuple[int, int]], progress: Progress
 ) -> None:
-    """Write the mutual nearest neighbours of pairs of image ids; what the pairs had is replaced."""
+    """Write the mutual nearest neighbours of pairs of image ids, which have no matches yet."""
     import pycolmap
     import torch
 

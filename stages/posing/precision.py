@@ -48,13 +48,14 @@ class Observations:
 
     Attributes:
         images: ids of the photos in the order of their numbers.
-        photo, point: [M] numbers. feature: [M] index of the feature in its photo.
+        photo, point: [M] numbers. camera: [M] ids. feature: [M] index of the feature in its photo.
         pixels: [M, 2]. points: [P, 3] world coordinates. point_ids: [P].
     """
 
     images: list[int]
     photo: np.ndarray
     point: np.ndarray
+    camera: np.ndarray
     feature: np.ndarray
     pixels: Float[np.ndarray, "m 2"]
     points: Float[np.ndarray, "p 3"]
@@ -72,9 +73,11 @@ def observations_of(model: Any) -> Observations:
                 point.append(point2D.point3D_id)
                 feature.append(index)
                 pixels.append(point2D.xy)
+    cameras = np.array([model.images[image_id].camera_id for image_id in images], dtype=np.int64)
     return Observations(
         images=images,
         photo=np.array(photo, dtype=np.int64),
+        camera=cameras[np.array(photo, dtype=np.int64)],
         point=np.searchsorted(point_ids, np.array(point, dtype=np.int64)),
         feature=np.array(feature, dtype=np.int64),
         pixels=np.array(pixels, dtype=np.float64).reshape(-1, 2),
@@ -156,10 +159,9 @@ def _linearise(
     in_camera = np.einsum("mij,mj->mi", rotations[seen.photo], seen.points[seen.point]) + translations[seen.photo]
     residuals = np.zeros((len(in_camera), 2))
     by_place = np.zeros((len(in_camera), 2, 3))
-    camera_of = np.array([model.images[i].camera_id for i in seen.images])[seen.photo]
     entries: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []  # row, column, value
-    for camera_id in np.unique(camera_of).tolist():
-        camera, rows = model.cameras[camera_id], np.flatnonzero(camera_of == camera_id)
+    for camera_id in np.unique(seen.camera).tolist():
+        camera, rows = model.cameras[camera_id], np.flatnonzero(seen.camera == camera_id)
         places = in_camera[rows]
         residuals[rows] = camera.img_from_cam(places) - seen.pixels[rows]
         for axis in range(3):

@@ -51,15 +51,15 @@ def parallaxes(database: Path) -> dict[Names, float]:
     return dict(zip(pairs, min(found, key=statistics.median), strict=True))
 
 
-def check_parallax(database: Path) -> None:
-    """Refuse photos that were all taken from one place.
+def check_parallax(database: Path) -> dict[Names, float]:
+    """The `parallaxes`; photos that were all taken from one place are refused.
 
     Raises:
         ReconstructionError: turning alone explains their matches.
     """
     found = parallaxes(database)
     if not found:
-        return
+        return found
     names = sorted(set().union(*found))
     most = float(np.quantile(list(found.values()), PAIRS_SHARE))
     if most < MIN_PARALLAX:
@@ -70,6 +70,7 @@ def check_parallax(database: Path) -> None:
             "Walk around the subject, a step to the side for each photo, add these photos to the folder, and try "
             "`hineus run PHOTOS --until sfm`.",
         )
+    return found
 
 
 def from_one_place(found: Mapping[Names, float]) -> list[str]:

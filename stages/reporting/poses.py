@@ -27,7 +27,7 @@ def describe_poses(registration: Registration | None, place: Place) -> list[str]
         length = f" ({place.world_from_poses.scale * error.center:.2g} m)" if place.metric else ""
         sentences.append(
             f"Expected error of the camera centres: {percent:.2g} % of the distance{length}, from "
-            f" features that are off by {error.residual_px:.2f} px. It counts what errs from feature to feature: "
+            f"features that are off by {error.residual_px:.2f} px. It counts what errs from feature to feature: "
             "true errors are larger."
         )
     return sentences

@@ -132,6 +132,14 @@ def fill_small_gaps(vertices: np.ndarray, faces: np.ndarray, chosen: np.ndarray,
     return chosen | (touches & (region_area <= max_area))[labels]
 
 
+def widened(mask: np.ndarray, pixels: int) -> np.ndarray:
+    """A mask [H, W] bool with a round border of so many pixels more."""
+    import cv2
+
+    brush = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * pixels + 1, 2 * pixels + 1))
+    return cv2.dilate(mask.astype(np.uint8), brush) > 0
+
+
 def outside_hull(
     vertices: np.ndarray,
     cameras: PinholeCameras,
