@@ -12,6 +12,7 @@ settings.register_profile("project", deadline=None, derandomize=True)
 settings.load_profile("project")
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
+CASES = DATA.with_name("cases")
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -31,3 +32,11 @@ def data_dir() -> Path:
     if not DATA.is_dir():
         pytest.skip("development photo sets are not on this machine")
     return DATA
+
+
+@pytest.fixture(scope="session")
+def cases_dir() -> Path:
+    """Small inputs that other programs' users stumbled over."""
+    if not CASES.is_dir():
+        pytest.skip("the cases are not on this machine")
+    return CASES
