@@ -11,7 +11,7 @@ import logging
 import math
 import shutil
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from fnmatch import fnmatchcase
 from pathlib import Path, PurePosixPath
@@ -25,13 +25,15 @@ from stages.capture.background import PLAIN_PHOTOS, plain_mask
 from stages.capture.exif import ORIENTATION, camera_key, focal_px, gps_position
 from stages.capture.listing import NAMED, by_reason, list_captures, name_some
 from stages.capture.masks import check_size, match_masks, read_mask, write_mask
-from stages.capture.photo_reading import UnusableError, read_photo, register_formats
+from stages.capture.photo_reading import Photo, UnusableError, read_photo
 from stages.capture.quality import Appearance, appearance, find_oddities
 from stages.capture.salient import SalientNetwork
 from stages.capture.video import extract_frames
 from stages.engine.fingerprint import file_sha256
 from stages.engine.stage import Stage, StageContext
 from stages.errors import InputError
+from stages.inputs.folders import short_name, unique_name
+from stages.inputs.formats import PHOTO_SUFFIXES, RAW_SUFFIXES
 from stages.posing.known import KnownPoses, match_photos
 from stages.posing.nero import DEPTH, read_depth_mask
 from stages.posing.reading import read_poses
@@ -51,11 +53,8 @@ def run(context: StageContext[IngestParams]) -> dict[str, Any]:
     params, source = context.params, context.sources["photos"]
     masks_folder = context.sources.get("masks")
     photos, videos, skipped = list_captures(source, masks_folder)
-    register_formats()
-    folder = source if source.is_dir() else source.parent
-    files = {path: folder / path for path in photos}
-    frames, damaged = _frames_of(videos, folder, context)
-    files |= frames
+    frames, damaged = _frames_of(videos, context)
+    files = photos | frames
     skipped += damaged
     paths = sorted(files)
     poses = read_poses(context.sources["poses"]) if "poses" in context.sources else None
@@ -75,7 +74,7 @@ def run(context: StageContext[IngestParams]) -> dict[str, Any]:
     names, make_mask = _Names(unique), _mask_maker(params)
     done = 0
 
-    def take(path: str) -> tuple[ImageRecord, Appearance] | SkippedImage:
+    def take(path: str) -> tuple[ImageRecord, Appearance, str] | SkippedImage:
         nonlocal done
         try:
             return _take_photo(files[path], path, unique[path], mask_files.get(path), make_mask, names, context)
@@ -87,7 +86,7 @@ def run(context: StageContext[IngestParams]) -> dict[str, Any]:
 
     outcomes = _in_threads(take, unique, context.workers)
     taken = [o for o in outcomes if not isinstance(o, SkippedImage)]
-    images = sorted((record for record, _ in taken), key=lambda record: record.name)
+    images = sorted((record for record, _, _ in taken), key=lambda record: record.name)
     skipped += [o for o in outcomes if isinstance(o, SkippedImage)]
     if params.auto_mask == "plain":
         images, without = _before_plain_backgrounds(images, context)
@@ -102,10 +101,14 @@ def run(context: StageContext[IngestParams]) -> dict[str, Any]:
             f"{len(missing)} of {len(images)} photos have no mask in {masks_folder}: {name_some(missing)}.",
             f"Add {Path(missing[0]).stem}.png and the like, move those photos away, or run with `--no-masks`.",
         )
-    for reason, sources in by_reason(skipped).items():
-        log.warning("left out %s: %s", name_some(sources), reason)
+    for expected, level in ((True, logging.INFO), (False, logging.WARNING)):
+        for reason, sources in by_reason(item for item in skipped if item.expected is expected).items():
+            log.log(level, "left out %s: %s", name_some(sources), reason)
+    doubtful = [SkippedImage(record.source, problem) for record, _, problem in taken if problem]
+    for problem, sources in by_reason(doubtful).items():
+        log.warning("%s: %s", name_some(sources), problem)
     # a video's frames are the sharpest of their stretch and near each other by choice
-    odd = find_oddities([seen for _, seen in taken if seen.source not in frames])
+    odd = find_oddities([seen for _, seen, _ in taken if seen.source not in frames])
     for warning in odd.warnings:
         log.warning("%s", warning)
     masked = sum(record.has_mask for record in images)
@@ -115,7 +118,8 @@ def run(context: StageContext[IngestParams]) -> dict[str, Any]:
     context.write(IMAGE_SET, ImageSet(tuple(images), tuple(skipped)))
     return {
         "images": len(images),
-        "skipped": len(skipped),
+        "skipped": sum(not item.expected for item in skipped),
+        **({"companions": companions} if (companions := sum(item.expected for item in skipped)) else {}),
         **({"videos": len(videos) - len(damaged)} if videos else {}),
         "masks": masked,
         "cameras": len({record.camera for record in images}),
@@ -130,21 +134,20 @@ def run(context: StageContext[IngestParams]) -> dict[str, Any]:
 
 # ---------------------------------------------------------------- which files
 def _frames_of(
-    videos: list[str], folder: Path, context: StageContext[IngestParams]
+    videos: dict[str, Path], context: StageContext[IngestParams]
 ) -> tuple[dict[str, Path], list[SkippedImage]]:
     """Frames of each video, as `clip.mp4/000120.jpg` -> file, so that no photo can have that name; and bad videos."""
     found: dict[str, Path] = {}
     damaged = []
     shutil.rmtree(context.scratch / "frames", ignore_errors=True)
-    for done, video in enumerate(videos):
+    for done, (video, file) in enumerate(videos.items()):
 
         def tell(part: float, done: int = done, video: str = video) -> None:
             context.progress(done + part, len(videos), f"frames of {video}")
 
         try:
-            frames = extract_frames(
-                folder / video, context.scratch / "frames" / video, context.params.video_frames, tell
-            )
+            folder = context.scratch / "frames" / str(done)  # a video's name may be too long
+            frames = extract_frames(file, folder, context.params.video_frames, tell)
         except UnusableError as reason:
             damaged.append(SkippedImage(video, str(reason)))
             continue
@@ -215,25 +218,37 @@ def read_mask_file(
 
 
 class _Names:
-    """Gives each photo one name under images/. Names depend on the folder, never on the order of work."""
+    """Gives each photo one name under images/. Names depend on the folder, never on the order of work.
+
+    They are unique whatever the case of letters, for file systems that do not tell it, and short enough for all.
+    """
 
     def __init__(self, paths: Iterable[str]) -> None:
-        own = set(paths)
-        # case-insensitive file systems must not merge two photos
-        self._lower = {path.lower() for path in own}
-        self._stems = Counter(str(PurePosixPath(path).with_suffix("")).lower() for path in own)
+        self._own: dict[str, str] = {}
+        lower: set[str] = set()
+        for path in sorted(paths):
+            self._own[path] = unique_name(short_name(path), lower, str.lower)
+            lower.add(self._own[path].lower())
+        self._lower = lower
+        self._stems = Counter(_stem(name).lower() for name in self._own.values())
 
-    def target(self, path: str, suffix: str | None) -> str:
-        """`path` itself (suffix None or unchanged), or its stem with `suffix`, unique in the folder."""
-        own = PurePosixPath(path)
-        if suffix is None or own.suffix.lower() == suffix:
-            return path
-        if self._stems[str(own.with_suffix("")).lower()] == 1:
-            return own.with_suffix(suffix).as_posix()
-        name = path + suffix
+    def target(self, path: str, suffixes: Sequence[str]) -> str:
+        """The photo's own name where it has one of these suffixes, else with the first of them in place of its own."""
+        name = self._own[path]
+        if PurePosixPath(name).suffix.lower() in suffixes:
+            return name
+        if self._stems[_stem(name).lower()] == 1:
+            return _stem(name) + suffixes[0]
+        name += suffixes[0]
         while name.lower() in self._lower:
-            name = name[: -len(suffix)] + "_" + suffix
+            name = name[: -len(suffixes[0])] + "_" + suffixes[0]
         return name
+
+
+def _stem(name: str) -> str:
+    """Without what is a photo's suffix: "frame.0001" has none."""
+    suffix = PurePosixPath(name).suffix
+    return name.removesuffix(suffix) if suffix.lower() in PHOTO_SUFFIXES | RAW_SUFFIXES else name
 
 
 def _in_threads(function: Callable[[Item], Result], items: Iterable[Item], workers: int) -> list[Result]:
@@ -283,31 +298,26 @@ def _take_photo(
     make_mask: MaskMaker | None,
     names: _Names,
     context: StageContext[IngestParams],
-) -> tuple[ImageRecord, Appearance]:
-    from PIL import Image
-
-    photo = read_photo(file)
+) -> tuple[ImageRecord, Appearance, str]:
+    """Its record, its looks, and what is wrong with its colours, in words."""
+    max_side = context.params.max_side
+    photo = read_photo(file, max_side)
     rgb, mask = photo.rgb, photo.alpha
     if mask_file is not None:
-        mask = read_mask_file(mask_file, source, rgb.size, photo.stored_size, photo.orientation)
+        mask = read_mask_file(mask_file, source, photo.size, photo.stored_size, photo.orientation)
     if mask is not None and not mask.any():
         raise UnusableError(f"its mask is empty ({mask_file.name if mask_file else 'alpha channel'})")
 
-    scale = min(1.0, context.params.max_side / max(rgb.size))
-    keep = photo.as_is and scale == 1
-    if scale < 1:
-        rgb = rgb.resize([max(1, round(side * scale)) for side in rgb.size], Image.Resampling.LANCZOS)
     made_mask = ""
     if mask is None and make_mask is not None:
         mask = make_mask(np.asarray(rgb))
         made_mask = "" if mask is None else context.params.auto_mask
-    suffix = None if keep else _encoded_suffix(file, photo.lossy)
-    name = names.target(source, suffix)
+    name = names.target(source, photo.as_is or _encoded_suffixes(photo))
 
     pictures = context.to_write(PHOTOS)
     target = pictures.path(name)
     target.parent.mkdir(parents=True, exist_ok=True)
-    if keep:
+    if photo.as_is:
         shutil.copyfile(file, target)
     else:
         _encode(rgb, target, photo.lossy, photo.exif)
@@ -321,7 +331,7 @@ def _take_photo(
         source=source,
         width=rgb.width,
         height=rgb.height,
-        focal_px=None if focal is None else focal * scale,
+        focal_px=None if focal is None else focal * min(1.0, max_side / max(photo.size)),
         camera=camera_key(photo.exif, rgb.size, source),
         blur=seen.sharpness,
         has_mask=mask is not None,
@@ -329,15 +339,11 @@ def _take_photo(
         gps=gps_position(photo.exif),
         made_mask=made_mask,
     )
-    return record, seen
+    return record, seen, photo.colours.problem
 
 
-def _encoded_suffix(file: Path, lossy: bool) -> str:
-    """A re-encoded photo keeps its own suffix where that suffix is true."""
-    own = file.suffix.lower()
-    if lossy:
-        return own if own in (".jpg", ".jpeg") else ".jpg"
-    return ".png"
+def _encoded_suffixes(photo: Photo) -> tuple[str, ...]:
+    return (".jpg", ".jpeg") if photo.lossy else (".png",)
 
 
 def _encode(rgb: Any, target: Path, lossy: bool, exif: Any) -> None:
@@ -347,7 +353,7 @@ def _encode(rgb: Any, target: Path, lossy: bool, exif: Any) -> None:
         metadata = exif.tobytes()
     except Exception:  # damaged maker notes; poses do without
         metadata = b""
-    extra = {"exif": metadata} if metadata else {}
+    extra: dict[str, Any] = {"icc_profile": None} | ({"exif": metadata} if metadata else {})
     if lossy:
         rgb.save(target, format="JPEG", quality=JPEG_QUALITY, subsampling=0, **extra)
     else:
@@ -356,7 +362,7 @@ def _encode(rgb: Any, target: Path, lossy: bool, exif: Any) -> None:
 
 INGEST: Stage[IngestParams] = Stage(
     name="ingest",
-    version=4,
+    version=5,
     settings=lambda config: config.ingest,
     run=run,
     writes=(PHOTOS, IMAGE_SET),

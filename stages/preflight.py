@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from configs.params import Config
+from stages.artifacts import SkippedImage
 from stages.capture.inspection import Inspection, inspect
 from stages.capture.listing import NAMED, by_reason, name_some
 from stages.capture.salient import INSTALL, find_weights
@@ -17,7 +18,6 @@ Verdict = Literal["go", "go with warnings", "no-go"]
 
 MOSTLY_PLAIN = 0.5  # so many plain backgrounds are meant; too few for masks from the background's colour alone
 FEW_PHOTOS = 20  # a full turn in steps of less than 20 degrees; sets below it lose photos
-EXPECTED = ("not an image", "the raw file of", "the clip of")  # reasons to leave a file out that are no news
 
 # All measured with `benchmarks/run_sets.py` on two cores, see docs/benchmarks/results.md.
 GIB = 1 << 30
@@ -56,10 +56,12 @@ class Preflight:
     """What was seen, what it needs, and what to make of it.
 
     Attributes:
+        max_side: what photos are reduced to, longest side in pixels.
         refusals: reasons for "no-go" that lie in the photos; `shortages`: those that lie in the machine.
     """
 
     inspection: Inspection
+    max_side: int
     needs: Needs
     warnings: tuple[str, ...]
     refusals: tuple[str, ...]
@@ -70,6 +72,11 @@ class Preflight:
         if self.refusals or self.shortages:
             return "no-go"
         return "go with warnings" if self.warnings else "go"
+
+    @property
+    def reduced(self) -> int:
+        """How many photos are larger than `max_side`."""
+        return sum(max(size) > self.max_side for size in self.inspection.sizes)
 
     def as_dict(self) -> dict[str, Any]:
         """JSON-able."""
@@ -82,6 +89,8 @@ class Preflight:
             "sizes": [[*size, count] for size, count in Counter(seen.sizes).most_common()],
             "cameras": dict(Counter(photo.camera for photo in seen.photos)),
             "with_focal": sum(photo.has_focal for photo in seen.photos),
+            "reduced": self.reduced,
+            "colour_profiles": dict(Counter(photo.colours.name for photo in seen.photos if photo.colours.name)),
             **asdict(seen.oddities),
             "plain_background": seen.plain,
             "needs": asdict(self.needs),
@@ -103,7 +112,7 @@ def preflight(
     """
     import psutil
 
-    seen = inspect(source, masks, config.ingest.video_frames, workers, decode)
+    seen = inspect(source, masks, config.ingest.video_frames, config.ingest.max_side, workers, decode)
     needs = estimate(seen, config, device, workers)
     while not folder.exists():
         folder = folder.parent
@@ -121,7 +130,7 @@ def preflight(
     warnings = _warnings(seen, config)
     if memory / MEMORY_MARGIN < needs.memory_gib <= memory:
         warnings.append(f"It may take {needs.memory_gib:.1f} of the {memory:.1f} GiB of memory that are free.")
-    return Preflight(seen, needs, tuple(warnings), tuple(refusals), tuple(shortages))
+    return Preflight(seen, config.ingest.max_side, needs, tuple(warnings), tuple(refusals), tuple(shortages))
 
 
 def estimate(seen: Inspection, config: Config, device: str, workers: int) -> Needs:
@@ -133,9 +142,10 @@ def estimate(seen: Inspection, config: Config, device: str, workers: int) -> Nee
     looked_at = pixels(min(config.ingest.max_side, config.sfm.max_image_size))
     trained_on = sum(pixels(min(config.ingest.max_side, config.undistort.max_side)))
     sfm_gib = SFM_BASE_GIB + workers * SFM_GIB_PER_THREAD_MP * max(looked_at, default=0) / 1e6
+    read_gib = max((photo.bytes_to_read for photo in seen.photos), default=0) / GIB
     later_gib = MEMORY_BASE_GIB + MEMORY_OF_PHOTOS * 3 * trained_on / GIB
     return Needs(
-        memory_gib=max(sfm_gib, later_gib),
+        memory_gib=max(read_gib, sfm_gib, later_gib),
         disk_gb=DISK_BASE_GB + (seen.num_bytes + DISK_BYTES_PER_PIXEL * trained_on) / 1e9,
         minutes=_minutes(looked_at, config, workers) if device == "cpu" else None,
     )
@@ -158,8 +168,10 @@ def _warnings(seen: Inspection, config: Config) -> list[str]:
     if config.ingest.min_images <= len(seen.sizes) < FEW_PHOTOS:
         found.append(f"Only {len(seen.sizes)} photos; 30 to 100 that overlap by two thirds give a whole object.")
     found += seen.oddities.warnings
-    unusable = by_reason(item for item in seen.skipped if not item.reason.startswith(EXPECTED))
-    return found + [f"Left out {name_some(names)}: {reason}." for reason, names in unusable.items()]
+    unusable = by_reason(item for item in seen.skipped if not item.expected)
+    found += [f"Left out {name_some(names)}: {reason}." for reason, names in unusable.items()]
+    doubtful = by_reason(SkippedImage(photo.source, photo.colours.problem) for photo in seen.photos)
+    return found + [f"{name_some(names)}: {problem}." for problem, names in doubtful.items() if problem]
 
 
 def facts(done: Preflight) -> list[tuple[str, str]]:
@@ -174,8 +186,17 @@ def facts(done: Preflight) -> list[tuple[str, str]]:
     if len(cameras) > NAMED:
         lines.append(("camera", f"and {len(cameras) - NAMED} more"))
     with_focal = sum(photo.has_focal for photo in seen.photos)
+    if done.reduced:
+        found = (
+            f"{done.reduced} of {len(seen.sizes)} to {done.max_side} pixels (`ingest.max_side`), for all that follows"
+        )
+        lines.append(("reduced", found))
+    profiles = Counter(photo.colours.name for photo in seen.photos if photo.colours.name).most_common()
+    lines += [("colours", f"{name} ({count} photos), converted to sRGB") for name, count in profiles[:NAMED]]
     estimated = "" if with_focal == len(seen.photos) else "; else it is estimated"
     lines.append(("focal length", f"in the EXIF of {with_focal} of {len(seen.photos)} photos{estimated}"))
+    companions = by_reason(item for item in seen.skipped if item.expected)
+    lines += [("set aside", f"{name_some(names)}: {reason}") for reason, names in companions.items()]
     if seen.plain:
         lines.append(("background", "plain: `--set ingest.auto_mask=plain` would cut the object out"))
     elif seen.plain_share >= MOSTLY_PLAIN:

@@ -57,7 +57,7 @@ def check(*arguments: str) -> Result:
 
 
 def look(folder: Path) -> Inspection:
-    return inspect(folder, None, video_frames=80, workers=2, decode=True)
+    return inspect(folder, None, video_frames=80, max_side=3200, workers=2, decode=True)
 
 
 # ---------------------------------------------------------------- what is noticed
@@ -90,11 +90,11 @@ def test_exif_and_size_are_those_of_the_upright_photo(photos: Path):
     exif.get_ifd(0x8769)[0xA405] = 28
     large = picture(40).resize((2400, 1800))  # large enough to be decoded smaller
     large.save(photos / "z.jpg", exif=exif)
-    seen = read_head(photos / "z.jpg", "z.jpg")
+    seen = read_head(photos / "z.jpg", "z.jpg", 3200)
     assert (seen.width, seen.height) == (1800, 2400)
     assert seen.camera == "Phone | 28 mm equivalent | 1800 x 2400"
     assert seen.has_focal
-    assert not read_head(photos / "00.jpg", "00.jpg").has_focal
+    assert not read_head(photos / "00.jpg", "00.jpg", 3200).has_focal
 
 
 def test_damaged_files_are_told_with_the_reason_and_other_files_are_no_warning(photos: Path, capfd):
@@ -106,9 +106,10 @@ def test_damaged_files_are_told_with_the_reason_and_other_files_are_no_warning(p
     data = json.loads(result.stdout)
     assert data["verdict"] == "go with warnings"
     assert {item["source"] for item in data["left_out"]} == {"bad.jpg", "empty.png", "torn.mp4", "notes.txt"}
-    assert len(data["warnings"]) == 2
-    assert data["warnings"][0].startswith("Left out bad.jpg, empty.png: no image")
-    assert data["warnings"][1].startswith("Left out torn.mp4: cannot be read as a video")
+    assert len(data["warnings"]) == 3
+    assert data["warnings"][0].startswith("Left out bad.jpg: no image")
+    assert data["warnings"][1] == "Left out empty.png: no image, whatever its name says (empty)."
+    assert data["warnings"][2].startswith("Left out torn.mp4: cannot be read as a video")
     assert "VIDEOIO" not in capfd.readouterr().err
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from stages.artifacts import SkippedImage
 from stages.capture.background import PLAIN_PHOTOS, find_background
 from stages.capture.listing import list_captures
-from stages.capture.photo_reading import PhotoFile, UnusableError, read_head, read_preview, register_formats
+from stages.capture.photo_reading import PhotoFile, UnusableError, read_head, read_preview
 from stages.capture.quality import Appearance, Oddities, appearance, find_oddities
 from stages.capture.video import video_size
 
@@ -53,39 +53,42 @@ class Inspection:
         return [(photo.width, photo.height) for photo in self.photos] + frames
 
 
-def inspect(source: Path, masks_folder: Path | None, video_frames: int, workers: int, decode: bool) -> Inspection:
-    """Look at all photos of `source` (see `list_captures`); `video_frames`: how many a video gives at most.
+def inspect(
+    source: Path, masks_folder: Path | None, video_frames: int, max_side: int, workers: int, decode: bool
+) -> Inspection:
+    """Look at all photos of `source` (see `list_captures`).
 
-    `decode`: also at their pixels, of reduced copies. Damage behind a sound head shows only then.
+    Args:
+        video_frames: how many a video gives at most. max_side: what photos are reduced to, pixels.
+        decode: also look at their pixels, of reduced copies. Damage behind a sound head shows only then.
 
     Raises:
         InputError: see `list_captures`.
     """
     photos, videos, skipped = list_captures(source, masks_folder)
-    folder = source if source.is_dir() else source.parent
-    register_formats()
+    files = photos | videos
 
     def look(path: str) -> tuple[PhotoFile, Appearance | None, bool] | Video | SkippedImage:
         try:
             if path in videos:
-                frames, width, height = video_size(folder / path)
+                frames, width, height = video_size(files[path])
                 return Video(path, min(frames, video_frames), width, height)
-            photo = read_head(folder / path, path)
+            photo = read_head(files[path], path, max_side)
             if not decode:
                 return photo, None, False
-            pixels = read_preview(folder / path)
+            pixels = read_preview(files[path])
             return photo, appearance(path, pixels), find_background(pixels).is_plain
         except UnusableError as reason:
             return SkippedImage(path, str(reason))
 
     with ThreadPoolExecutor(max_workers=max(1, workers)) as pool:
-        seen = list(pool.map(look, [*photos, *videos]))
+        seen = list(pool.map(look, files))
     looked_at = [item for item in seen if isinstance(item, tuple)]
     return Inspection(
         photos=tuple(photo for photo, _, _ in looked_at),
         videos=tuple(item for item in seen if isinstance(item, Video)),
         skipped=tuple([*skipped, *(item for item in seen if isinstance(item, SkippedImage))]),
-        num_bytes=sum((folder / path).stat().st_size for path in [*photos, *videos]),
+        num_bytes=sum(file.stat().st_size for file in files.values()),
         oddities=find_oddities([look for _, look, _ in looked_at if look is not None]),
         plain_share=sum(plain for _, _, plain in looked_at) / max(len(looked_at), 1),
     )

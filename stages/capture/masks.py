@@ -7,17 +7,18 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from stages.capture.exif import ORIENTATION
-from stages.capture.photo_reading import PHOTO_SUFFIXES
 from stages.errors import InputError
+from stages.inputs.folders import named_files
+from stages.inputs.formats import PHOTO_SUFFIXES, open_image
 
 
 def match_masks(photos: list[str], folder: Path) -> dict[str, Path]:
     """Photo -> its mask file: same relative path or, where unambiguous, same file name."""
     by_path: dict[str, Path] = {}
     by_name: dict[str, list[Path]] = {}
-    for path in sorted(folder.rglob("*")):
-        if path.is_file() and path.suffix.lower() in PHOTO_SUFFIXES and not path.name.startswith("."):
-            key = path.relative_to(folder).with_suffix("").as_posix()
+    for name, path in named_files(folder)[0].items():
+        if path.suffix.lower() in PHOTO_SUFFIXES:
+            key = PurePosixPath(name).with_suffix("").as_posix()
             by_path.setdefault(key, path)
             by_name.setdefault(PurePosixPath(key).name, []).append(path)
     found: dict[str, Path] = {}
@@ -43,7 +44,7 @@ def read_mask(
     from PIL import Image, ImageOps
 
     try:
-        with Image.open(file) as stored:
+        with open_image(file) as stored:
             stored.load()
             image: Image.Image = stored
             if image.size != size and image.size == stored_size:

@@ -20,7 +20,7 @@ class _LogFile(logging.FileHandler):
 @contextlib.contextmanager
 def log_to_file(path: Path) -> Iterator[None]:
     """Everything that is logged inside goes to `path`, too, and the traceback of what is raised."""
-    handler = _LogFile(path, encoding="utf-8")
+    handler = _LogFile(path, encoding="utf-8", errors="backslashreplace")  # paths may not be UTF-8
     handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
     root = logging.getLogger()
     root.addHandler(handler)

@@ -16,6 +16,7 @@ import numpy as np
 
 from stages.artifacts import KnownSphere
 from stages.errors import InputError
+from stages.inputs.texts import read_text
 from stages.posing.known import SUFFIX, KnownCamera, KnownPoses, image_size, nearest_rotation, reading
 
 FILES = ("transforms.json", "transforms_train.json")
@@ -51,7 +52,7 @@ def read_transforms(file: Path) -> KnownPoses:
 
 def _load(file: Path) -> dict[str, Any]:
     with reading(str(file), "the JSON of nerfstudio or Blender"):
-        data = json.loads(file.read_text(encoding="utf-8"))
+        data = json.loads(read_text(file))
     frames = data.get("frames") if isinstance(data, dict) else None
     if not isinstance(frames, list) or not frames:
         raise InputError(f"{file} has no `frames`.", "It needs the JSON of nerfstudio or Blender.")
