@@ -57,7 +57,8 @@ UNFINISHED_FILES = {
     "*.download": "half-downloaded",
 }
 SMALL_VIDEOS = ("m4root", "sub")  # where Sony's cameras keep small copies of videos
-MOST_BYTES = 200  # of a name that we give: file systems take 255, and suffixes are added to it
+MOST_BYTES = 200  # of a name that we give, less its suffix: file systems take 255, and more suffixes are added
+MOST_SUFFIX, HASH = 8, 8  # characters, the dot among them; digits
 
 
 @dataclass(frozen=True)
@@ -109,15 +110,20 @@ def unique_name(name: str, taken: Container[str], key: Callable[[str], str] = st
 
 
 def short_name(name: str) -> str:
-    """A relative posix path none of whose parts takes more than `MOST_BYTES`: longer ones end in "~" and a hash."""
-    return "/".join(part if len(part.encode()) <= MOST_BYTES else _cut(part) for part in name.split("/"))
+    """A relative posix path in which the long parts end in "~" and a hash, so that none is too long for a file.
+
+    Whatever its suffix, if it has any, a name is cut alike.
+    """
+    return "/".join(_cut(part) for part in name.split("/"))
 
 
 def _cut(part: str) -> str:
     suffix = PurePosixPath(part).suffix
-    suffix = suffix if len(suffix.encode()) <= 8 else ""
-    mark = f"~{hashlib.sha256(part.encode()).hexdigest()[:8]}{suffix}"
-    return part.encode()[: MOST_BYTES - len(mark.encode())].decode(errors="ignore") + mark
+    stem = part.removesuffix(suffix if len(suffix) <= MOST_SUFFIX else "").encode()
+    if len(stem) <= MOST_BYTES:
+        return part
+    start = stem[: MOST_BYTES - HASH - 1].decode(errors="ignore")
+    return f"{start}~{hashlib.sha256(stem).hexdigest()[:HASH]}{part[len(stem.decode()) :]}"
 
 
 # ---------------------------------------------------------------- the walk

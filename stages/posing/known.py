@@ -15,7 +15,7 @@ import numpy as np
 
 from stages.artifacts import KnownSphere
 from stages.errors import InputError
-from stages.inputs.folders import readable
+from stages.inputs.folders import readable, short_name
 from stages.inputs.formats import open_image
 
 # An image's suffix; "frame.0001" has none.
@@ -117,8 +117,12 @@ def match_photos(poses: KnownPoses, photos: Iterable[str]) -> dict[str, KnownCam
 
 
 def _parts(name: str) -> tuple[str, ...]:
-    """Of a path with "/", or with "\\" as Windows has it; photos' names with that in them are cut alike."""
-    return tuple(part for part in SEPARATORS.split(SUFFIX.sub("", readable(name))) if part not in ("", "."))
+    """Of a path with "/", or with "\\" as Windows has it; photos' names with that in them are cut alike.
+
+    Blanks around a name are lost in texts, long names are those of our own exports.
+    """
+    parts = SEPARATORS.split(SUFFIX.sub("", short_name(readable(name))))
+    return tuple(part.strip() for part in parts if part not in ("", "."))
 
 
 def _likeness(first: str, second: str) -> tuple[int, bool]:
