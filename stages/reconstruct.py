@@ -19,6 +19,7 @@ from stages.engine.runner import Listener, StageOutcome, run_pipeline
 from stages.engine.stage import Stage
 from stages.engine.workspace import Workspace
 from stages.errors import ConfigError, InputError, SystemRequirementError
+from stages.inputs.folders import readable
 from stages.posing.reading import locate_poses, masks_beside
 from stages.preflight import Preflight, in_short, preflight
 from stages.request import Request
@@ -124,7 +125,7 @@ def choose_folder(request: Request) -> Path:
         return request.workspace
     if request.photos is not None:
         photos = request.photos.resolve()
-        return Path.cwd() / f"{photos.stem if is_video(photos) else photos.name}_hineus"
+        return Path.cwd() / f"{readable(photos.stem if is_video(photos) else photos.name)}_hineus"
     if (Path.cwd() / "workspace.json").exists():
         return Path.cwd()
     raise ConfigError(

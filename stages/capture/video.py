@@ -10,13 +10,16 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 
 from stages.capture.photo_reading import UnusableError
+from stages.inputs.folders import readable
 from stages.inputs.formats import CONTAINERS, Kind, kind_of
 
 LOOKS_PER_S = 10.0  # frames looked at; hand-held blur comes and goes within some tenths of a second
@@ -190,9 +193,23 @@ def _open(video: Path) -> Any:
     level = cv2.utils.logging.getLogLevel()
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)  # it warns of damaged files, which we name
     try:
-        capture = cv2.VideoCapture(str(video.absolute()), cv2.CAP_FFMPEG)
+        with _path_for_opencv(video) as path:
+            capture = cv2.VideoCapture(path, cv2.CAP_FFMPEG)
     finally:
         cv2.utils.logging.setLogLevel(level)
     if not capture.isOpened():
         raise UnusableError("cannot be read as a video (damaged, or a codec that FFmpeg does not have)")
     return capture
+
+
+@contextmanager
+def _path_for_opencv(file: Path) -> Iterator[str]:
+    """An absolute path to open `file` by: a link, where its own is not UTF-8, on which OpenCV crashes."""
+    path = str(file.absolute())
+    if path == readable(path):
+        yield path
+        return
+    with TemporaryDirectory() as folder:
+        link = Path(folder) / f"video{file.suffix}"
+        link.symlink_to(path)
+        yield str(link)
