@@ -187,10 +187,9 @@ def facts(done: Preflight) -> list[tuple[str, str]]:
         lines.append(("camera", f"and {len(cameras) - NAMED} more"))
     with_focal = sum(photo.has_focal for photo in seen.photos)
     if done.reduced:
-        found = (
-            f"{done.reduced} of {len(seen.sizes)} to {done.max_side} pixels (`ingest.max_side`), for all that follows"
+        lines.append(
+            ("reduced", f"{done.reduced} of {len(seen.sizes)} to {done.max_side} pixels, by `ingest.max_side`")
         )
-        lines.append(("reduced", found))
     profiles = Counter(photo.colours.name for photo in seen.photos if photo.colours.name).most_common()
     lines += [("colours", f"{name} ({count} photos), converted to sRGB") for name, count in profiles[:NAMED]]
     estimated = "" if with_focal == len(seen.photos) else "; else it is estimated"

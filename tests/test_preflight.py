@@ -18,6 +18,7 @@ from configs.load import load_config
 from hineus_cli.app import app
 from stages import preflight as module
 from stages import reconstruct
+from stages.capture.colour import ADOBE_RGB, matrix_profile
 from stages.capture.inspection import Inspection, Video, inspect
 from stages.capture.photo_reading import read_head
 from stages.preflight import GIB, estimate, preflight
@@ -129,6 +130,22 @@ def test_a_plain_background_is_noticed(tmp_path: Path):
         cloth.paste(picture(i).resize((120, 120)), (100, 60))
         cloth.save(tmp_path / f"{i}.png")
     assert look(tmp_path).plain
+
+
+def test_what_is_done_to_files_is_said_beforehand(photos: Path):
+    wide = matrix_profile("Adobe RGB", ADOBE_RGB, lambda values: values**2.2)
+    picture(50).save(photos / "wide.jpg", icc_profile=wide)
+    picture(51).save(photos / "broken.jpg", icc_profile=b"nothing")
+    picture(52).resize((4000, 3000)).save(photos / "large.jpg")
+    picture(53).save(photos / "IMG_1.THM", format="JPEG")
+    said = dict(module.facts(preflight(photos, None, photos.parent, load_config("cpu"), "cpu", 2, decode=False)))
+    assert said["reduced"] == "1 of 27 to 3200 pixels, by `ingest.max_side`"
+    assert said["colours"] == "Adobe RGB (1 photos), converted to sRGB"
+    assert said["set aside"] == "IMG_1.THM: the preview of a video"
+    data = json.loads(check(str(photos), "--json").stdout)
+    assert (data["photos"], data["reduced"], data["colour_profiles"]) == (27, 1, {"Adobe RGB": 1})
+    assert "broken.jpg: its colour profile is broken: taken for sRGB." in data["warnings"]
+    assert not any("THM" in warning for warning in data["warnings"])
 
 
 # ---------------------------------------------------------------- verdicts

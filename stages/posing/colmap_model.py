@@ -53,6 +53,8 @@ def _read_text(folder: Path) -> Iterator[KnownCamera]:
         number, model, width, height, *params = line.split()
         size = {"width": int(width), "height": int(height)}
         cameras[number] = pycolmap.Camera(model=model, params=[float(value) for value in params], **size)
+        if not cameras[number].verify_params():
+            raise ValueError(f"camera {number} has {len(params)} parameters")
     for line in _lines(folder / "images.txt", every=2):
         _, *pose, camera, name = line.split(maxsplit=9)
         w, x, y, z, *translation = (float(value) for value in pose)
