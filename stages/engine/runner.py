@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -116,6 +117,12 @@ def run_pipeline(
     return outcomes
 
 
+def naming_command(source: str, root: Path) -> str:
+    """The command that names the place of an outside path ("photos", "masks") to the workspace at `root`."""
+    option = "" if source == "photos" else f"--{source} "
+    return f"hineus run {option}{source.upper()} --workspace {shlex.quote(str(root))}"
+
+
 def _select(
     pipeline: Sequence[Stage[Any]], from_stage: str | None, until: str | None, force: Sequence[str]
 ) -> tuple[Sequence[Stage[Any]], dict[str, str]]:
@@ -150,7 +157,7 @@ def _run_stage(
         if not digests.available(name):
             raise InputError(
                 f"Stage {stage.name} must run ({status.reason}), but its {name} are not at {path} any more.",
-                f"Bring them back, or name the new place: `hineus run PHOTOS --workspace {workspace.root}`.",
+                f"Bring them back, or name the new place: `{naming_command(name, workspace.root)}`.",
             )
 
     def progress(done: float, total: float, note: str = "") -> None:

@@ -59,6 +59,8 @@ class Record:
         preset: name of the preset the settings started from, if that is known.
         hineus: version of the program that wrote it.
         created: UTC time, ISO 8601.
+        root: the workspace's own absolute path when this was written, so that what was moved with it is found again;
+            empty in those of 0.2 and before.
     """
 
     format: int = FORMAT
@@ -66,6 +68,7 @@ class Record:
     preset: str | None = None
     hineus: str = ""
     created: str = ""
+    root: str = ""
 
 
 class Workspace:
@@ -183,6 +186,7 @@ class Workspace:
             preset=preset,
             hineus=_hineus_version(),
             created=self.record.created or now(),
+            root=str(self.root),
         )
         header = f"# The settings of the last run (preset: {preset or 'none'}). Use them again with --config.\n"
         with storage_errors(self.root, "keeping the settings"):
@@ -352,7 +356,8 @@ def _parse_record(text: str, path: Path) -> Record:
                 "Get the newer one with `pip install --upgrade hineus`, or use another `--workspace DIR`.",
             )
         sources = dict(data.get("sources", {}))
-        return Record(found, sources, data.get("preset"), data.get("hineus", ""), data.get("created", ""))
+        texts = {name: str(data.get(name, "")) for name in ("hineus", "created", "root")}
+        return Record(found, sources, data.get("preset"), **texts)
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise WorkspaceError(
             f"{path} is damaged ({error}).",
