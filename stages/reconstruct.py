@@ -143,7 +143,7 @@ def choose_folder(request: Request) -> Path:
         return request.workspace
     if request.photos is not None:
         return default_workspace(request.photos).folder
-    if (Path.cwd() / "workspace.json").exists():
+    if artifacts.is_workspace(Path.cwd()):
         return Path.cwd()
     raise ConfigError(
         "Neither a folder of photos nor a workspace is given.",

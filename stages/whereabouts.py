@@ -11,12 +11,10 @@ from pathlib import Path
 
 from stages.engine.fingerprint import walk_files
 from stages.engine.photos_since import PhotosSince
-from stages.engine.workspace import Workspace
+from stages.engine.workspace import WORKSPACE_SUFFIX, Workspace
 from stages.errors import WorkspaceError
 
 log = logging.getLogger(__name__)
-
-SUFFIX = "_hineus"
 
 
 @dataclass(frozen=True)
@@ -52,7 +50,7 @@ def _named(photos: Path) -> Path:
 
 def _beside(photos: Path) -> Path:
     name = photos.stem if photos.is_file() else photos.name
-    return photos.parent / f"{name}{SUFFIX}"
+    return photos.parent / f"{name}{WORKSPACE_SUFFIX}"
 
 
 def _is_of(folder: Path, photos: Path) -> bool:
@@ -105,7 +103,7 @@ def refuse_other_photos(workspace: Workspace, photos: Path, since: PhotosSince) 
 
 def _free(folder: Path) -> Path:
     """The first of NAME_2_hineus, NAME_3_hineus, ... that is not there."""
-    stem, number = folder.name.removesuffix(SUFFIX), 2
-    while (free := folder.with_name(f"{stem}_{number}{SUFFIX}")).exists():
+    stem, number = folder.name.removesuffix(WORKSPACE_SUFFIX), 2
+    while (free := folder.with_name(f"{stem}_{number}{WORKSPACE_SUFFIX}")).exists():
         number += 1
     return free

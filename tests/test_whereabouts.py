@@ -14,6 +14,9 @@ from typer.testing import CliRunner, Result
 
 from hineus_cli.app import build_app
 from stages import reconstruct, whereabouts
+from stages.artifacts import SkippedImage
+from stages.capture.listing import list_captures
+from stages.engine.fingerprint import SourceDigests
 from stages.engine.workspace import Workspace
 
 POSED = with_stage("sfm", sources=("poses",))  # a pipeline that reads poses, too
@@ -112,6 +115,21 @@ def test_the_old_default_is_found_and_said(folder: Path) -> None:
     assert actions(answer) == {"skipped"}
     assert "these photos were reconstructed there before" in answer["said"]
     assert folder_of("b/images") == folder / "b/images_hineus"
+
+
+def test_workspaces_beside_photos_are_no_photos_of_the_folder_above(folder: Path) -> None:
+    run("a/images")
+    (folder / "a/images_hineus/ingest/picture.jpg").write_text("not a photo")
+    photos, _, skipped = list_captures(folder / "a")
+    assert photos == [f"images/{index}.jpg" for index in range(4)]
+    assert skipped == [SkippedImage("images_hineus", "a workspace of hineus")]
+    assert list(SourceDigests({"photos": folder / "a"}).files("photos") or {}) == photos
+
+
+def test_the_photos_folder_is_no_workspace_but_has_one(folder: Path) -> None:
+    run("a/images")
+    result = hineus("status", "a/images")
+    assert (result.exit_code, f"That of the photos in it is {folder}/a/images_hineus." in result.stderr) == (5, True)
 
 
 # ---------------------------------------------------------------- other photos
