@@ -5,8 +5,10 @@ Modules that are slow to import are imported inside the commands, so that `hineu
 
 from __future__ import annotations
 
+import signal
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import Annotated, Any
 
 import typer
@@ -23,11 +25,10 @@ from hineus_cli.commands.settings import presets, show_config
 from hineus_cli.commands.status import status
 from hineus_cli.commands.view import view
 from hineus_cli.session import Session, print_json
+from hineus_cli.stopping import GOES_ON, Stopped, stopped_by_signals
 from stages.engine.stage import Stage
 from stages.errors import HineusError
 from stages.pipeline import PIPELINE
-
-INTERRUPTED = 130
 
 
 class HineusGroup(TyperGroup):
@@ -38,7 +39,8 @@ class HineusGroup(TyperGroup):
     def main(self, *args: Any, **extra: Any) -> Any:
         session = Session(self.pipeline)
         try:
-            return super().main(*args, obj=session, **extra)
+            with stopped_by_signals():
+                return super().main(*args, obj=session, **extra)
         except HineusError as error:
             _tell(session, type(error).__name__, error.message, error.hint, error.exit_code)
             sys.exit(error.exit_code)
@@ -54,11 +56,11 @@ class HineusGroup(TyperGroup):
     def invoke(self, ctx: Any) -> Any:
         try:
             return super().invoke(ctx)
-        except KeyboardInterrupt:
-            from hineus_cli.console import show_error
-
-            show_error("Stopped.", "What was finished is kept: run the same command to go on from there.")
-            raise typer.Exit(INTERRUPTED) from None
+        except KeyboardInterrupt as interruption:
+            stop = interruption if isinstance(interruption, Stopped) else Stopped(signal.SIGINT)
+            with suppress(OSError):  # the terminal may be gone
+                _tell(ctx.obj, "Stopped", stop.message, GOES_ON, stop.exit_code)
+            raise typer.Exit(stop.exit_code) from None
 
 
 def _unexpected(session: Session, error: Exception) -> tuple[str, str]:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
+from hineus_cli.stopping import end_children
 from stages.engine.stage import Stage
 
 if TYPE_CHECKING:
@@ -45,7 +46,11 @@ class Session:
         from hineus_cli.console import ProgressDisplay
 
         with self.working(verbose), ProgressDisplay() as self.progress:
-            yield self.progress
+            try:
+                yield self.progress
+            except KeyboardInterrupt:
+                end_children()
+                raise
 
 
 def print_json(answer: Mapping[str, Any], ok: bool = True) -> None:

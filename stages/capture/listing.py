@@ -36,7 +36,9 @@ def list_captures(source: Path, masks_folder: Path | None = None) -> tuple[list[
     inside_masks = masks_folder.resolve() if masks_folder else None
     photos, videos, skipped = [], [], []
     workspaces = {path.parent for path in source.rglob(WORKSPACE_RECORD)} - {source}
-    skipped += [SkippedImage(path.relative_to(source).as_posix(), "a workspace of hineus") for path in sorted(workspaces)]
+    skipped += [
+        SkippedImage(path.relative_to(source).as_posix(), "a workspace of hineus") for path in sorted(workspaces)
+    ]
     for path in sorted(source.rglob("*")):
         relative = path.relative_to(source)
         if not path.is_file() or any(part.startswith((".", "__MACOSX")) for part in relative.parts):

@@ -26,6 +26,9 @@ def log_to_file(path: Path) -> Iterator[None]:
     root.addHandler(handler)
     try:
         yield
+    except KeyboardInterrupt as stop:
+        logging.getLogger(TRACEBACKS).warning("stopped by %s", str(stop) or "Ctrl-C")
+        raise
     except Exception:
         logging.getLogger(TRACEBACKS).error("the run failed", exc_info=True)
         raise
