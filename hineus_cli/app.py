@@ -5,6 +5,7 @@ Modules that are slow to import are imported inside the commands, so that `hineu
 
 from __future__ import annotations
 
+import errno
 import signal
 import sys
 from collections.abc import Sequence
@@ -45,7 +46,10 @@ class HineusGroup(TyperGroup):
             _tell(session, type(error).__name__, error.message, error.hint, error.exit_code)
             sys.exit(error.exit_code)
         except Exception as error:
-            _tell(session, type(error).__name__, *_unexpected(session, error), HineusError.exit_code)
+            from hineus_cli.console import is_output_error
+
+            told = _no_output(error) if is_output_error(error) else _unexpected(session, error)
+            _tell(session, type(error).__name__, *told, HineusError.exit_code)
             sys.exit(HineusError.exit_code)
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
@@ -84,7 +88,8 @@ def _tell(session: Session, kind: str, message: str, hint: str, exit_code: int) 
     show_error(message, hint)
     if session.json:
         error = {"type": kind, "message": message, "hint": hint, "exit_code": exit_code}
-        print_json({"error": error}, ok=False)
+        with suppress(OSError):  # which may be what is to be told
+            print_json({"error": error}, ok=False)
 
 
 # ---------------------------------------------------------------- the table of commands
@@ -135,4 +140,18 @@ app = build_app()
 
 def main() -> None:
     """The `hineus` command."""
-    app(prog_name="hineus")
+    from hineus_cli.console import flush_output, mend_streams, show_error
+
+    mend_streams()
+    try:
+        app(prog_name="hineus")
+    finally:
+        failed = flush_output()
+        if failed is not None:
+            if failed.errno != errno.EPIPE:  # as with `| head`, where all that was wanted was read
+                show_error(*_no_output(failed))
+            sys.exit(HineusError.exit_code)
+
+
+def _no_output(error: Exception) -> tuple[str, str]:
+    return f"The output cannot be written: {error}.", "Free some space, or send it elsewhere."

@@ -21,14 +21,14 @@ def view(
     import threading
     import webbrowser
 
-    from hineus_cli.console import people
+    from hineus_cli.console import say
     from hineus_cli.viewing import serving, watch
 
     watched = watch(workspace, context.obj.pipeline)
     try:
         with serving(watched, port) as url:
             typer.echo(url)
-            people().print("Ctrl-C ends it.")
+            say("Ctrl-C ends it.")
             if not no_browser:
                 webbrowser.open(url)
             threading.Event().wait()
