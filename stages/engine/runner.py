@@ -181,6 +181,7 @@ def _run_stage(
     )
     with ResourceMeter() as meter:
         numbers = _call(stage, context, workspace, status)
+    _tell_warnings(numbers, workspace.root)
     manifest = _describe(identity, out, numbers, meter, workspace)
     _check_outputs(stage, manifest)
     workspace.publish(stage.name, manifest)
@@ -209,6 +210,14 @@ def _call(
         if wanted := requirement_error(error, stage.name):
             raise wanted from error
         raise
+
+
+def _tell_warnings(numbers: Mapping[str, Any], root: Path) -> None:
+    """Those with a command to try. Results know no paths: the workspace is named here, and by the report's page."""
+    for warning in numbers.get("warnings", ()):
+        if command := warning.get("command"):
+            named = command.replace("--workspace WORKSPACE", f"--workspace {shlex.quote(str(root))}")
+            log.warning("%s Try: `%s`", warning["sentence"], named)
 
 
 def _check_outputs(stage: Stage[Any], manifest: Manifest) -> None:
