@@ -86,6 +86,17 @@ def stage_status(
     return StageStatus(stage.name, state, tuple(reasons), manifest, known)
 
 
+def previous_to_continue(stage: Stage[Any], workspace: Workspace, status: StageStatus) -> Manifest | None:
+    """The publication that a run of the stage would go on from: whole, and of the same version and settings."""
+    made, now = status.manifest, status.identity
+    if not stage.continues or made is None or now is None or status.state != "stale":
+        return None
+    before = made.identity
+    if before.version != now.version or section_with_new_names(stage.name, before.params) != now.params:
+        return None
+    return made if output_problem(workspace.stage_folder(stage.name), made, hashes=True) is None else None
+
+
 def pipeline_status(pipeline: Sequence[Stage[Any]], present: Present, hashes: bool = False) -> list[StageStatus]:
     """How every stage stands. Reads only, so it needs no lock."""
     statuses: dict[str, StageStatus] = {}
@@ -137,6 +148,7 @@ def _identity_now(
         params=jsonable(stage.settings(config).model_dump(mode="json")),
         inputs=inputs,
         sources={name: _source_files(name, present.digests, before) for name in stage.sources},
+        previous=before.previous if before else None,
     )
 
 
