@@ -384,7 +384,7 @@ def test_a_shape_keeps_its_distances_in_a_larger_region(center, radius):
     trainer = make_trainer()  # its SDF is a ball about the middle
     old = Similarity(2.0, np.eye(3), np.array([1.0, 2, 3]))
     new = old.compose(Similarity(radius, np.eye(3), np.array(center)))
-    shape = train._shape_within(trainer, new, old)
+    shape = train._shape_within(trainer.distances, new, old)
     in_poses = np.linalg.norm(new.apply(cube()) - old.translation, axis=-1) - 2.0 * TINY.field.sphere_radius
     np.testing.assert_allclose(shape * new.scale, in_poses, atol=0.02)
 
@@ -393,7 +393,7 @@ def test_a_shape_keeps_its_distances_in_a_larger_region(center, radius):
 def test_a_trainer_that_takes_over_starts_from_the_shape_with_its_grid_up_to_date():
     first, second = make_trainer(), make_trainer()
     larger = Similarity(1.5, np.eye(3), np.zeros(3))
-    assert second.start_from(train._shape_within(first, larger, Similarity.identity())) < 0.02
+    assert second.start_from(train._shape_within(first.distances, larger, Similarity.identity())) < 0.02
     second.step_index = 160  # at which a grid that is up to date would only be refreshed near the surface
     second._refresh_cache(second.moment(0.5))
     radius = np.linalg.norm(second.cache.points(torch.arange(24**3)).numpy(), axis=1)

@@ -154,7 +154,7 @@ def _run_stage(
     identity = status.identity
     if identity is None:
         raise ValueError(f"stage {stage.name} was asked to run before the stages it needs: {status.reason}")
-    identity = replace(identity, previous=previous and previous.digest)
+    identity = replace(identity, previous=previous.digest if previous else None)
     given = {name: path for name in stage.sources if (path := digests.sources.get(name)) is not None}
     for name, path in given.items():
         if not digests.available(name):
