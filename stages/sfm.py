@@ -268,9 +268,13 @@ def _publish(
         others: models that mapping gave beside this one.
         steps: the attempts; none where the poses were given.
     """
+    import pycolmap
+
     model, folder = adjusted.model, context.to_write(MODEL)
     folder.mkdir(parents=True)
     model.write(str(folder))
+    # the photos in the order of their ids, whatever the order in which they were placed
+    pycolmap.Reconstruction(str(folder)).write(str(folder))
     points = model.num_points3D()
     registration = Registration(
         registered=tuple(sorted(registered)),
