@@ -6,7 +6,7 @@ import ctypes
 import logging
 import os
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +14,13 @@ from configs.load import load_config
 from configs.params import Config
 from stages import artifacts
 from stages.capture.listing import is_video
+from stages.engine.fingerprint import SourceDigests
 from stages.engine.run_log import log_to_file
 from stages.engine.runner import Listener, StageOutcome, run_pipeline
 from stages.engine.stage import Stage
 from stages.engine.workspace import Workspace
 from stages.errors import ConfigError, InputError, SystemRequirementError
+from stages.kept import what_is_kept
 from stages.posing.reading import locate_poses, masks_beside
 from stages.preflight import Preflight, in_short, preflight
 from stages.request import Request
@@ -76,6 +78,11 @@ def reconstruct(request: Request, pipeline: Sequence[Stage], listener: Listener 
         photos = sources["photos"]
         if photos is not None and not workspace.stage_folder("ingest").exists():
             _tell_preflight(preflight(photos, sources["masks"], workspace.root, config, device, workers, decode=False))
+        elif photos is not None and photos.exists():
+            digests = SourceDigests({"photos": photos}, workspace.digest_cache)
+            if kept := what_is_kept(workspace, config, digests.files("photos") or {}, _forced(request, pipeline)):
+                log.info("%s", kept)
+            digests.save()
         log.debug("preset %s, device %s, %d workers, %s", preset, device, workers, sources)
         outcomes = run_pipeline(
             pipeline,
@@ -102,9 +109,15 @@ def check_photos(request: Request) -> Preflight:
     photos = request.photos
     assert photos is not None, "the command line demands it"
     config = load_config(request.preset or default_preset(), request.config, request.sets)
-    workers = request.workers or available_cores()
+    workers, folder = request.workers or available_cores(), choose_folder(request)
     device = choose_device(request.device)
-    return preflight(photos, request.masks, choose_folder(request), config, device, workers, decode=True)
+    done = preflight(photos, request.masks, folder, config, device, workers, decode=True)
+    if not (folder / "workspace.json").exists():
+        return done
+    workspace = Workspace.open(folder)
+    digests = SourceDigests({"photos": photos.resolve()}, workspace.digest_cache)
+    _, config = choose_config(request, workspace)
+    return replace(done, kept=what_is_kept(workspace, config, digests.files("photos") or {}))
 
 
 def _tell_preflight(done: Preflight) -> None:
@@ -112,6 +125,13 @@ def _tell_preflight(done: Preflight) -> None:
     log.info("%s", in_short(done))
     for line in (*done.refusals, *done.shortages, *done.warnings):
         log.warning("%s", line)
+
+
+def _forced(request: Request, pipeline: Sequence[Stage]) -> set[str]:
+    """Stages that run even if fresh."""
+    names = [stage.name for stage in pipeline]
+    first = names.index(request.from_stage) if request.from_stage in names else len(names)
+    return {*request.force, *names[first:]}
 
 
 def choose_folder(request: Request) -> Path:

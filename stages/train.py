@@ -39,7 +39,7 @@ SETTLED = 500  # steps between looks at that
 # A training goes on from the last one where no more than this part of its photos came and went.
 MAX_CHANGED = 0.25
 # Part of the budget that counts as spent then: where the networks fit as they are, and where only the shape does, whose
-# region is another one. See docs/benchmarks/added-photos.md.
+# region is another one: the numbers are in docs/adr/0013.
 KEPT_NETWORKS, KEPT_SHAPE = 0.7, LOOK_AT
 SAME_FRAME = 1e-6  # of the region's radius
 
@@ -305,10 +305,15 @@ def _last_scene(context: StageContext[TrainParams], scene: PosedScene) -> PosedS
     if context.params.hold_out:
         log.info("training starts anew: photos that are held out now may have been seen before")
         return None
-    if changed > MAX_CHANGED * len(then):
+    if not little_changed(changed, len(then)):
         log.info("training starts anew: %d of %d photos are new or gone", changed, len(now | then))
         return None
     return before
+
+
+def little_changed(changed: int, before: int) -> bool:
+    """Whether so few photos came and went, of those that were trained on, that training goes on."""
+    return changed <= MAX_CHANGED * before
 
 
 def _kept_region(scene: PosedScene, before: PosedScene) -> _Region | None:

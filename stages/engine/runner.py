@@ -108,7 +108,7 @@ def run_pipeline(
                 listener.stage_started(stage, reason)
                 previous = None
                 if stage.name not in forced:
-                    previous = previous_to_continue(stage, workspace, status)
+                    previous = previous_to_continue(stage, workspace, config)
                 manifest = _run_stage(stage, present, status, previous, device, workers, listener)
                 outcome = _outcome("ran", reason, manifest)
                 status = StageStatus(stage.name, "fresh", (), manifest, manifest.identity)

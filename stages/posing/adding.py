@@ -67,14 +67,18 @@ class KnownPhotos:
     @property
     def enough(self) -> bool:
         """Whether so many of the photos have a pose that the others are placed beside them."""
-        total = len(self.names) + len(self.new)
-        return len(self.poses) >= MIN_PLACED and len(self.poses) > MIN_SHARE * total
+        return enough_placed(len(self.poses), len(self.names) + len(self.new))
 
     def describe(self) -> str:
         """For people: "40 photos known (2 by another name), 7 new, 2 gone"."""
         renamed = sum(now != then for now, then in self.names.items())
         other = f" ({renamed} by another name)" if renamed else ""
         return f"{len(self.names)} photos known{other}, {len(self.new)} new, {len(self.gone)} gone"
+
+
+def enough_placed(placed: int, total: int) -> bool:
+    """Whether so many known photos of all have a pose that the others are placed beside them."""
+    return placed >= MIN_PLACED and placed > MIN_SHARE * total
 
 
 def same_contents(before: Mapping[str, str], now: Mapping[str, str]) -> dict[str, str]:
