@@ -22,6 +22,7 @@ from stages.engine.runner import Listener, StageOutcome, naming_command, run_pip
 from stages.engine.stage import Stage
 from stages.engine.workspace import Workspace
 from stages.errors import ConfigError, InputError, SystemRequirementError, WorkspaceError
+from stages.kept import what_is_kept
 from stages.posing.reading import locate_poses, masks_beside
 from stages.preflight import Preflight, in_short, preflight
 from stages.request import Request
@@ -83,6 +84,11 @@ def reconstruct(request: Request, pipeline: Sequence[Stage], listener: Listener 
         photos = sources["photos"]
         if photos is not None and not workspace.stage_folder("ingest").exists():
             _tell_preflight(preflight(photos, sources["masks"], workspace.root, config, device, workers, decode=False))
+        elif photos is not None and photos.exists():
+            digests = SourceDigests({"photos": photos}, workspace.digest_cache)
+            if kept := what_is_kept(workspace, config, digests.files("photos") or {}, _forced(request, pipeline)):
+                log.info("%s", kept)
+            digests.save()
         log.debug("preset %s, device %s, %d workers, %s", preset, device, workers, sources)
         outcomes = run_pipeline(
             pipeline,
@@ -109,10 +115,16 @@ def check_photos(request: Request) -> Preflight:
     photos = request.photos
     assert photos is not None, "the command line demands it"
     config = load_config(request.preset or default_preset(), request.config, request.sets)
-    workers = request.workers or available_cores()
+    workers, folder = request.workers or available_cores(), choose_folder(request)
     device = choose_device(request.device)
-    done = preflight(photos, request.masks, choose_folder(request), config, device, workers, decode=True)
-    return replace(done, refusals=(*done.refusals, *_workspace_refusals(request)))
+    done = preflight(photos, request.masks, folder, config, device, workers, decode=True)
+    done = replace(done, refusals=(*done.refusals, *_workspace_refusals(request)))
+    if not (folder / "workspace.json").exists():
+        return done
+    workspace = Workspace.open(folder)
+    digests = SourceDigests({"photos": photos.resolve()}, workspace.digest_cache)
+    _, config = choose_config(request, workspace)
+    return replace(done, kept=what_is_kept(workspace, config, digests.files("photos") or {}))
 
 
 def _workspace_refusals(request: Request) -> list[str]:
@@ -131,6 +143,13 @@ def _tell_preflight(done: Preflight) -> None:
     log.info("%s", in_short(done))
     for line in (*done.refusals, *done.shortages, *done.warnings):
         log.warning("%s", line)
+
+
+def _forced(request: Request, pipeline: Sequence[Stage]) -> set[str]:
+    """Stages that run even if fresh."""
+    names = [stage.name for stage in pipeline]
+    first = names.index(request.from_stage) if request.from_stage in names else len(names)
+    return {*request.force, *names[first:]}
 
 
 def choose_folder(request: Request) -> Path:
