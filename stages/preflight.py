@@ -58,6 +58,7 @@ class Preflight:
     Attributes:
         max_side: what photos are reduced to, longest side in pixels.
         refusals: reasons for "no-go" that lie in the photos; `shortages`: those that lie in the machine.
+        kept: what a run would keep of the workspace that is there, see `stages.kept`; empty where nothing has changed.
     """
 
     inspection: Inspection
@@ -66,6 +67,7 @@ class Preflight:
     warnings: tuple[str, ...]
     refusals: tuple[str, ...]
     shortages: tuple[str, ...]
+    kept: str = ""
 
     @property
     def verdict(self) -> Verdict:
@@ -97,6 +99,7 @@ class Preflight:
             "warnings": list(self.warnings),
             "refusals": list(self.refusals),
             "shortages": list(self.shortages),
+            "kept": self.kept,
         }
 
 
@@ -207,6 +210,8 @@ def facts(done: Preflight) -> list[tuple[str, str]]:
                 "object out",
             )
         )
+    if done.kept:
+        lines.append(("workspace", done.kept))
     minutes = "not measured on a GPU" if needs.minutes is None else f"about {needs.minutes:.0f} min"
     lines.append(("needs", f"{minutes}, {needs.memory_gib:.1f} GiB of memory, {needs.disk_gb:.1f} GB of disk"))
     return lines

@@ -170,7 +170,7 @@ def replay(context: StageContext[ReportParams]) -> str:
 
 REPORT: Stage[ReportParams] = Stage(
     name="report",
-    version=7,
+    version=8,
     settings=lambda config: config.report,
     run=run,
     reads=(

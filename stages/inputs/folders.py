@@ -74,6 +74,11 @@ class LeftOut:
     missed: bool = False
 
 
+def is_workspace(folder: Path) -> bool:
+    """Whether the folder is a workspace, whose pictures are nobody's photos."""
+    return (folder / WORKSPACE_RECORD).is_file()
+
+
 def named_files(folder: Path) -> tuple[dict[str, Path], list[LeftOut]]:
     """Files below `folder` by readable posix path relative to it, sorted; and what was left out.
 
@@ -181,7 +186,7 @@ def _why_not_into(path: Path, root: Path) -> str | None:
         return "a hidden folder"
     if (path.parent.name.lower(), path.name.lower()) == SMALL_VIDEOS:
         return "small copies of videos"
-    if (path / WORKSPACE_RECORD).is_file():
+    if is_workspace(path):
         return "a workspace of hineus"
     if path.is_symlink():
         target = path.resolve()
