@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from configs.params import Config
+from stages.capture.gps import gps_warnings
 from stages.capture.inspection import Inspection, inspect
 from stages.capture.listing import NAMED, by_reason, name_some
 from stages.capture.salient import INSTALL, find_weights
@@ -82,6 +83,7 @@ class Preflight:
             "sizes": [[*size, count] for size, count in Counter(seen.sizes).most_common()],
             "cameras": dict(Counter(photo.camera for photo in seen.photos)),
             "with_focal": sum(photo.has_focal for photo in seen.photos),
+            "with_gps": _located(seen),
             **asdict(seen.oddities),
             "plain_background": seen.plain,
             "needs": asdict(self.needs),
@@ -158,8 +160,15 @@ def _warnings(seen: Inspection, config: Config) -> list[str]:
     if config.ingest.min_images <= len(seen.sizes) < FEW_PHOTOS:
         found.append(f"Only {len(seen.sizes)} photos; 30 to 100 that overlap by two thirds give a whole object.")
     found += seen.oddities.warnings
+    if config.place.gps:
+        found += gps_warnings({photo.source: photo.gps for photo in seen.photos})
     unusable = by_reason(item for item in seen.skipped if not item.reason.startswith(EXPECTED))
     return found + [f"Left out {name_some(names)}: {reason}." for reason, names in unusable.items()]
+
+
+def _located(seen: Inspection) -> int:
+    """Photos that say where they were taken."""
+    return sum(photo.gps.position is not None for photo in seen.photos)
 
 
 def facts(done: Preflight) -> list[tuple[str, str]]:
@@ -176,6 +185,8 @@ def facts(done: Preflight) -> list[tuple[str, str]]:
     with_focal = sum(photo.has_focal for photo in seen.photos)
     estimated = "" if with_focal == len(seen.photos) else "; else it is estimated"
     lines.append(("focal length", f"in the EXIF of {with_focal} of {len(seen.photos)} photos{estimated}"))
+    if located := _located(seen):
+        lines.append(("GPS", f"a position in {located} of {len(seen.photos)} photos"))
     if seen.plain:
         lines.append(("background", "plain: `--set ingest.auto_mask=plain` would cut the object out"))
     elif seen.plain_share >= MOSTLY_PLAIN:

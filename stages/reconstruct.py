@@ -134,7 +134,7 @@ def choose_folder(request: Request) -> Path:
 
 
 def choose_sources(request: Request, workspace: Workspace) -> dict[str, Path | None]:
-    """Photos, masks and poses: those given, else those the workspace was last run with.
+    """Photos, masks, poses and control points: those given, else those the workspace was last run with.
 
     Masks that the poses' format comes with are used, too.
 
@@ -150,6 +150,8 @@ def choose_sources(request: Request, workspace: Workspace) -> dict[str, Path | N
                 f"{given} is a file; a folder of {name}{' or a video' if name == 'photos' else ''} is needed.",
                 f"Name the folder it is in: {given.absolute().parent}",
             )
+    if request.control is not None and not request.control.exists():
+        raise InputError(f"There are no control points at {request.control}.", "Check the path with `ls`.")
     recorded = known.get("photos")
     photos = request.photos.resolve() if request.photos else Path(recorded) if recorded else None
     if photos is None:
@@ -164,12 +166,14 @@ def choose_sources(request: Request, workspace: Workspace) -> dict[str, Path | N
         )
     masks = request.masks.resolve() if request.masks else None
     poses = locate_poses(request.poses).resolve() if request.poses else None
+    control = request.control.resolve() if request.control else None
     if str(photos) == recorded:
         masks = masks or _remembered(known.get("masks"), request.no_masks)
         poses = poses or _remembered(known.get("poses"), request.no_poses)
+        control = control or _remembered(known.get("control"), request.no_control)
     if masks is None and request.poses and poses is not None and not request.no_masks:
         masks = masks_beside(poses)
-    return {"photos": photos, "masks": masks, "poses": poses}
+    return {"photos": photos, "masks": masks, "poses": poses, "control": control}
 
 
 def _remembered(path: str | None, forget: bool) -> Path | None:

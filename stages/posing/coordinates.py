@@ -1,0 +1,128 @@
+"""Coordinate systems of surveyors and maps (EPSG codes), by pyproj: to latitude, longitude and altitude, and back.
+
+Heights pass through as they are, but for their unit: which surface they count from (geoid, ellipsoid) moves all points
+of a capture alike, and its models need not be installed.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from stages.errors import ConfigError, InputError, SystemRequirementError
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+WGS84 = "EPSG:4326"
+MAX_BEYOND_DEG = 3.0  # maps are used beyond their border, but not this far
+EXTRA = "pip install 'hineus[geo]'"
+
+
+def to_geodetic(xyz: Float[np.ndarray, "n 3"], crs: str, what: str) -> Float[np.ndarray, "n 3"]:
+    """Latitude, longitude (degrees, WGS 84) and altitude (metres) of coordinates: east (or longitude), north, up.
+
+    Args:
+        crs: "EPSG:32632", a PROJ string or WKT. what: the coordinates' name in an error.
+
+    Raises:
+        ConfigError: there is no such coordinate system.
+        InputError: the coordinates lie outside the area that it is for.
+        SystemRequirementError: pyproj is not installed.
+    """
+    import_pyproj()
+    from pyproj import Transformer
+
+    horizontal, metres = _horizontal(crs)
+    across = Transformer.from_crs(horizontal, WGS84, always_xy=True)
+    longitude, latitude = (np.asarray(each) for each in across.transform(xyz[:, 0], xyz[:, 1]))
+    found = np.stack([latitude, longitude, metres * xyz[:, 2]], 1)
+    outside = ~np.isfinite(found).all(1) | (np.abs(latitude) > 90)
+    area = horizontal.area_of_use
+    if area is not None:
+        east = (longitude - area.west) % 360 <= (area.east - area.west) % 360 + MAX_BEYOND_DEG
+        east |= (longitude - area.west) % 360 >= 360 - MAX_BEYOND_DEG
+        east |= area.east - area.west >= 360
+        within = (latitude >= area.south - MAX_BEYOND_DEG) & (latitude <= area.north + MAX_BEYOND_DEG)
+        outside |= ~(east & within)
+    if outside.any():
+        x, y, _ = xyz[int(np.argmax(outside))]
+        name = f" ({area.name})" if area is not None else ""
+        raise InputError(
+            f"{outside.sum()} of {len(xyz)} {what} lie outside the area of {horizontal.name}{name}, e.g. {x:g} {y:g}.",
+            "x is east or longitude, y is north or latitude: are they swapped? Or name the coordinate system: "
+            "`--set place.control_epsg=CODE`.",
+        )
+    return found
+
+
+def to_grid(positions: Float[np.ndarray, "n 3"], crs: str) -> Float[np.ndarray, "n 3"]:
+    """East, north and up in metres, in a projected coordinate system, of latitude, longitude and altitude.
+
+    Raises:
+        ConfigError: there is no such system, or it is not one of east and north in metres.
+        SystemRequirementError: pyproj is not installed.
+    """
+    import_pyproj()
+    from pyproj import Transformer
+
+    horizontal, _ = _horizontal(crs)
+    units = {axis.unit_conversion_factor for axis in horizontal.axis_info}
+    if not horizontal.is_projected or units != {1.0}:
+        unit = horizontal.axis_info[0].unit_name
+        raise ConfigError(
+            f"{crs} ({horizontal.name}) counts in {unit}; results are in metres east and north.",
+            "Name a projected system in metres, such as that of UTM: `--set place.epsg=32632`.",
+        )
+    across = Transformer.from_crs(WGS84, horizontal, always_xy=True)
+    east, north = across.transform(positions[:, 1], positions[:, 0])
+    grid = np.stack([east, north, positions[:, 2]], 1)
+    if not np.isfinite(grid).all():
+        raise ConfigError(
+            f"{crs} ({horizontal.name}) does not reach to latitude {positions[0, 0]:.4f}, longitude "
+            f"{positions[0, 1]:.4f}.",
+            "Name a system for this place, or leave it out: `--set place.epsg=null`.",
+        )
+    return grid
+
+
+def import_pyproj() -> None:
+    """Make sure that it is there.
+
+    Raises:
+        SystemRequirementError: it is not.
+    """
+    try:
+        import pyproj  # noqa: F401
+    except ImportError as error:
+        raise SystemRequirementError(
+            f"Coordinates of a named system are converted by pyproj, which cannot be imported: {error}.",
+            f"Try `{EXTRA}`.",
+        ) from error
+
+
+def _horizontal(crs: str) -> tuple[Any, float]:
+    """The part for east and north of a coordinate system, and the metres in its unit of height."""
+    from pyproj import CRS
+    from pyproj.exceptions import CRSError
+
+    try:
+        named = CRS.from_user_input(crs)
+    except CRSError as error:
+        raise ConfigError(
+            f"There is no coordinate system {crs[:60]}.",
+            "Look it up at https://epsg.io: `--set place.control_epsg=32632`.",
+        ) from error
+    horizontal, *rest = named.sub_crs_list if named.is_compound else [named]
+    if not (horizontal.is_projected or horizontal.is_geographic):
+        raise ConfigError(
+            f"{named.name} has no east and north, or latitude and longitude.",
+            "Convert the coordinates to longitude, latitude and height: EPSG:4326.",
+        )
+    if rest:
+        return horizontal, float(rest[0].axis_info[0].unit_conversion_factor)
+    if horizontal.is_geographic:
+        return horizontal, 1.0
+    # heights are measured with the same staff
+    return horizontal, float(horizontal.axis_info[0].unit_conversion_factor)
