@@ -147,6 +147,6 @@ def _strip(points: Float[np.ndarray, "p 3"]) -> str:
     if len(points) < MIN_FOR_PLACE:
         return f"{len(points)} points could be placed, {MIN_FOR_PLACE} are needed for place and direction"
     lengths = np.linalg.svd(points - points.mean(0), compute_uv=False)
-    if lengths[1] < MIN_STRIP * lengths[0]:
+    if lengths[1] <= MIN_STRIP * lengths[0]:
         return f"the {len(points)} points lie on one line, and the turn about it stays open"
     return ""

@@ -179,8 +179,8 @@ def _columns_of(cells: Sequence[str], where: str) -> list[str]:
         return ["x", "y", "z", "px", "py", "photo", "name"]
     if re.match("^.999a99", kinds):
         return ["name", "x", "y", "z", "photo", "px", "py", "role"]
-    if re.match("^a.99$", kinds):
-        return ["photo", "name", "px", "py"] if PHOTO_NAME.search(cells[0]) else ["name", "photo", "px", "py"]
+    if re.match("^a.99$", kinds) and PHOTO_NAME.search(cells[0]):
+        return ["photo", "name", "px", "py"]
     if re.match("^.a99$", kinds):
         return ["name", "photo", "px", "py"]
     if re.match("^.999a?$", kinds):
