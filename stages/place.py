@@ -25,7 +25,7 @@ from stages.geometry.place import GivenRegion, Located, Place, given_region, loc
 from stages.geometry.similarity import Similarity
 from stages.geometry.subjects import find_subjects
 from stages.geometry.up import Up, angle_deg, estimate_up
-from stages.posing.control_files import read_control
+from stages.posing.control_files import CONTROL, read_control
 from stages.posing.coordinates import to_grid
 from stages.posing.markers import MarkerScale, detect_markers, measure_markers
 from stages.posing.survey import Survey, survey
@@ -57,7 +57,7 @@ def run(context: StageContext[PlaceParams]) -> dict[str, Any]:
     use_gps = params.gps and context.read(GIVEN_POSES) is None
     gps = _gps_of(cameras, records)
     located = _locate(cameras, gps) if use_gps else None
-    surveyed = _survey(context, model, photos, records) if "control" in context.sources else None
+    surveyed = _survey(context, model, photos, records) if CONTROL in context.sources else None
     found = None
     if params.marker_size is not None:
         found = _measure_markers(model, photos, cameras, context.read(PHOTOS), params)
@@ -170,9 +170,8 @@ def _survey(
     Raises:
         InputError, ConfigError, SystemRequirementError: see `survey`.
     """
-    control = read_control(context.sources["control"])
-    code = context.params.control_epsg
-    crs = control.crs if code is None else f"EPSG:{code}"
+    control = read_control(context.sources[CONTROL])
+    crs = control.system(context.params.control_epsg)
     found = survey(control, crs, photos, model.cameras, records)
     used = sum(point.used for point in found.points)
     residual = "" if found.fit.residual is None else f", residual {found.fit.residual:.2g} m"
@@ -366,6 +365,6 @@ PLACE: Stage[PlaceParams] = Stage(
     run=run,
     reads=(IMAGE_SET, PHOTOS, MODEL, GIVEN_POSES),
     writes=(WORLD_PLACE, GIVEN_REGION),
-    sources=("control",),
+    sources=(CONTROL,),
     summary="scale, place and up of the world, from GPS, control points, markers or a known distance",
 )

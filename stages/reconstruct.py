@@ -19,6 +19,7 @@ from stages.engine.runner import Listener, StageOutcome, run_pipeline
 from stages.engine.stage import Stage
 from stages.engine.workspace import Workspace
 from stages.errors import ConfigError, InputError, SystemRequirementError
+from stages.posing.control_files import CONTROL
 from stages.posing.reading import locate_poses, masks_beside
 from stages.preflight import Preflight, in_short, preflight
 from stages.request import Request
@@ -75,7 +76,9 @@ def reconstruct(request: Request, pipeline: Sequence[Stage], listener: Listener 
     with workspace.lock(), log_to_file(workspace.log_path):
         photos = sources["photos"]
         if photos is not None and not workspace.stage_folder("ingest").exists():
-            _tell_preflight(preflight(photos, sources["masks"], workspace.root, config, device, workers, decode=False))
+            control = sources[CONTROL]
+            done = preflight(photos, sources["masks"], workspace.root, config, device, workers, False, control)
+            _tell_preflight(done)
         log.debug("preset %s, device %s, %d workers, %s", preset, device, workers, sources)
         outcomes = run_pipeline(
             pipeline,
@@ -104,7 +107,7 @@ def check_photos(request: Request) -> Preflight:
     config = load_config(request.preset or default_preset(), request.config, request.sets)
     workers = request.workers or available_cores()
     device = choose_device(request.device)
-    return preflight(photos, request.masks, choose_folder(request), config, device, workers, decode=True)
+    return preflight(photos, request.masks, choose_folder(request), config, device, workers, True, request.control)
 
 
 def _tell_preflight(done: Preflight) -> None:
@@ -170,10 +173,10 @@ def choose_sources(request: Request, workspace: Workspace) -> dict[str, Path | N
     if str(photos) == recorded:
         masks = masks or _remembered(known.get("masks"), request.no_masks)
         poses = poses or _remembered(known.get("poses"), request.no_poses)
-        control = control or _remembered(known.get("control"), request.no_control)
+        control = control or _remembered(known.get(CONTROL), request.no_control)
     if masks is None and request.poses and poses is not None and not request.no_masks:
         masks = masks_beside(poses)
-    return {"photos": photos, "masks": masks, "poses": poses, "control": control}
+    return {"photos": photos, "masks": masks, "poses": poses, CONTROL: control}
 
 
 def _remembered(path: str | None, forget: bool) -> Path | None:

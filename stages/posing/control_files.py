@@ -15,6 +15,7 @@ from pathlib import Path
 
 from stages.errors import InputError
 
+CONTROL = "control points"  # what a run calls this input
 SUFFIXES = frozenset({".csv", ".txt", ".tsv", ".gcp"})
 FORM = "It needs rows of name, x, y, z, photo, px, py with these names above them, or is OpenDroneMap's gcp_list.txt."
 COLUMNS = {
@@ -72,6 +73,10 @@ class GroundControl:
     points: tuple[KnownPoint, ...]
     sightings: tuple[Sighting, ...]
     crs: str = ""
+
+    def system(self, code: int | None) -> str:
+        """The coordinate system, where the user may have said its EPSG code."""
+        return self.crs if code is None else f"EPSG:{code}"
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import PurePosixPath
 from typing import TYPE_CHECKING, Any
@@ -14,7 +14,7 @@ from stages.artifacts import ImageRecord
 from stages.errors import InputError
 from stages.geometry.earth import east_north_up, middle_position
 from stages.geometry.place import ControlMark, ControlPoint
-from stages.posing.control import MIN_FOR_SCALE, ControlFit, PlacedPoint, fit_control, place_point
+from stages.posing.control import MIN_FOR_PLACE, MIN_FOR_SCALE, ControlFit, PlacedPoint, fit_control, place_point
 from stages.posing.control_files import GroundControl, KnownPoint, Sighting
 from stages.posing.coordinates import to_geodetic
 from stages.posing.known import best_fits
@@ -98,19 +98,24 @@ def survey(
 
 
 # ---------------------------------------------------------------- which photo
-def _of_photos(
-    control: GroundControl, photos: Sequence[Any], records: Sequence[ImageRecord]
-) -> tuple[dict[str, _Marks], list[str]]:
-    """The sightings in posed photos by point, and sentences on those of photos that are not there."""
-    by_stem: dict[str, list[str]] = defaultdict(list)
-    for record in records:
-        by_stem[_stem(record.source)].append(record.source)
-    of_source = {record.source: record for record in records}
-    posed = {photo.name: photo for photo in photos}
-    marks: dict[str, _Marks] = defaultdict(_Marks)
-    missing, unposed = set(), set()
+def match_sightings(
+    control: GroundControl, sizes: Mapping[str, tuple[int, int]]
+) -> tuple[list[tuple[Sighting, str]], set[str]]:
+    """Each sighting with its photo, and the names of photos that are not there.
+
+    Args:
+        sizes: photo, as a relative posix path -> upright width and height as it was taken.
+
+    Raises:
+        InputError: none is of a photo, one fits several, or one lies outside its photo.
+    """
+    by_stem: dict[str, dict[str, str]] = defaultdict(dict)
+    for source in sizes:
+        by_stem[_stem(source)][source.lower()] = source
+    found, missing = [], set()
     for mark in control.sightings:
-        _, fitting = best_fits(mark.photo.lower(), [source.lower() for source in by_stem[_stem(mark.photo)]])
+        near = by_stem.get(_stem(mark.photo), {})
+        _, fitting = best_fits(mark.photo.lower(), near)
         if len(fitting) > 1:
             raise InputError(
                 f"{mark.photo} in {control.origin} fits {len(fitting)} photos: {fitting[0]}, {fitting[1]}.",
@@ -119,53 +124,85 @@ def _of_photos(
         if not fitting:
             missing.add(mark.photo)
             continue
-        record = next(of_source[source] for source in by_stem[_stem(mark.photo)] if source.lower() == fitting[0])
-        if record.name not in posed:
-            unposed.add(record.source)
-            continue
-        found = marks[mark.point]
-        scale = _scale(mark, record)
-        found.photos.append(posed[record.name])
-        found.names.append(record.source)
-        found.pixels.append((scale * mark.pixel[0], scale * mark.pixel[1]))
-        found.scales.append(scale)
-    names = {mark.photo for mark in control.sightings}
-    if missing == names:
+        source = near[fitting[0]]
+        _check_inside(mark, source, sizes[source])
+        found.append((mark, source))
+    if not found:
         raise InputError(
-            f"None of the {len(names)} photos that {control.origin} marks is among the {len(records)} photos: it names "
-            f"e.g. {min(names)}, photos are called e.g. {records[0].source}.",
+            f"None of the {len(missing)} photos that {control.origin} marks is among the {len(sizes)} photos: it names "
+            f"e.g. {min(missing)}, photos are called e.g. {min(sizes, default='-')}.",
             "Name photos in it as the files are named.",
         )
-    sentences = []
-    if missing:
-        sentences.append(
-            f"{len(missing)} of {len(names)} photos with control points are not there, e.g. {min(missing)}."
-        )
-    if unposed:
-        sentences.append(
-            f"{len(unposed)} of {len(names)} photos with control points have no pose, e.g. {min(unposed)}."
-        )
-    return marks, sentences
+    return found, missing
 
 
 def _stem(name: str) -> str:
     return PurePosixPath(name.lower()).stem
 
 
-def _scale(mark: Sighting, record: ImageRecord) -> float:
-    """Pixels of the photo as it was read, in one of the photo as it was taken.
-
-    Raises:
-        InputError: the sighting lies outside the photo.
-    """
-    width, height = record.taken or (record.width, record.height)
-    x, y = mark.pixel
-    if not (-EDGE_PX <= x <= width + EDGE_PX and -EDGE_PX <= y <= height + EDGE_PX):
+def _check_inside(mark: Sighting, source: str, size: tuple[int, int]) -> None:
+    if not all(-EDGE_PX <= at <= side + EDGE_PX for at, side in zip(mark.pixel, size, strict=True)):
         raise InputError(
-            f"{mark.point} is marked at {x:g} {y:g} in {record.source}, which has {width} x {height} pixels.",
+            f"{mark.point} is marked at {mark.pixel[0]:g} {mark.pixel[1]:g} in {source}, which has "
+            f"{size[0]} x {size[1]} pixels.",
             "Pixels count from the upper left corner of the photo as viewers show it: upright, in its full size.",
         )
-    return record.width / width
+
+
+def foresee(control: GroundControl, crs: str, sizes: Mapping[str, tuple[int, int]]) -> tuple[list[str], list[str]]:
+    """What can be told of control points before photos have poses: why they cannot do, and what to look at.
+
+    Raises:
+        InputError, ConfigError, SystemRequirementError: as `survey`.
+    """
+    found, missing = match_sightings(control, sizes)
+    if crs:
+        to_geodetic(np.array([point.xyz for point in control.points]), crs, "control points")
+    photos_of: dict[str, set[str]] = defaultdict(set)
+    for mark, source in found:
+        photos_of[mark.point].add(source)
+    fitted = [point.name for point in control.points if not point.check]
+    count = sum(len(photos_of[name]) >= MIN_FOR_SCALE for name in fitted)
+    marked = f"{count} of {len(fitted)} control points are marked in two photos or more"
+    warnings = _of_missing(missing, control)
+    if count < MIN_FOR_SCALE:
+        return [f"{marked}, {MIN_FOR_SCALE} are needed for the scale, {MIN_FOR_PLACE} for the place."], warnings
+    if count < MIN_FOR_PLACE:
+        warnings.append(f"{marked}: they tell the scale; {MIN_FOR_PLACE} are needed for place and direction.")
+    return [], warnings
+
+
+def _of_missing(missing: Collection[str], control: GroundControl) -> list[str]:
+    names = {mark.photo for mark in control.sightings}
+    if not missing:
+        return []
+    return [f"{len(missing)} of {len(names)} photos with control points are not there, e.g. {min(missing)}."]
+
+
+def _of_photos(
+    control: GroundControl, photos: Sequence[Any], records: Sequence[ImageRecord]
+) -> tuple[dict[str, _Marks], list[str]]:
+    """The sightings in posed photos by point, and sentences on those of photos that are not there or have no pose."""
+    of_source = {record.source: record for record in records}
+    sizes = {source: record.taken or (record.width, record.height) for source, record in of_source.items()}
+    posed = {photo.name: photo for photo in photos}
+    found, missing = match_sightings(control, sizes)
+    marks: dict[str, _Marks] = defaultdict(_Marks)
+    unposed = set()
+    for mark, source in found:
+        record = of_source[source]
+        if record.name not in posed:
+            unposed.add(source)
+            continue
+        theirs, scale = marks[mark.point], record.width / sizes[source][0]
+        theirs.photos.append(posed[record.name])
+        theirs.names.append(source)
+        theirs.pixels.append((scale * mark.pixel[0], scale * mark.pixel[1]))
+        theirs.scales.append(scale)
+    sentences = _of_missing(missing, control)
+    if unposed:
+        sentences.append(f"{len(unposed)} photos with control points have no pose, e.g. {min(unposed)}.")
+    return marks, sentences
 
 
 # ---------------------------------------------------------------- what is told
