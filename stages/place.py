@@ -90,7 +90,7 @@ def run(context: StageContext[PlaceParams]) -> dict[str, Any]:
         "gps_residual_m": place.gps_residual and round(place.gps_residual, 3),
         **({"control_residual_m": round(place.control_residual, 4)} if place.control_residual is not None else {}),
         **({"up_from": up_from} if up_from else {}),
-        "warnings": [{"sentence": warning, "command": ""} for warning in warnings],
+        **({"warnings": [{"sentence": warning} for warning in warnings]} if warnings else {}),
     }
 
 
