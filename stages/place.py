@@ -220,7 +220,7 @@ def _by_control(
         if np.hypot(*apart[:2]) > MAX_GPS_SHIFT_M:
             warnings.append(
                 f"The control points put the cameras {np.hypot(*apart[:2]) / 1e3:,.1f} km from where GPS has them: is "
-                "their coordinate system right (`--set place.control_epsg=CODE`)?"
+                "their coordinate system right (`--set place.control_epsg=32632`)?"
             )
     return found, warnings
 
@@ -239,7 +239,7 @@ def _in_reach(place: Place, centers: np.ndarray, epsg: int | None) -> Place:
     if place.origin is None:
         raise ConfigError(
             f"`place.epsg` = {epsg} asks for a map's coordinates, but where on Earth the scene lies is not known.",
-            "It takes GPS, or at least 3 control points in a named coordinate system: `--set place.control_epsg=CODE`.",
+            "It takes GPS, or at least 3 control points in a named coordinate system: `--set place.control_epsg=32632`.",
         )
     corners = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)])
     enu = middle + max(radius, MIN_GRID_M) * corners

@@ -208,3 +208,26 @@ def test_a_distance_is_compared_with_control_points(inputs, tmp_path: Path, capl
     found, _ = place(inputs, tmp_path, control, known_distance="0 0 0 1 0 0 2")
     assert found.scale_from == "6 control points"
     assert "Control points and the known distance disagree on the scale by -50.0 %" in caplog.text
+
+
+# ---------------------------------------------------------------- the case
+@pytest.mark.slow
+def test_photos_on_both_sides_of_the_180th_meridian(cases_dir: Path, tmp_path: Path):
+    """24 photos of the demo, 20 m a unit: upright, with the metres and the place that they were made with."""
+    from stages.pipeline import PIPELINE
+    from stages.reconstruct import reconstruct
+    from stages.request import Request
+
+    request = Request(
+        cases_dir / "20-gps-antimeridian" / "photos", tmp_path / "ws", preset="tiny", sets=["sfm.wanted=0.6"],
+        until="undistort",
+    )  # fmt: skip
+    reconstruct(request, PIPELINE)
+    found = artifacts.WORLD_PLACE.load(tmp_path / "ws" / "place")
+    scene = artifacts.FIRST_SCENE.load(tmp_path / "ws" / "undistort")
+    assert found.scale_from == "GPS"
+    assert found.origin[0] == pytest.approx(-16.8, abs=1e-3)
+    assert abs(found.origin[1]) == pytest.approx(180, abs=1e-3)
+    assert scene.up_in(found) @ scene.up > np.cos(np.radians(10))  # as the ground says
+    heights = found.world_from_poses.apply(scene.poses_from_scene.apply(scene.cameras.centers))[:, 2]
+    assert heights.min() > found.world_from_poses.apply(scene.poses_from_scene.apply(scene.points))[:, 2].min()

@@ -52,7 +52,7 @@ def to_geodetic(xyz: Float[np.ndarray, "n 3"], crs: str, what: str) -> Float[np.
         raise InputError(
             f"{outside.sum()} of {len(xyz)} {what} lie outside the area of {horizontal.name}{name}, e.g. {x:g} {y:g}.",
             "x is east or longitude, y is north or latitude: are they swapped? Or name the coordinate system: "
-            "`--set place.control_epsg=CODE`.",
+            "`--set place.control_epsg=32632`.",
         )
     return found
 
