@@ -173,9 +173,11 @@ def _survey(
     control = read_control(context.sources[CONTROL])
     crs = control.system(context.params.control_epsg)
     found = survey(control, crs, photos, model.cameras, records)
-    used = sum(point.used for point in found.points)
+    used, checks = (sum(getattr(point, what) for point in found.points) for what in ("used", "check"))
+    more = f" and {checks} to check" if checks else ""
     residual = "" if found.fit.residual is None else f", residual {found.fit.residual:.2g} m"
-    log.info("control points: %d of %d used (%s)%s", used, len(found.points), crs or "a frame of their own", residual)
+    total, frame = len(found.points) - checks, crs or "a frame of their own"
+    log.info("control points: %d of %d used%s (%s)%s", used, total, more, frame, residual)
     return found
 
 
@@ -239,7 +241,7 @@ def _in_reach(place: Place, centers: np.ndarray, epsg: int | None) -> Place:
     if place.origin is None:
         raise ConfigError(
             f"`place.epsg` = {epsg} asks for a map's coordinates, but where on Earth the scene lies is not known.",
-            "It takes GPS, or at least 3 control points in a named coordinate system: `--set place.control_epsg=32632`.",
+            "It takes GPS, or 3 control points or more in a named coordinate system: `--set place.control_epsg=32632`.",
         )
     corners = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)])
     enu = middle + max(radius, MIN_GRID_M) * corners

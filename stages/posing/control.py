@@ -24,9 +24,10 @@ MIN_PARALLAX_DEG = 1.0
 MAX_MISS, MIN_MISS_PX = 0.003, 4.0
 # Points within this narrow a strip (part of its length) leave the turn about it open.
 MIN_STRIP = 0.05
-# A point's coordinates are wrong that lie further from where the others put it than this many times the others' median.
-BLUNDER, MIN_FOR_BLUNDERS = 10.0, 5
-TINY_M = 1e-6  # keeps exact coordinates from being blunders; below what anybody measures
+# A point's coordinates are wrong that lie further from where the others put it than this many times the others' median,
+# and than this part of the points' spread: exact ones differ by tens of times, too.
+BLUNDER, MIN_BLUNDER, MIN_FOR_BLUNDERS = 10.0, 0.01, 5
+TINY_M = 1e-6  # below what anybody measures
 
 
 @dataclass(frozen=True)
@@ -114,20 +115,27 @@ def fit_control(found: Float[np.ndarray, "p 3"], known: Float[np.ndarray, "p 3"]
         if min(lengths) <= TINY_M:
             raise ValueError("all points lie at one place")
         return ControlFit(None, lengths[0] / lengths[1], used, np.full(len(found), np.nan), None, None, strip)
-    left_out = _left_out(found, known, used)
+    left_out, spread = _left_out(found, known, used), _spread(known)
     while used.sum() >= MIN_FOR_BLUNDERS:
         worst = int(np.nanargmax(np.where(used, left_out, -1)))
         rest = used & (np.arange(len(used)) != worst)
         without = _left_out(found, known, rest)
-        if not without[worst] > BLUNDER * max(float(np.nanmedian(without[rest])), TINY_M) or _strip(known[rest]):
+        limit = max(BLUNDER * float(np.nanmedian(without[rest])), MIN_BLUNDER * spread)
+        if not without[worst] > limit or _strip(known[rest]):
             break
         used, left_out = rest, without
     similarity = align_points(found[used], known[used])
     misses = np.linalg.norm(similarity.apply(found) - known, axis=1)
     count = int(used.sum())
     residual = float(np.sqrt((misses[used] ** 2).sum() / count * 3 * count / (3 * count - 7)))
-    spread = float(np.sqrt(((known[used] - known[used].mean(0)) ** 2).sum(1).mean()))
-    return ControlFit(similarity, similarity.scale, used, left_out, residual, residual / np.sqrt(3 * count) / spread)
+    return ControlFit(
+        similarity, similarity.scale, used, left_out, residual, residual / np.sqrt(3 * count) / _spread(known[used])
+    )
+
+
+def _spread(points: Float[np.ndarray, "p 3"]) -> float:
+    """Root mean square distance from their middle."""
+    return float(np.sqrt(((points - points.mean(0)) ** 2).sum(1).mean()))
 
 
 def _left_out(

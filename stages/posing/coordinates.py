@@ -13,7 +13,7 @@ import numpy as np
 from stages.errors import ConfigError, InputError, SystemRequirementError
 
 if TYPE_CHECKING:
-    from jaxtyping import Float
+    from jaxtyping import Bool, Float
 
 WGS84 = "EPSG:4326"
 MAX_BEYOND_DEG = 3.0  # maps are used beyond their border, but not this far
@@ -38,19 +38,12 @@ def to_geodetic(xyz: Float[np.ndarray, "n 3"], crs: str, what: str) -> Float[np.
     across = Transformer.from_crs(horizontal, WGS84, always_xy=True)
     longitude, latitude = (np.asarray(each) for each in across.transform(xyz[:, 0], xyz[:, 1]))
     found = np.stack([latitude, longitude, metres * xyz[:, 2]], 1)
-    outside = ~np.isfinite(found).all(1) | (np.abs(latitude) > 90)
-    area = horizontal.area_of_use
-    if area is not None:
-        east = (longitude - area.west) % 360 <= (area.east - area.west) % 360 + MAX_BEYOND_DEG
-        east |= (longitude - area.west) % 360 >= 360 - MAX_BEYOND_DEG
-        east |= area.east - area.west >= 360
-        within = (latitude >= area.south - MAX_BEYOND_DEG) & (latitude <= area.north + MAX_BEYOND_DEG)
-        outside |= ~(east & within)
+    outside = ~np.isfinite(found).all(1) | _beyond(found, horizontal)
     if outside.any():
         x, y, _ = xyz[int(np.argmax(outside))]
-        name = f" ({area.name})" if area is not None else ""
         raise InputError(
-            f"{outside.sum()} of {len(xyz)} {what} lie outside the area of {horizontal.name}{name}, e.g. {x:g} {y:g}.",
+            f"{outside.sum()} of {len(xyz)} {what} lie outside the area of {_described(horizontal)}, "
+            f"e.g. {x:.2f} {y:.2f}.",
             "x is east or longitude, y is north or latitude: are they swapped? Or name the coordinate system: "
             "`--set place.control_epsg=32632`.",
         )
@@ -78,13 +71,30 @@ def to_grid(positions: Float[np.ndarray, "n 3"], crs: str) -> Float[np.ndarray, 
     across = Transformer.from_crs(WGS84, horizontal, always_xy=True)
     east, north = across.transform(positions[:, 1], positions[:, 0])
     grid = np.stack([east, north, positions[:, 2]], 1)
-    if not np.isfinite(grid).all():
+    if not np.isfinite(grid).all() or _beyond(positions, horizontal).any():
         raise ConfigError(
-            f"{crs} ({horizontal.name}) does not reach to latitude {positions[0, 0]:.4f}, longitude "
+            f"{_described(horizontal)} does not reach to latitude {positions[0, 0]:.4f}, longitude "
             f"{positions[0, 1]:.4f}.",
             "Name a system for this place, or leave it out: `--set place.epsg=null`.",
         )
     return grid
+
+
+def _beyond(positions: Float[np.ndarray, "n 3"], horizontal: Any) -> Bool[np.ndarray, " n"]:
+    """Whether latitudes and longitudes lie outside the area that a coordinate system is for, and its margin."""
+    latitude, longitude, _ = positions.T
+    area = horizontal.area_of_use
+    if area is None:
+        return np.abs(latitude) > 90
+    east = (longitude - area.west + MAX_BEYOND_DEG) % 360  # of the western border; areas may cross the 180th meridian
+    width = 360 if area.east - area.west >= 360 else (area.east - area.west) % 360 + 2 * MAX_BEYOND_DEG
+    within = (latitude >= area.south - MAX_BEYOND_DEG) & (latitude <= area.north + MAX_BEYOND_DEG) & (east <= width)
+    return ~within | (np.abs(latitude) > 90)
+
+
+def _described(horizontal: Any) -> str:
+    area = horizontal.area_of_use
+    return str(horizontal.name) if area is None else f"{horizontal.name} ({area.name[:80].rstrip('. ')})"
 
 
 def import_pyproj() -> None:
@@ -112,7 +122,7 @@ def _horizontal(crs: str) -> tuple[Any, float]:
     except CRSError as error:
         raise ConfigError(
             f"There is no coordinate system {crs[:60]}.",
-            "Look it up at https://epsg.io: `--set place.control_epsg=32632`.",
+            "Look its code up at https://epsg.io; UTM zone 32 north is 32632.",
         ) from error
     horizontal, *rest = named.sub_crs_list if named.is_compound else [named]
     if not (horizontal.is_projected or horizontal.is_geographic):
