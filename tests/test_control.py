@@ -84,6 +84,7 @@ SAME = {
     "names of Metashape": TABLE.replace("name,x,y,z,photo,px,py", "#Label,X/Easting,Y/Northing,Z/Altitude,Image,u,v"),
     "units": TABLE.replace("name,x,y,z,photo,px,py", 'Point ID,"X [m]",Y (m),Z [m],Image Name,px,py'),
     "OpenDroneMap": "1 2 3 10 20 a.jpg A\n1 2 3 11.5 21 b.jpg A\n4\t5\t6\t30\t40\ta.jpg\tcheck1\n",
+    "x and y are pixels": TABLE.replace("name,x,y,z,photo,px,py", "Marker,East,North,Up,Picture,x,y"),
     "coordinates once": TABLE.replace("A,1,2,3,b", "A,,,,b"),
     "comments": "# taken by hand\n" + TABLE,
     "Windows": TABLE.replace("\n", "\r\n\r\n"),
@@ -114,6 +115,7 @@ def test_utf_16_and_latin_names(tmp_path: Path):
     [
         ("name,x,y,z,role\nA,1,2,3,control\nB,4,5,6,check\n", "name,photo,px,py\nA,a.jpg,10,20\nB,b.jpg,1,2\n"),
         ("A,1,2,3\ncheckB,4,5,6\n", "a.jpg,A,10,20\nb.jpg,checkB,1,2\n"),
+        ("A 1 2 3\ncheckB 4 5 6\n", "#image,name,x,y\na.jpg,A,10,20\nb.jpg,checkB,1,2\n"),
     ],
 )
 def test_a_table_of_points_and_one_of_marks(parts: tuple[str, str], tmp_path: Path):
@@ -276,6 +278,17 @@ def test_too_few_points_are_counted():
     with pytest.raises(InputError, match=r"1 points could be placed, 2 are needed.*P1: marked in 1 photo") as caught:
         surveyed(replace(given, sightings=few))
     assert "--no-control" in caught.value.hint
+
+
+@pytest.mark.parametrize("kind", ["mixed up", "degrees"])
+def test_coordinates_that_do_not_fit_are_doubted(kind: str):
+    given = control(points=POINTS[:4] * (1, 1, 0))
+    xyz = [given.points[i].xyz for i in (1, 2, 0, 3)]
+    if kind == "degrees":
+        xyz = [(8.5 + (x - UTM[0]) / 75e3, 47.3 + (y - UTM[1]) / 111e3, z) for x, y, z in (p.xyz for p in given.points)]
+    mixed = tuple(replace(point, xyz=at) for point, at in zip(given.points, xyz, strict=True))
+    found = surveyed(replace(given, points=mixed))
+    assert any("do not lie to each other as their coordinates say" in warning for warning in found.warnings)
 
 
 def test_names_of_photos():

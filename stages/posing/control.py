@@ -27,6 +27,7 @@ MIN_STRIP = 0.05
 # A point's coordinates are wrong that lie further from where the others put it than this many times the others' median,
 # and than this part of the points' spread: exact ones differ by tens of times, too.
 BLUNDER, MIN_BLUNDER, MIN_FOR_BLUNDERS = 10.0, 0.01, 5
+MAX_MISFIT = 0.05  # residual of a fit, part of the points' spread: beyond it they are mixed up
 TINY_M = 1e-6  # below what anybody measures
 
 
@@ -97,6 +98,11 @@ class ControlFit:
     residual: float | None
     scale_error: float | None
     open: str = ""
+
+    @property
+    def fits(self) -> bool:
+        """Whether the points used lie to each other as their coordinates do, within what a careful measurer errs."""
+        return self.scale_error is None or self.scale_error * np.sqrt(3 * self.used.sum()) < MAX_MISFIT
 
 
 def fit_control(found: Float[np.ndarray, "p 3"], known: Float[np.ndarray, "p 3"]) -> ControlFit:

@@ -155,7 +155,7 @@ def _table(lines: Sequence[tuple[int, str]], file: Path) -> tuple[str, list[_Row
             plain = [re.sub(r"[\[(].*?[\])]|[^a-z]", "", cell.lower()) for cell in cells]
             known = [KNOWN.get(cell) for cell in plain]
             if len({column for column in known if column}) >= 3:
-                header, degrees = known, any(cell in DEGREES for cell in plain)
+                header, degrees = _pixels_apart(plain, known), any(cell in DEGREES for cell in plain)
                 continue
         if text is not line or text.lower() == "local":
             continue  # a comment
@@ -165,6 +165,13 @@ def _table(lines: Sequence[tuple[int, str]], file: Path) -> tuple[str, list[_Row
             raise InputError(f"{where} has {len(cells)} columns, the line of names has {len(columns)}.", FORM)
         rows.append(_Row({column: cell for column, cell in zip(columns, cells, strict=False) if column}, where))
     return crs, rows, degrees
+
+
+def _pixels_apart(names: Sequence[str], columns: Sequence[str | None]) -> list[str | None]:
+    """The columns where "x" and "y" are pixels: beside photos, with easting and northing or without any height."""
+    if "photo" not in columns or "px" in columns or (columns.count("x") < 2 and "z" in columns):
+        return list(columns)
+    return [{"x": "px", "y": "py"}.get(name, column) for name, column in zip(names, columns, strict=True)]
 
 
 def _cells(line: str) -> list[str]:

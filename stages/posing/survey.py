@@ -268,6 +268,11 @@ def _warnings(
                 f"Control point {point.name} lies {point.left_out_m:.2g} m from where the others put it and is not "
                 "used: look at its coordinates, and whether the photos show that point."
             )
+    if not fit.fits:
+        sentences.append(
+            "The control points do not lie to each other as their coordinates say: they miss them by "
+            f"{fit.residual:.2g} m. Are names mixed up, or the coordinates degrees (`--set place.control_epsg=4326`)?"
+        )
     if fit.open:
         sentences.append(f"The control points only tell the scale: {fit.open}.")
     return sentences
