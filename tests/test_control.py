@@ -282,7 +282,7 @@ def test_too_few_points_are_counted():
 
 @pytest.mark.parametrize("kind", ["mixed up", "degrees"])
 def test_coordinates_that_do_not_fit_are_doubted(kind: str):
-    given = control(points=POINTS[:4] * (1, 1, 0))
+    given = control(points=POINTS[:4] * (1, 1, kind != "degrees"))
     xyz = [given.points[i].xyz for i in (1, 2, 0, 3)]
     if kind == "degrees":
         xyz = [(8.5 + (x - UTM[0]) / 75e3, 47.3 + (y - UTM[1]) / 111e3, z) for x, y, z in (p.xyz for p in given.points)]
