@@ -40,6 +40,7 @@ MAX_GPS_TILT_DEG = 2.0  # GPS is believed where it knows up to this
 # Up as the photos tell it may lie this far from the true one: slopes, cameras held askew. And what stands on its head.
 MAX_UP_DEG, UPSIDE_DOWN_DEG = 25.0, 120.0
 MAX_GPS_SHIFT_M = 100.0  # GPS without a fix of its own may be off by this
+SIGNS = "look at EXIF's GPSLongitudeRef, GPSLatitudeRef and GPSAltitudeRef"
 MIN_GRID_M = 10.0  # a map's grid is compared with metres over no less than this
 
 
@@ -108,10 +109,19 @@ def _locate(cameras: PinholeCameras, gps: Mapping[int, tuple[float, float, float
     try:
         located = locate(cameras.centers[list(gps)], np.array(list(gps.values())))
     except ValueError as error:
-        log.warning("GPS is not used: %s", error)
+        log.warning("GPS is not used: %s%s", error, _mirrored(cameras, gps))
         return None
     log.info("GPS: %d of %d positions used, residual %.2g m", located.used, len(gps), located.residual)
     return located
+
+
+def _mirrored(cameras: PinholeCameras, gps: Mapping[int, tuple[float, float, float]]) -> str:
+    """The end of a sentence, where the positions would fit in a mirrored world."""
+    try:
+        locate(cameras.centers[list(gps)], np.array(list(gps.values())) * (1, -1, 1))
+    except ValueError:
+        return ""
+    return f". They fit with one of their signs changed: {SIGNS}"
 
 
 def _up_of_photos(cameras: PinholeCameras, model: Any, photos: list[Any]) -> Up:
@@ -145,8 +155,7 @@ def _by_gps(located: Located, seen: Up) -> tuple[Place, list[str]]:
             gps_residual=located.residual,
         )
         return place, [
-            f"{doubts[0]}: only the scale is taken from it. Positions east and west, or north and south, may be "
-            "interchanged (EXIF's GPSLongitudeRef, GPSLatitudeRef)."
+            f"{doubts[0]}: only the scale is taken from it. One of the positions' signs may be wrong: {SIGNS}."
         ]
     place = Place(
         world_from_poses=located.world_from_poses,

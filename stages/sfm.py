@@ -330,7 +330,7 @@ def _too_few(
 
 SFM: Stage[SfmParams] = Stage(
     name="sfm",
-    version=6,
+    version=7,
     settings=lambda config: config.sfm,
     run=run,
     reads=(PHOTOS, IMAGE_SET),

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from dotted_capture import DOTS, MODELS, cam_from_world, write_capture
+from rigs import three_rings
 
 from configs.params import PlaceParams
 from stages import artifacts
@@ -19,7 +20,7 @@ from stages.errors import ConfigError
 from stages.files.georeference import georeference, metadata_xml
 from stages.geometry.earth import earth_centred, from_east_north_up
 from stages.geometry.place import Place
-from stages.place import PLACE
+from stages.place import PLACE, _locate
 from stages.posing.control_files import CONTROL
 from stages.reporting.control import describe_control
 
@@ -107,6 +108,15 @@ def test_east_and_west_interchanged_do_not_turn_the_scene_over(inputs, tmp_path:
     assert "up_from" not in numbers
 
 
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_dome_of_photos_in_a_mirrored_world_is_refused_with_the_tags_to_look_at(axis: int, caplog):
+    cameras, sides = three_rings(), [1.0, 1.0, 1.0]
+    sides[axis] = -1
+    positions = from_east_north_up(GROWTH * 10 * cameras.centers * sides, (47.0, 8.0, 400.0)).tolist()
+    assert _locate(cameras, dict(enumerate(positions))) is None
+    assert "They fit with one of their signs changed: look at EXIF's GPSLongitudeRef" in caplog.text
+
+
 def test_where_up_is_only_askew_it_is_said_and_gps_believed(inputs, tmp_path: Path):
     angle = np.radians(40)
     tilt = np.array([[1, 0, 0], [0, np.cos(angle), -np.sin(angle)], [0, np.sin(angle), np.cos(angle)]])
@@ -129,7 +139,7 @@ def test_control_points_in_a_frame_of_their_own(inputs, tmp_path: Path):
     assert np.abs(world).max() < 100  # 32 bits hold it
     assert [point.check for point in found.control] == [False] * 5 + [True]
     shown = describe_control(found)
-    assert "5 of 6 control points were used" in shown["sentence"]
+    assert "5 of 5 control points were used" in shown["sentence"]
     assert "1 only check it" in shown["sentence"]
     assert shown["points"][0]["marks"] == "8 of 8"
     assert metadata_xml(found) is None

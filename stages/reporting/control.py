@@ -13,8 +13,8 @@ def describe_control(place: Place) -> dict[str, Any] | None:
     """A sentence and a row for each point, the worst first; None where there are none."""
     if not place.control:
         return None
-    used = [point for point in place.control if point.used]
-    sentence = f"{len(used)} of {len(place.control)} control points were used"
+    used = sum(point.used for point in place.control)
+    sentence = f"{used} of {sum(not point.check for point in place.control)} control points were used"
     if place.control_residual is not None:
         sentence += f", residual {_length(place.control_residual)}"
     checks = [np.array(point.miss) for point in place.control if point.check and point.miss is not None]
