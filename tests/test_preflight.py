@@ -256,6 +256,11 @@ def test_positions_that_cannot_be_are_named(photos: Path):
     assert warned(photos, "--set", "place.gps=false") == ""
 
 
+def test_altitudes_of_0_among_others_are_named(photos: Path):
+    located(photos, {i: (47 + i / 1e5, 8.0, 0.0 if i in (3, 8) else 400.0) for i in range(24)})
+    assert "GPS has 03.jpg, 08.jpg at an altitude of 0, the other photos at about 400 m" in warned(photos)
+
+
 def test_photos_of_one_position_tell_no_scale(photos: Path):
     located(photos, {i: (47.0, 8.0, 400.0) for i in range(24)})
     assert "All 24 photos carry the same GPS position" in warned(photos)

@@ -14,6 +14,7 @@ from stages.geometry.earth import earth_centred, middle_position
 # A position further from the middle of all is of another place: metres, and times the median distance.
 FAR_M, FAR_TIMES = 20e3, 20.0
 SAME_M = 0.01  # positions as near as this are one
+ON_THE_SHORE_M = 30.0  # lower photos may well be at 0, which programs write for an altitude that they do not know
 MIN_SAME = 4  # fewer photos may well have been taken from one place
 
 
@@ -32,6 +33,12 @@ def gps_warnings(found: Mapping[str, Gps]) -> list[str]:
     away = np.linalg.norm(earth_centred(positions) - middle, axis=1)
     if away.max() < SAME_M:
         sentences.append(f"All {len(names)} photos carry the same GPS position, which tells neither scale nor place.")
+    level = float(np.median(positions[:, 2]))
+    if abs(level) > ON_THE_SHORE_M and (at_zero := [names[i] for i in np.flatnonzero(positions[:, 2] == 0)]):
+        sentences.append(
+            f"GPS has {name_some(at_zero)} at an altitude of 0, the other photos at about {level:.0f} m: where these "
+            "agree, such positions do not count."
+        )
     far = np.flatnonzero(away > max(FAR_M, FAR_TIMES * float(np.median(away))))
     if far.size:
         sentences.append(

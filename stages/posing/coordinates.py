@@ -6,6 +6,7 @@ of a capture alike, and its models need not be installed.
 
 from __future__ import annotations
 
+from textwrap import shorten
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -94,7 +95,7 @@ def _beyond(positions: Float[np.ndarray, "n 3"], horizontal: Any) -> Bool[np.nda
 
 def _described(horizontal: Any) -> str:
     area = horizontal.area_of_use
-    return str(horizontal.name) if area is None else f"{horizontal.name} ({area.name[:80].rstrip('. ')})"
+    return str(horizontal.name) if area is None else f"{horizontal.name} ({shorten(area.name, 80, placeholder=' ...')})"
 
 
 def import_pyproj() -> None:
