@@ -15,7 +15,7 @@ from stages.capture.inspection import Inspection, inspect
 from stages.capture.listing import NAMED, by_reason, name_some
 from stages.capture.salient import INSTALL, find_weights
 from stages.posing.control_files import read_control
-from stages.posing.survey import foresee
+from stages.posing.marks import foresee
 
 Verdict = Literal["go", "go with warnings", "no-go"]
 

@@ -18,6 +18,7 @@ from stages.geometry.similarity import Similarity
 from stages.posing.control import fit_control, place_point
 from stages.posing.control_files import GroundControl, KnownPoint, Sighting, coordinate_system, read_control
 from stages.posing.coordinates import to_geodetic, to_grid
+from stages.posing.marks import match_sightings
 from stages.posing.survey import survey
 
 UTM = np.array([465123.25, 5247811.5, 410.0])  # EPSG:32632, in Zurich
@@ -275,7 +276,7 @@ def test_marks_that_miss_and_points_that_are_not_placed_are_named():
 def test_too_few_points_are_counted():
     given = control(points=POINTS[:3])
     few = tuple(each for each in given.sightings if each.point == "P0" or each.photo == "000.jpg")
-    with pytest.raises(InputError, match=r"1 points could be placed, 2 are needed.*P1: marked in 1 photo") as caught:
+    with pytest.raises(InputError, match=r"1 points could be placed, 2 are needed.*P1 .marked in 1 photo") as caught:
         surveyed(replace(given, sightings=few))
     assert "--no-control" in caught.value.hint
 
@@ -302,6 +303,21 @@ def test_names_of_photos():
     assert surveyed(replace(given, sightings=some)).warnings == (
         "1 of 9 photos with control points are not there, e.g. gone.jpg.",
     )
+
+
+def test_which_photo_a_name_means():
+    sizes = {"a/IMG_1.JPG": (100, 100), "b/IMG_1.JPG": (100, 100), "c/x.jpg": (100, 100), "c/X.jpg": (100, 100)}
+    one = GroundControl(Path("g"), (KnownPoint("A", (0, 0, 0), False),), (Sighting("A", "", (1, 1)),))
+
+    def meant(name: str) -> str:
+        found, _ = match_sightings(replace(one, sightings=(Sighting("A", name, (1, 1)),)), sizes)
+        return found[0][1]
+
+    assert meant("D:/flight/b/img_1.jpg") == "b/IMG_1.JPG"
+    assert meant("c/x.jpg") == "c/x.jpg"
+    for name in ("IMG_1.JPG", "x.png"):
+        with pytest.raises(InputError, match="fits 2 photos"):
+            meant(name)
 
 
 def test_a_mark_outside_its_photo_is_refused():

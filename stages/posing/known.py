@@ -85,10 +85,10 @@ def match_photos(poses: KnownPoses, photos: Iterable[str]) -> dict[str, KnownCam
     photos = list(photos)
     by_stem: dict[str, list[str]] = {}
     for photo in photos:
-        by_stem.setdefault(_parts(photo)[-1], []).append(photo)
+        by_stem.setdefault(stem(photo), []).append(photo)
     cameras_of: dict[str, list[tuple[tuple[int, bool], KnownCamera]]] = {}
     for camera in poses.cameras:
-        best, fitting = best_fits(camera.name, by_stem.get(_parts(camera.name)[-1], []))
+        best, fitting = best_fits(camera.name, by_stem.get(stem(camera.name), []))
         if not fitting:
             continue
         if len(fitting) > 1:
@@ -120,6 +120,11 @@ def best_fits(name: str, photos: Iterable[str]) -> tuple[tuple[int, bool], list[
     scored = [(_likeness(name, photo), photo) for photo in photos]
     best = max((score for score, _ in scored), default=(0, False))
     return best, [photo for score, photo in scored if score == best and score[0] > 0]
+
+
+def stem(name: str) -> str:
+    """The last part of a posix path, suffix aside; "frame.0001" has none."""
+    return _parts(name)[-1]
 
 
 def _parts(name: str) -> tuple[str, ...]:
