@@ -87,6 +87,15 @@ Poses = Annotated[
 ]
 NoPoses = Annotated[bool, typer.Option("--no-poses", help="Forget the poses of the last run and find them.")]
 NoMasks = Annotated[bool, typer.Option("--no-masks", help="Forget the masks of the last run.")]
+Control = Annotated[
+    Path | None,
+    typer.Option(
+        help="Ground control: a CSV of name, x, y, z, photo, px, py, OpenDroneMap's gcp_list.txt, or a folder "
+        "of two tables, of points and of marks.",
+        show_default=False,
+    ),
+]
+NoControl = Annotated[bool, typer.Option("--no-control", help="Forget the ground control points of the last run.")]
 Preset = Annotated[
     str | None,
     typer.Option(help="See `hineus presets`; default: gpu with a CUDA device, else cpu.", show_default=False),
@@ -161,6 +170,8 @@ def of_a_run(
     no_masks: NoMasks = False,
     poses: Poses = None,
     no_poses: NoPoses = False,
+    control: Control = None,
+    no_control: NoControl = False,
     preset: Preset = None,
     config: ConfigFile = None,
     sets: Sets = None,
@@ -181,6 +192,8 @@ def of_a_run(
         no_masks=no_masks,
         poses=poses,
         no_poses=no_poses,
+        control=control,
+        no_control=no_control,
         preset=preset,
         config=config,
         sets=settings(sets, time, hold_out, no_ground, watertight, deterministic),

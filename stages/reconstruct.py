@@ -23,6 +23,7 @@ from stages.engine.stage import Stage
 from stages.engine.workspace import Workspace
 from stages.errors import ConfigError, InputError, SystemRequirementError, WorkspaceError
 from stages.kept import what_is_kept
+from stages.posing.control_files import CONTROL
 from stages.posing.reading import locate_poses, masks_beside
 from stages.preflight import Preflight, in_short, preflight
 from stages.request import Request
@@ -83,7 +84,9 @@ def reconstruct(request: Request, pipeline: Sequence[Stage], listener: Listener 
         _tell_sources(request, workspace, sources)
         photos = sources["photos"]
         if photos is not None and not workspace.stage_folder("ingest").exists():
-            _tell_preflight(preflight(photos, sources["masks"], workspace.root, config, device, workers, decode=False))
+            control = sources[CONTROL]
+            done = preflight(photos, sources["masks"], workspace.root, config, device, workers, False, control)
+            _tell_preflight(done)
         elif photos is not None and photos.exists():
             digests = SourceDigests({"photos": photos}, workspace.digest_cache)
             if kept := what_is_kept(workspace, config, digests.files("photos") or {}, _forced(request, pipeline)):
@@ -117,7 +120,7 @@ def check_photos(request: Request) -> Preflight:
     config = load_config(request.preset or default_preset(), request.config, request.sets)
     workers, folder = request.workers or available_cores(), choose_folder(request)
     device = choose_device(request.device)
-    done = preflight(photos, request.masks, folder, config, device, workers, decode=True)
+    done = preflight(photos, request.masks, folder, config, device, workers, True, request.control)
     done = replace(done, refusals=(*done.refusals, *_workspace_refusals(request)))
     if not (folder / "workspace.json").exists():
         return done
@@ -200,12 +203,12 @@ def choose_photos(request: Request, workspace: Workspace) -> Path:
 
 
 def choose_sources(request: Request, workspace: Workspace, digests: SourceDigests) -> dict[str, Path | None]:
-    """Photos (those of `digests`), masks and poses: those given, else those the workspace was last run with.
+    """Photos (those of `digests`), masks, poses and control points: those given, else those of the last run.
 
     Masks that the poses' format comes with are used, too.
 
     Raises:
-        InputError: the masks or poses that are given are not there.
+        InputError: the masks, poses or control points that are given are not there.
         WorkspaceError: the workspace was made of other photos.
     """
     photos = digests.sources["photos"]
@@ -217,17 +220,21 @@ def choose_sources(request: Request, workspace: Workspace, digests: SourceDigest
             f"{request.masks} is a file; a folder of masks is needed.",
             f"Name the folder it is in: {request.masks.absolute().parent}",
         )
+    if request.control is not None and not request.control.exists():
+        raise InputError(f"There are no control points at {request.control}.", "Check the path with `ls`.")
     since = _photos_since(workspace, digests)
     if not request.other_photos:
         refuse_other_photos(workspace, photos, since)
     masks = request.masks.resolve() if request.masks else None
     poses = locate_poses(request.poses).resolve() if request.poses else None
+    control = request.control.resolve() if request.control else None
     if str(photos) == workspace.record.sources.get("photos") or since.kind not in ("new", "other"):
         masks = masks or (None if request.no_masks else find_source(workspace, "masks", photos))
         poses = poses or (None if request.no_poses else find_source(workspace, "poses", photos))
+        control = control or (None if request.no_control else find_source(workspace, CONTROL, photos))
     if masks is None and request.poses and poses is not None and not request.no_masks:
         masks = masks_beside(poses)
-    return {"photos": photos, "masks": masks, "poses": poses}
+    return {"photos": photos, "masks": masks, "poses": poses, CONTROL: control}
 
 
 def _photos_since(workspace: Workspace, digests: SourceDigests) -> PhotosSince:
@@ -245,8 +252,8 @@ def _tell_sources(request: Request, workspace: Workspace, sources: Mapping[str, 
     """Where the workspace is that was not named, and what has become of the last run's photos, masks and poses."""
     if request.workspace is None and request.photos is not None and (why := default_workspace(request.photos).why):
         log.info("workspace: %s (%s)", workspace.root, why)
-    given = {"photos": request.photos, "masks": request.masks, "poses": request.poses}
-    forgotten = {"masks": request.no_masks, "poses": request.no_poses}
+    given = {"photos": request.photos, "masks": request.masks, "poses": request.poses, CONTROL: request.control}
+    forgotten = {"masks": request.no_masks, "poses": request.no_poses, CONTROL: request.no_control}
     for name, before in workspace.record.sources.items():
         now = sources.get(name)
         if before is None or forgotten.get(name) or (given.get(name) and name != "photos"):

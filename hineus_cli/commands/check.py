@@ -9,6 +9,7 @@ import typer
 
 from hineus_cli.options import (
     ConfigFile,
+    Control,
     Device,
     Json,
     Masks,
@@ -29,6 +30,7 @@ def check(
     photos: Annotated[Path, typer.Argument(help="Folder of photos, or a video.", show_default=False)],
     workspace: WorkspaceOption = None,
     masks: Masks = None,
+    control: Control = None,
     preset: Preset = None,
     config: ConfigFile = None,
     sets: Sets = None,
@@ -44,6 +46,7 @@ def check(
         photos=photos,
         workspace=workspace,
         masks=masks,
+        control=control,
         preset=preset,
         config=config,
         sets=settings(sets, time),
