@@ -12,6 +12,7 @@ from configs.params import Config
 from stages.capture.inspection import Inspection, inspect
 from stages.capture.listing import NAMED, by_reason, name_some
 from stages.capture.salient import INSTALL, find_weights
+from stages.limits import available_memory
 
 Verdict = Literal["go", "go with warnings", "no-go"]
 
@@ -101,13 +102,11 @@ def preflight(
     Raises:
         InputError: there is no such folder or video.
     """
-    import psutil
-
     seen = inspect(source, masks, config.ingest.video_frames, workers, decode)
     needs = estimate(seen, config, device, workers)
     while not folder.exists():
         folder = folder.parent
-    memory, disk = psutil.virtual_memory().available / GIB, shutil.disk_usage(folder).free / 1e9
+    memory, disk = available_memory() / GIB, shutil.disk_usage(folder).free / 1e9
     refusals, shortages = [], []
     if len(seen.sizes) < config.ingest.min_images:
         refusals.append(f"{len(seen.sizes)} usable photos, {config.ingest.min_images} are needed.")

@@ -13,12 +13,14 @@ from typing import Any
 from configs.load import load_config
 from configs.params import Config
 from stages import artifacts
+from stages.caches import temporary_files
 from stages.capture.listing import is_video
 from stages.engine.run_log import log_to_file
 from stages.engine.runner import Listener, StageOutcome, run_pipeline
 from stages.engine.stage import Stage
 from stages.engine.workspace import Workspace
 from stages.errors import ConfigError, InputError, SystemRequirementError
+from stages.limits import available_cores
 from stages.posing.reading import locate_poses, masks_beside
 from stages.preflight import Preflight, in_short, preflight
 from stages.request import Request
@@ -64,15 +66,15 @@ def reconstruct(request: Request, pipeline: Sequence[Stage], listener: Listener 
     Raises:
         HineusError: a child by what the user can do.
     """
-    if request.workers is not None:
-        # Read when the heavy libraries load, which is inside the stages.
-        os.environ["OMP_NUM_THREADS"] = str(request.workers)
+    workers = request.workers or available_cores()
+    # Read when the heavy libraries load, which is inside the stages. They know nothing of a container's quota.
+    if request.workers is not None or workers < (os.cpu_count() or 1):
+        os.environ["OMP_NUM_THREADS"] = str(workers)
     workspace = Workspace.open(choose_folder(request), create=True)
     sources = choose_sources(request, workspace)
     preset, config = choose_config(request, workspace)
     device = choose_device(request.device)
-    workers = request.workers or available_cores()
-    with workspace.lock(), log_to_file(workspace.log_path):
+    with workspace.lock(), log_to_file(workspace.log_path), temporary_files(workspace.root):
         photos = sources["photos"]
         if photos is not None and not workspace.stage_folder("ingest").exists():
             _tell_preflight(preflight(photos, sources["masks"], workspace.root, config, device, workers, decode=False))
@@ -229,13 +231,6 @@ def has_cuda() -> bool:
     import torch
 
     return bool(torch.cuda.is_available())
-
-
-def available_cores() -> int:
-    """CPU cores this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def _existing(path: Path) -> Path | None:
