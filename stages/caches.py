@@ -109,6 +109,7 @@ def temporary_files(work: Path) -> Iterator[None]:
 
     `TMPDIR` says so to libraries and other processes.
     """
+    work.mkdir(parents=True, exist_ok=True)
     usual = system_temporary()
     if usual is not None and shutil.disk_usage(usual).free >= min(ENOUGH_TEMPORARY, shutil.disk_usage(work).free):
         yield

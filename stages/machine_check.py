@@ -124,7 +124,8 @@ def _optional(module: str, distribution: str, without: str) -> Finding:
 def _system_libraries(broken: bool) -> Finding:
     missing = missing_libraries()
     if not missing:
-        return Finding("system libraries", "ok", f"all {len(SYSTEM_LIBRARIES)} found")
+        found = f"all {len(SYSTEM_LIBRARIES)} found" if sys.platform == "linux" else "the packages bring theirs"
+        return Finding("system libraries", "ok", found)
     state: State = "missing" if broken else "note"
     return Finding("system libraries", state, f"not found: {', '.join(missing)}", apt_line(missing))
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import logging
 import os
+import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -74,7 +75,7 @@ def reconstruct(request: Request, pipeline: Sequence[Stage], listener: Listener 
     sources = choose_sources(request, workspace)
     preset, config = choose_config(request, workspace)
     device = choose_device(request.device)
-    with workspace.lock(), log_to_file(workspace.log_path), temporary_files(workspace.root):
+    with workspace.lock(), log_to_file(workspace.log_path), temporary_files(workspace.root / ".work"):
         photos = sources["photos"]
         if photos is not None and not workspace.stage_folder("ingest").exists():
             _tell_preflight(preflight(photos, sources["masks"], workspace.root, config, device, workers, decode=False))
@@ -225,7 +226,7 @@ def default_preset() -> str:
 def has_cuda() -> bool:
     """Whether PyTorch can use a CUDA device; quick where there is no driver."""
     try:
-        ctypes.CDLL("libcuda.so.1")
+        ctypes.CDLL("nvcuda" if sys.platform == "win32" else "libcuda.so.1")
     except OSError:
         return False
     import torch
