@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Literal
 
 from stages.caches import cache_folder, compiler_folder, system_temporary, why_unusable
+from stages.capture.salient import INSTALL, PACKAGE
 from stages.engine.system import SYSTEM_LIBRARIES, apt_line, installed_version, missing_libraries
 from stages.limits import available_cores, available_memory, total_memory
 
@@ -118,7 +119,8 @@ def _optional(module: str, distribution: str, without: str) -> Finding:
     version = installed_version(distribution)
     if version is not None:
         return Finding(module, "ok", version)
-    return Finding(module, "note", f"not installed: {without}", f"pip install {distribution}")
+    advice = INSTALL if module == PACKAGE and sys.version_info >= (3, 13) else f"pip install {distribution}"
+    return Finding(module, "note", f"not installed: {without}", advice)
 
 
 def _system_libraries(broken: bool) -> Finding:
