@@ -11,6 +11,7 @@ from typing import Annotated, Any
 
 import typer
 
+from hineus_cli.completing import devices, preset_names, setting_keys, stage_names
 from stages.errors import ConfigError
 from stages.request import HOLD_OUT, Request
 
@@ -98,17 +99,28 @@ Control = Annotated[
 NoControl = Annotated[bool, typer.Option("--no-control", help="Forget the ground control points of the last run.")]
 Preset = Annotated[
     str | None,
-    typer.Option(help="See `hineus presets`; default: gpu with a CUDA device, else cpu.", show_default=False),
+    typer.Option(
+        help="See `hineus presets`; default: gpu with a CUDA device, else cpu.",
+        show_default=False,
+        autocompletion=preset_names,
+    ),
 ]
 ConfigFile = Annotated[
     Path | None, typer.Option("--config", help="YAML file of settings, over the preset.", show_default=False)
 ]
 Sets = Annotated[
     list[str] | None,
-    typer.Option("--set", help="One setting, over all else: section.key=value. Repeatable.", show_default=False),
+    typer.Option(
+        "--set",
+        help="One setting, over all else: section.key=value. Repeatable.",
+        show_default=False,
+        autocompletion=setting_keys,
+    ),
 ]
-Until = Annotated[str | None, typer.Option(help="Stop after this stage.", show_default=False)]
-Device = Annotated[str, typer.Option(help="auto, cpu or cuda.")]
+Until = Annotated[
+    str | None, typer.Option(help="Stop after this stage.", show_default=False, autocompletion=stage_names)
+]
+Device = Annotated[str, typer.Option(help="auto, cpu or cuda.", autocompletion=devices)]
 Workers = Annotated[int | None, typer.Option(min=1, help="CPU threads; default: all.", show_default=False)]
 Time = Annotated[
     float | None,

@@ -14,6 +14,7 @@ from stages.capture.gps import gps_warnings
 from stages.capture.inspection import Inspection, inspect
 from stages.capture.listing import NAMED, by_reason, name_some
 from stages.capture.salient import INSTALL, find_weights
+from stages.limits import available_memory
 from stages.posing.control_files import read_control
 from stages.posing.marks import foresee
 
@@ -119,13 +120,11 @@ def preflight(
         InputError: there is no such folder or video, or the control points cannot be used.
         ConfigError, SystemRequirementError: their coordinates cannot be converted.
     """
-    import psutil
-
     seen = inspect(source, masks, config.ingest.video_frames, workers, decode)
     needs = estimate(seen, config, device, workers)
     while not folder.exists():
         folder = folder.parent
-    memory, disk = psutil.virtual_memory().available / GIB, shutil.disk_usage(folder).free / 1e9
+    memory, disk = available_memory() / GIB, shutil.disk_usage(folder).free / 1e9
     refusals, shortages = [], []
     if len(seen.sizes) < config.ingest.min_images:
         refusals.append(f"{len(seen.sizes)} usable photos, {config.ingest.min_images} are needed.")

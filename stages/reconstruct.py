@@ -6,6 +6,7 @@ import ctypes
 import logging
 import os
 import shlex
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -14,6 +15,7 @@ from typing import Any
 from configs.load import load_config
 from configs.params import Config
 from stages import artifacts
+from stages.caches import temporary_files
 from stages.capture.listing import is_video
 from stages.engine.fingerprint import SourceDigests
 from stages.engine.photos_since import READS_PHOTOS, PhotosSince, photos_since
@@ -23,6 +25,7 @@ from stages.engine.stage import Stage
 from stages.engine.workspace import Workspace
 from stages.errors import ConfigError, InputError, SystemRequirementError, WorkspaceError
 from stages.kept import what_is_kept
+from stages.limits import available_cores
 from stages.posing.control_files import CONTROL
 from stages.posing.reading import locate_poses, masks_beside
 from stages.preflight import Preflight, in_short, preflight
@@ -70,16 +73,16 @@ def reconstruct(request: Request, pipeline: Sequence[Stage], listener: Listener 
     Raises:
         HineusError: a child by what the user can do.
     """
-    if request.workers is not None:
-        # Read when the heavy libraries load, which is inside the stages.
-        os.environ["OMP_NUM_THREADS"] = str(request.workers)
+    workers = request.workers or available_cores()
+    # Read when the heavy libraries load, which is inside the stages. They know nothing of a container's quota.
+    if request.workers is not None or workers < (os.cpu_count() or 1):
+        os.environ["OMP_NUM_THREADS"] = str(workers)
     workspace = Workspace.open(choose_folder(request), create=True)
     digests = SourceDigests({"photos": choose_photos(request, workspace)}, workspace.digest_cache)
     sources = choose_sources(request, workspace, digests)
     preset, config = choose_config(request, workspace)
     device = choose_device(request.device)
-    workers = request.workers or available_cores()
-    with workspace.lock(), log_to_file(workspace.log_path):
+    with workspace.lock(), log_to_file(workspace.log_path), temporary_files(workspace.root / ".work"):
         digests.save()
         _tell_sources(request, workspace, sources)
         photos = sources["photos"]
@@ -328,19 +331,12 @@ def default_preset() -> str:
 def has_cuda() -> bool:
     """Whether PyTorch can use a CUDA device; quick where there is no driver."""
     try:
-        ctypes.CDLL("libcuda.so.1")
+        ctypes.CDLL("nvcuda" if sys.platform == "win32" else "libcuda.so.1")
     except OSError:
         return False
     import torch
 
     return bool(torch.cuda.is_available())
-
-
-def available_cores() -> int:
-    """CPU cores this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def _existing(path: Path) -> Path | None:

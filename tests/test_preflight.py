@@ -9,7 +9,6 @@ from types import SimpleNamespace
 
 import cv2
 import numpy as np
-import psutil
 import pytest
 from PIL import Image, ImageFile, ImageFilter
 from typer.testing import CliRunner, Result
@@ -49,7 +48,7 @@ def photos(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def room(monkeypatch: pytest.MonkeyPatch, memory_gib: float, disk_gb: float) -> None:
-    monkeypatch.setattr(psutil, "virtual_memory", lambda: SimpleNamespace(available=memory_gib * GIB))
+    monkeypatch.setattr(module, "available_memory", lambda: memory_gib * GIB)
     monkeypatch.setattr(module.shutil, "disk_usage", lambda path: SimpleNamespace(free=disk_gb * 1e9))
 
 
