@@ -24,15 +24,28 @@ from stages.artifacts import IMAGE_SET, PHOTOS, ImageRecord, ImageSet, SkippedIm
 from stages.capture.background import PLAIN_PHOTOS, plain_mask
 from stages.capture.exif import ORIENTATION, camera_key, focal_px, gps_position
 from stages.capture.listing import NAMED, by_reason, list_captures, name_some
-from stages.capture.masks import check_size, match_masks, read_mask, write_mask
-from stages.capture.photo_reading import UnusableError, read_photo, register_formats
+from stages.capture.mask_doubts import MaskLook, find_doubts, is_black_and_white, look_at_mask, nothing_kept
+from stages.capture.mask_names import set_masks_aside
+from stages.capture.masks import (
+    EMPTY,
+    MASK_NOT_PHOTO,
+    Mask,
+    check_size,
+    load_mask,
+    match_masks,
+    no_masks,
+    tell_masks,
+    unused_reason,
+    write_mask,
+)
+from stages.capture.photo_reading import Photo, UnusableError, read_photo, register_formats
 from stages.capture.quality import Appearance, appearance, find_oddities
 from stages.capture.salient import SalientNetwork
 from stages.capture.video import extract_frames
 from stages.engine.fingerprint import file_sha256
 from stages.engine.stage import Stage, StageContext
 from stages.errors import InputError
-from stages.posing.known import KnownPoses, match_photos
+from stages.posing.known import KnownPoses, check_masks, match_photos
 from stages.posing.nero import DEPTH, read_depth_mask
 from stages.posing.reading import read_poses
 
@@ -53,6 +66,7 @@ def run(context: StageContext[IngestParams]) -> dict[str, Any]:
     photos, videos, skipped = list_captures(source, masks_folder)
     register_formats()
     folder = source if source.is_dir() else source.parent
+    photos, own_masks, aside = set_masks_aside(photos)
     files = {path: folder / path for path in photos}
     frames, damaged = _frames_of(videos, folder, context)
     files |= frames
@@ -71,11 +85,19 @@ def run(context: StageContext[IngestParams]) -> dict[str, Any]:
     unique, copies = _without_copies(paths, files, context)
     skipped += copies
 
-    mask_files = find_masks(list(unique), masks_folder, poses) if masks_folder else {}
+    use_own = params.own_masks and masks_folder is None
+    mask_files = {path: folder / mask for path, mask in own_masks.items() if use_own and path in unique}
+    if masks_folder is not None:
+        mask_files = find_masks(list(unique), masks_folder, poses, files.values())
+        if not mask_files and unique:
+            raise no_masks(list(unique), masks_folder)
+    used = {file.resolve() for file in mask_files.values()}
+    reason = unused_reason(params.own_masks, masks_folder is not None)
+    skipped += [SkippedImage(mask, reason) for mask in aside if (folder / mask).resolve() not in used]
     names, make_mask = _Names(unique), _mask_maker(params)
     done = 0
 
-    def take(path: str) -> tuple[ImageRecord, Appearance] | SkippedImage:
+    def take(path: str) -> tuple[ImageRecord, Appearance, MaskLook | None] | SkippedImage:
         nonlocal done
         try:
             return _take_photo(files[path], path, unique[path], mask_files.get(path), make_mask, names, context)
@@ -87,16 +109,18 @@ def run(context: StageContext[IngestParams]) -> dict[str, Any]:
 
     outcomes = _in_threads(take, unique, context.workers)
     taken = [o for o in outcomes if not isinstance(o, SkippedImage)]
-    images = sorted((record for record, _ in taken), key=lambda record: record.name)
+    images = sorted((record for record, *_ in taken), key=lambda record: record.name)
     skipped += [o for o in outcomes if isinstance(o, SkippedImage)]
     if params.auto_mask == "plain":
         images, without = _before_plain_backgrounds(images, context)
         skipped += without
     skipped.sort(key=lambda item: item.source)
+    looks = [look for *_, look in taken if look is not None]
+    _judge_masks(looks, len(mask_files), skipped, params)
 
     if len(images) < params.min_images:
         raise _too_few(source, len(images), params.min_images, skipped)
-    missing = [record.source for record in images if masks_folder and record.source not in mask_files]
+    missing = [record.source for record in images if masks_folder and not record.has_mask]
     if missing:
         raise InputError(
             f"{len(missing)} of {len(images)} photos have no mask in {masks_folder}: {name_some(missing)}.",
@@ -105,12 +129,13 @@ def run(context: StageContext[IngestParams]) -> dict[str, Any]:
     for reason, sources in by_reason(skipped).items():
         log.warning("left out %s: %s", name_some(sources), reason)
     # a video's frames are the sharpest of their stretch and near each other by choice
-    odd = find_oddities([seen for _, seen in taken if seen.source not in frames])
+    odd = find_oddities([seen for _, seen, _ in taken if seen.source not in frames])
     for warning in odd.warnings:
         log.warning("%s", warning)
     masked = sum(record.has_mask for record in images)
     if 0 < masked < len(images):
-        origin = "nothing stands out in the others" if params.auto_mask == "salient" else "from their alpha channel"
+        origin = "found among them" if mask_files else "from their alpha channel"
+        origin = "nothing stands out in the others" if params.auto_mask == "salient" else origin
         log.warning("only %d of %d photos have a mask (%s)", masked, len(images), origin)
     context.write(IMAGE_SET, ImageSet(tuple(images), tuple(skipped)))
     return {
@@ -190,28 +215,58 @@ def _tell_unused(poses: KnownPoses, used: set[str]) -> None:
         log.warning("%d of %d poses in %s have no photo: %s", len(unused), total, file, name_some(unused))
 
 
-def find_masks(photos: list[str], folder: Path, poses: KnownPoses | None) -> dict[str, Path]:
-    """Photo -> its mask file in `folder`; as the poses' format pairs them where it is that format's own folder."""
-    if poses is None or {file.parent.resolve() for file in poses.masks.values()} != {folder.resolve()}:
-        return match_masks(photos, folder)
+def find_masks(
+    photos: list[str], folder: Path, poses: KnownPoses | None, not_masks: Iterable[Path] = ()
+) -> dict[str, Path]:
+    """Photo -> its mask file in `folder`; as the poses' file pairs them where it is the folder of that file's masks.
+
+    Raises:
+        InputError: the poses name masks that are not there.
+    """
+    own = poses.masks if poses is not None else {}
+    if poses is None or not own or not all(file.resolve().is_relative_to(folder.resolve()) for file in own.values()):
+        return match_masks(photos, folder, list(not_masks))
+    check_masks(poses)
     cameras = match_photos(poses, photos)
-    named = {photo: poses.masks.get(camera.name) for photo, camera in cameras.items()}
-    return {photo: file for photo, file in named.items() if file is not None}
+    return {photo: own[camera.name] for photo, camera in cameras.items() if camera.name in own}
 
 
 def read_mask_file(
-    file: Path, photo: str, size: tuple[int, int], stored_size: tuple[int, int], orientation: int
-) -> np.ndarray:
-    """Mask [H, W] bool of the upright photo, of a picture or of a depth image.
+    file: Path,
+    photo: str,
+    size: tuple[int, int],
+    stored_size: tuple[int, int],
+    orientation: int,
+    black_keeps: bool = False,
+    pixels: np.ndarray | None = None,
+) -> Mask:
+    """Mask of the upright photo, of a picture (see `load_mask`) or of a depth image.
 
     Raises:
         InputError: it cannot be read, or is not of the upright photo's size (width, height).
     """
     if not file.name.endswith(DEPTH):
-        return read_mask(file, photo, size, stored_size, orientation)
+        return load_mask(file, photo, size, stored_size, orientation, black_keeps, pixels)
     mask = read_depth_mask(file)
-    check_size(file, photo, mask.shape[::-1], size)
-    return mask
+    check_size(file, photo, (mask.shape[1], mask.shape[0]), size)
+    return Mask(mask, size)
+
+
+def _judge_masks(looks: list[MaskLook], given: int, skipped: list[SkippedImage], params: IngestParams) -> None:
+    """Say which masks are used and what is doubtful about them; `given`: how many files of masks there are.
+
+    Raises:
+        InputError: nothing good can come of these masks.
+    """
+    empty = [item.source for item in skipped if item.reason.startswith(EMPTY)]
+    if empty and not looks:
+        raise InputError(*nothing_kept(len(empty), empty[0]))
+    if given:
+        log.info("%s", tell_masks(looks))
+    for doubt in find_doubts(looks, params.masks_keep != "auto"):
+        if doubt.impossible:
+            raise InputError(doubt.message, doubt.hint)
+        log.warning("%s %s", doubt.message, doubt.hint)
 
 
 class _Names:
@@ -283,15 +338,20 @@ def _take_photo(
     make_mask: MaskMaker | None,
     names: _Names,
     context: StageContext[IngestParams],
-) -> tuple[ImageRecord, Appearance]:
+) -> tuple[ImageRecord, Appearance, MaskLook | None]:
     from PIL import Image
 
     photo = read_photo(file)
-    rgb, mask = photo.rgb, photo.alpha
-    if mask_file is not None:
-        mask = read_mask_file(mask_file, source, rgb.size, photo.stored_size, photo.orientation)
-    if mask is not None and not mask.any():
-        raise UnusableError(f"its mask is empty ({mask_file.name if mask_file else 'alpha channel'})")
+    rgb, look = photo.rgb, None
+    if is_black_and_white(np.asarray(rgb)):
+        raise UnusableError(MASK_NOT_PHOTO)
+    given = _given_mask(photo, source, mask_file, context.params)
+    mask = None if given is None else given.kept
+    if given is not None:
+        called = mask_file.name if mask_file else f"the alpha channel of {source}"
+        if not given.kept.any():
+            raise UnusableError(f"{EMPTY} ({mask_file.name if mask_file else 'alpha channel'})")
+        look = look_at_mask(source, called, given.kept, given.stored_size, rgb.size, np.asarray(rgb))
 
     scale = min(1.0, context.params.max_side / max(rgb.size))
     keep = photo.as_is and scale == 1
@@ -329,7 +389,20 @@ def _take_photo(
         gps=gps_position(photo.exif),
         made_mask=made_mask,
     )
-    return record, seen
+    return record, seen, look
+
+
+def _given_mask(photo: Photo, source: str, mask_file: Path | None, params: IngestParams) -> Mask | None:
+    """The mask that comes with a photo: its file, or the alpha channel."""
+    black_keeps = params.masks_keep == "black"
+    if mask_file is not None:
+        pixels = np.asarray(photo.rgb)
+        return read_mask_file(
+            mask_file, source, photo.rgb.size, photo.stored_size, photo.orientation, black_keeps, pixels
+        )
+    if photo.alpha is None or not params.own_masks:
+        return None
+    return Mask(photo.alpha ^ black_keeps, photo.rgb.size)
 
 
 def _encoded_suffix(file: Path, lossy: bool) -> str:
@@ -356,7 +429,7 @@ def _encode(rgb: Any, target: Path, lossy: bool, exif: Any) -> None:
 
 INGEST: Stage[IngestParams] = Stage(
     name="ingest",
-    version=4,
+    version=5,
     settings=lambda config: config.ingest,
     run=run,
     writes=(PHOTOS, IMAGE_SET),

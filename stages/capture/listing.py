@@ -34,12 +34,14 @@ def list_captures(source: Path, masks_folder: Path | None = None) -> tuple[list[
     if masks_folder is not None and not masks_folder.is_dir():
         raise InputError(f"The mask folder {masks_folder} does not exist.", "Check the path given to --masks.")
     inside_masks = masks_folder.resolve() if masks_folder else None
+    if inside_masks and source.resolve() not in inside_masks.parents:  # the photos may lie in the masks' folder
+        inside_masks = None
     photos, videos, skipped = [], [], []
     for path in sorted(source.rglob("*")):
         relative = path.relative_to(source)
         if not path.is_file() or any(part.startswith((".", "__MACOSX")) for part in relative.parts):
             continue
-        if inside_masks and inside_masks != source.resolve() and inside_masks in path.resolve().parents:
+        if inside_masks and inside_masks in path.resolve().parents:
             continue
         name, suffix = relative.as_posix(), path.suffix.lower()
         if suffix in PHOTO_SUFFIXES | RAW_SUFFIXES:
