@@ -11,7 +11,7 @@ import logging
 import math
 import shutil
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from fnmatch import fnmatchcase
 from pathlib import Path, PurePosixPath
@@ -30,12 +30,14 @@ from stages.capture.masks import (
     EMPTY,
     MASK_NOT_PHOTO,
     Mask,
+    PairMasks,
     check_size,
+    choose_masks,
     load_mask,
     match_masks,
-    no_masks,
+    missing_masks,
     tell_masks,
-    unused_reason,
+    unused_masks,
     write_mask,
 )
 from stages.capture.photo_reading import Photo, UnusableError, read_photo, register_formats
@@ -85,15 +87,12 @@ def run(context: StageContext[IngestParams]) -> dict[str, Any]:
     unique, copies = _without_copies(paths, files, context)
     skipped += copies
 
-    use_own = params.own_masks and masks_folder is None
-    mask_files = {path: folder / mask for path, mask in own_masks.items() if use_own and path in unique}
-    if masks_folder is not None:
-        mask_files = find_masks(list(unique), masks_folder, poses, files.values())
-        if not mask_files and unique:
-            raise no_masks(list(unique), masks_folder)
-    used = {file.resolve() for file in mask_files.values()}
-    reason = unused_reason(params.own_masks, masks_folder is not None)
-    skipped += [SkippedImage(mask, reason) for mask in aside if (folder / mask).resolve() not in used]
+    mask_files = choose_masks(
+        {path: files[path] for path in unique}, own_masks, folder, masks_folder, params.own_masks, pairs_of(poses)
+    )
+    skipped += unused_masks(aside, folder, mask_files.values(), params.own_masks, masks_folder)
+    if not mask_files and (none := missing_masks(list(unique), mask_files, masks_folder)):
+        raise none
     names, make_mask = _Names(unique), _mask_maker(params)
     done = 0
 
@@ -120,12 +119,8 @@ def run(context: StageContext[IngestParams]) -> dict[str, Any]:
 
     if len(images) < params.min_images:
         raise _too_few(source, len(images), params.min_images, skipped)
-    missing = [record.source for record in images if masks_folder and not record.has_mask]
-    if missing:
-        raise InputError(
-            f"{len(missing)} of {len(images)} photos have no mask in {masks_folder}: {name_some(missing)}.",
-            f"Add {Path(missing[0]).stem}.png and the like, move those photos away, or run with `--no-masks`.",
-        )
+    if some := missing_masks([record.source for record in images], mask_files, masks_folder):
+        raise some
     for reason, sources in by_reason(skipped).items():
         log.warning("left out %s: %s", name_some(sources), reason)
     # a video's frames are the sharpest of their stretch and near each other by choice
@@ -215,8 +210,13 @@ def _tell_unused(poses: KnownPoses, used: set[str]) -> None:
         log.warning("%d of %d poses in %s have no photo: %s", len(unused), total, file, name_some(unused))
 
 
+def pairs_of(poses: KnownPoses | None) -> PairMasks:
+    """`find_masks` with these poses."""
+    return lambda photos, folder, not_masks: find_masks(photos, folder, poses, not_masks)
+
+
 def find_masks(
-    photos: list[str], folder: Path, poses: KnownPoses | None, not_masks: Iterable[Path] = ()
+    photos: list[str], folder: Path, poses: KnownPoses | None, not_masks: Collection[Path] = ()
 ) -> dict[str, Path]:
     """Photo -> its mask file in `folder`; as the poses' file pairs them where it is the folder of that file's masks.
 
@@ -225,8 +225,8 @@ def find_masks(
     """
     own = poses.masks if poses is not None else {}
     if poses is None or not own or not all(file.resolve().is_relative_to(folder.resolve()) for file in own.values()):
-        return match_masks(photos, folder, list(not_masks))
-    check_masks(poses)
+        return match_masks(photos, folder, not_masks)
+    check_masks(own, poses.origin)
     cameras = match_photos(poses, photos)
     return {photo: own[camera.name] for photo, camera in cameras.items() if camera.name in own}
 
@@ -262,7 +262,7 @@ def _judge_masks(looks: list[MaskLook], given: int, skipped: list[SkippedImage],
     if empty and not looks:
         raise InputError(*nothing_kept(len(empty), empty[0]))
     if given:
-        log.info("%s", tell_masks(looks))
+        log.info("masks: %s", tell_masks(looks))
     for doubt in find_doubts(looks, params.masks_keep != "auto"):
         if doubt.impossible:
             raise InputError(doubt.message, doubt.hint)

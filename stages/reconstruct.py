@@ -5,7 +5,7 @@ from __future__ import annotations
 import ctypes
 import logging
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ from stages.engine.stage import Stage
 from stages.engine.workspace import Workspace
 from stages.errors import ConfigError, InputError, SystemRequirementError
 from stages.posing.reading import locate_poses, masks_beside
-from stages.preflight import Preflight, in_short, preflight
+from stages.preflight import Preflight, in_short, masks_in_words, preflight
 from stages.request import Request
 
 log = logging.getLogger(__name__)
@@ -75,7 +75,7 @@ def reconstruct(request: Request, pipeline: Sequence[Stage], listener: Listener 
     with workspace.lock(), log_to_file(workspace.log_path):
         photos = sources["photos"]
         if photos is not None and not workspace.stage_folder("ingest").exists():
-            _tell_preflight(preflight(photos, sources["masks"], workspace.root, config, device, workers, decode=False))
+            _tell_preflight(_preflight(sources, workspace.root, config, device, workers, decode=False))
         log.debug("preset %s, device %s, %d workers, %s", preset, device, workers, sources)
         outcomes = run_pipeline(
             pipeline,
@@ -104,12 +104,24 @@ def check_photos(request: Request) -> Preflight:
     config = load_config(request.preset or default_preset(), request.config, request.sets)
     workers = request.workers or available_cores()
     device = choose_device(request.device)
-    return preflight(photos, request.masks, choose_folder(request), config, device, workers, decode=True)
+    poses = locate_poses(request.poses) if request.poses else None
+    sources = {"photos": photos, "masks": request.masks or _masks_of(poses, request.no_masks), "poses": poses}
+    return _preflight(sources, choose_folder(request), config, device, workers, decode=True)
+
+
+def _preflight(
+    sources: Mapping[str, Path | None], folder: Path, config: Config, device: str, workers: int, decode: bool
+) -> Preflight:
+    photos = sources["photos"]
+    assert photos is not None, "there is nothing to look at"
+    return preflight(photos, sources["masks"], folder, config, device, workers, decode, sources["poses"])
 
 
 def _tell_preflight(done: Preflight) -> None:
     """In short. A no-go does not stop the run: estimates may be wrong, and the stages say what they need."""
     log.info("%s", in_short(done))
+    if done.inspection.masks.unused is not None:
+        log.info("masks: %s", masks_in_words(done.inspection))
     for line in (*done.refusals, *done.shortages, *done.warnings):
         log.warning("%s", line)
 
@@ -167,9 +179,14 @@ def choose_sources(request: Request, workspace: Workspace) -> dict[str, Path | N
     if str(photos) == recorded:
         masks = masks or _remembered(known.get("masks"), request.no_masks)
         poses = poses or _remembered(known.get("poses"), request.no_poses)
-    if masks is None and request.poses and poses is not None and not request.no_masks:
-        masks = masks_beside(poses)
+    if masks is None and request.poses:
+        masks = _masks_of(poses, request.no_masks)
     return {"photos": photos, "masks": masks, "poses": poses}
+
+
+def _masks_of(poses: Path | None, without: bool) -> Path | None:
+    """The folder of the masks that come with these poses."""
+    return masks_beside(poses) if poses is not None and not without else None
 
 
 def _remembered(path: str | None, forget: bool) -> Path | None:
@@ -179,7 +196,8 @@ def _remembered(path: str | None, forget: bool) -> Path | None:
 def choose_config(request: Request, workspace: Workspace) -> tuple[str | None, Config]:
     """The preset's name and the settings.
 
-    A workspace goes on with the settings it was last run with, `--set` on top, until a preset or a file is named.
+    A workspace goes on with the settings it was last run with, `--set` on top, until a preset or a file is named;
+    a preset says nothing of its masks.
 
     Raises:
         ConfigError: see `load_config`.
@@ -187,7 +205,7 @@ def choose_config(request: Request, workspace: Workspace) -> tuple[str | None, C
     kept = request.preset is None and request.config is None and workspace.config_path.exists()
     if not kept:
         named = request.preset or default_preset()
-        return named, load_config(named, request.config, request.sets)
+        return named, load_config(named, request.config, [*_of_these_masks(request, workspace), *request.sets])
     preset = workspace.record.preset
     log.info("settings: those of the last run (preset %s); name a --preset to start anew", preset or "none")
     try:
@@ -198,6 +216,19 @@ def choose_config(request: Request, workspace: Workspace) -> tuple[str | None, C
         raise ConfigError(
             error.message, "These are the settings of the last run. Name a preset to start anew: `--preset cpu`."
         ) from error
+
+
+def _of_these_masks(request: Request, workspace: Workspace) -> list[str]:
+    """What the last run said of masks, where only a preset is new: a workspace remembers its masks, too."""
+    recorded = workspace.record.sources.get("photos")
+    same_photos = request.photos is None or str(request.photos.resolve()) == recorded
+    if not same_photos or request.masks or request.no_masks or request.config or not workspace.config_path.exists():
+        return []
+    try:
+        before = load_config(None, workspace.config_path).ingest
+    except ConfigError:  # of another version; the preset replaces it
+        return []
+    return [f"ingest.masks_keep={before.masks_keep}", f"ingest.own_masks={str(before.own_masks).lower()}"]
 
 
 def choose_device(name: str) -> str:

@@ -8,10 +8,13 @@ from typing import Annotated
 import typer
 
 from hineus_cli.options import (
+    BlackKeeps,
     ConfigFile,
     Device,
     Json,
     Masks,
+    NoMasks,
+    Poses,
     Preset,
     Sets,
     Time,
@@ -29,6 +32,9 @@ def check(
     photos: Annotated[Path, typer.Argument(help="Folder of photos, or a video.", show_default=False)],
     workspace: WorkspaceOption = None,
     masks: Masks = None,
+    no_masks: NoMasks = False,
+    black_keeps: BlackKeeps = None,
+    poses: Poses = None,
     preset: Preset = None,
     config: ConfigFile = None,
     sets: Sets = None,
@@ -44,9 +50,11 @@ def check(
         photos=photos,
         workspace=workspace,
         masks=masks,
+        no_masks=no_masks,
+        poses=poses,
         preset=preset,
         config=config,
-        sets=settings(sets, time),
+        sets=settings(sets, time, no_masks=no_masks, black_keeps=black_keeps),
         device=device,
         workers=workers,
     )

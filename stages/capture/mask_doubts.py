@@ -75,8 +75,8 @@ def look_at_mask(
     border[edge:-edge, edge:-edge] = False
     middle = mask[height // 4 : height - height // 4, width // 4 : width - width // 4]
     same = hashlib.sha1(np.packbits(mask).tobytes(), usedforsecurity=False).hexdigest()
-    shares = (float(part.mean()) for part in (mask, mask[border], middle))
-    return MaskLook(photo, file, *shares, same, size, photo_size, outline_fit(mask, rgb))
+    kept, kept_border, kept_middle = (float(part.mean()) for part in (mask, mask[border], middle))
+    return MaskLook(photo, file, kept, kept_border, kept_middle, same, size, photo_size, outline_fit(mask, rgb))
 
 
 def find_doubts(looks: Sequence[MaskLook], polarity_is_sure: bool = False) -> list[Doubt]:
@@ -137,7 +137,9 @@ def _inverted(seen: Sequence[MaskLook], sure: bool) -> Doubt | None:
     return Doubt(
         f"The masks seem inverted: in {len(inverted)} of {len(seen)} the photo's border is kept and something in its "
         f"middle cut out, e.g. {inverted[0]}.",
-        "Say which colour is the object: `--masks-black-keeps`, or `--masks-white-keeps` if they are right.",
+        "Try the other colour: `--masks-white-keeps` or `--masks-black-keeps`."
+        if sure
+        else "Say which colour is the object: `--masks-black-keeps`, or `--masks-white-keeps` if they are right.",
         impossible=not sure,
     )
 

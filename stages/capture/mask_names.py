@@ -55,7 +55,7 @@ def pair_by_name(photos: Sequence[str], masks: Iterable[str]) -> dict[str, str]:
         first, *others = (mask for score, mask in fitting if score == best)
         if all(_parents(mask) == _parents(first) for mask in others):
             wanted.setdefault(first, []).append((best, photo))
-    found = {}
+    found: dict[str, str] = {}
     for mask, claims in wanted.items():
         best = max(score for score, _ in claims)
         claiming = [photo for score, photo in claims if score == best]

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from stages.artifacts import SkippedImage
 from stages.capture.exif import ORIENTATION
 from stages.capture.listing import name_some
 from stages.capture.mask_doubts import MaskLook
@@ -22,6 +23,7 @@ from stages.errors import InputError
 SOFT, MAX_UNCLEAR = 0.1, 0.5
 JPEG_NOISE = 8  # a black picture of JPEG may have values up to this; masks of 0 and 1 have two values only
 MIN_CONTRAST = 0.25  # of the brightest value: less is a picture of one value, and its noise
+ASIDE = "masks among the photos"
 EMPTY = "its mask is empty"
 MASK_NOT_PHOTO = "a mask rather than a photo: it is black and white (`--masks FOLDER` takes masks)"
 
@@ -52,6 +54,9 @@ def _is_picture(path: Path) -> bool:
     return path.suffix.lower() in PHOTO_SUFFIXES and not path.name.startswith(".") and path.is_file()
 
 
+PairMasks = Callable[[list[str], Path, list[Path]], Mapping[str, Path]]
+
+
 def unused_folder(source: Path, photos: list[str]) -> Path | None:
     """A folder of masks of these photos near the folder `source` of photos, where nobody has named it."""
     nearby = [source / ".mask", *sorted(path for path in source.resolve().parent.iterdir() if path != source.resolve())]
@@ -61,22 +66,48 @@ def unused_folder(source: Path, photos: list[str]) -> Path | None:
     return None
 
 
-def unused_reason(own_masks: bool, others_given: bool) -> str:
-    """Why a mask among the photos is not used."""
-    if others_given:
-        return "masks among the photos, while --masks names others"
-    if not own_masks:
-        return "masks among the photos, left out as ingest.own_masks=false says (--no-masks)"
-    return "masks among the photos that belong to none of them"
+def choose_masks(
+    photos: Mapping[str, Path],
+    own: Mapping[str, str],
+    folder: Path,
+    masks_folder: Path | None,
+    use_own: bool,
+    pair: PairMasks = match_masks,
+) -> dict[str, Path]:
+    """Photo -> its mask file: of `masks_folder` if that is given, else of those among the photos in `folder`.
+
+    Args:
+        photos: photo -> its file. own: photo -> its mask, as `set_masks_aside` found them.
+    """
+    if masks_folder is not None:
+        return dict(pair(list(photos), masks_folder, list(photos.values())))
+    return {photo: folder / mask for photo, mask in own.items() if use_own and photo in photos}
 
 
-def no_masks(photos: list[str], folder: Path) -> InputError:
-    """None of the photos has a mask in the folder."""
-    names = [path.relative_to(folder).as_posix() for path in sorted(folder.rglob("*")) if _is_picture(path)]
-    called = f"{len(names)} pictures, e.g. {names[0]}" if names else "no pictures"
+def unused_masks(
+    aside: Iterable[str], folder: Path, used: Iterable[Path], use_own: bool, masks_folder: Path | None
+) -> list[SkippedImage]:
+    """Those of the masks among the photos that are not used, and why."""
+    taken = {file.resolve() for file in used}
+    reason = f"{ASIDE} that belong to none of them"
+    if masks_folder is not None:
+        reason = f"{ASIDE}, while --masks names others"
+    elif not use_own:
+        reason = f"{ASIDE}, not used (`--no-masks`; `--set ingest.own_masks=true` uses them)"
+    return [SkippedImage(mask, reason) for mask in aside if (folder / mask).resolve() not in taken]
+
+
+def missing_masks(photos: Sequence[str], files: Mapping[str, Path], folder: Path | None) -> InputError | None:
+    """What to say where photos have no mask in the `folder` that the user gave."""
+    missing = [photo for photo in photos if photo not in files]
+    if folder is None or not missing:
+        return None
+    message = f"{len(missing)} of {len(photos)} photos have no mask in {folder}: {name_some(missing)}."
+    if not files:
+        names = [path.relative_to(folder).as_posix() for path in sorted(folder.rglob("*")) if _is_picture(path)]
+        message += f" It holds {len(names)} pictures, e.g. {names[0]}." if names else " It holds no pictures."
     return InputError(
-        f"{len(photos)} of {len(photos)} photos have no mask in {folder}: {name_some(photos)}. It holds {called}.",
-        f"Masks are named like their photos: {Path(photos[0]).stem}.png and the like. Or run with `--no-masks`.",
+        message, f"Add {Path(missing[0]).stem}.png and the like, move those photos away, or run with `--no-masks`."
     )
 
 
@@ -84,7 +115,7 @@ def tell_masks(looks: Sequence[MaskLook]) -> str:
     """Which masks are used, in a sentence."""
     first = looks[0]
     scaled = [look for look in looks if look.size != look.photo_size]
-    said = f"{len(looks)} masks are used, e.g. {first.file} for {first.photo}; `--no-masks` leaves them out"
+    said = f"{len(looks)} are used, e.g. {first.file} for {first.photo}; `--no-masks` leaves them out"
     if scaled:
         (width, height), of_photo = scaled[0].size, scaled[0].photo_size
         said += f". {len(scaled)} are scaled to their photos ({width} x {height} to {of_photo[0]} x {of_photo[1]})"
@@ -153,6 +184,13 @@ def turned(image: Any, orientation: int | None) -> Any:
     tagged.info = {"exif": exif.tobytes()}
     tagged._exif = None
     return ImageOps.exif_transpose(tagged)
+
+
+def turned_pixels(pixels: np.ndarray, orientation: int | None) -> np.ndarray:
+    """As `turned`, of [H, W, 3] uint8."""
+    from PIL import Image
+
+    return pixels if orientation in (None, 0, 1) else np.asarray(turned(Image.fromarray(pixels), orientation))
 
 
 def _sees_through(image: Any) -> bool:

@@ -127,15 +127,15 @@ def _likeness(first: str, second: str) -> tuple[int, bool]:
     return common, PurePosixPath(first).suffix.lower() == PurePosixPath(second).suffix.lower()
 
 
-def check_masks(poses: KnownPoses) -> None:
+def check_masks(masks: Mapping[str, Path], origin: Path) -> None:
     """
     Raises:
-        InputError: a mask that the poses' file names is not there.
+        InputError: a mask that the poses' file `origin` names is not there.
     """
-    missing = sorted(str(file) for file in poses.masks.values() if not file.is_file())
+    missing = sorted(str(file) for file in masks.values() if not file.is_file())
     if missing:
         raise InputError(
-            f"{len(missing)} of {len(poses.masks)} masks that {poses.origin} names are not there, e.g. {missing[0]}.",
+            f"{len(missing)} of {len(masks)} masks that {origin} names are not there, e.g. {missing[0]}.",
             "Put them there, name another folder with `--masks FOLDER`, or run without: `--no-masks`.",
         )
 

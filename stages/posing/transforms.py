@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -16,7 +17,7 @@ import numpy as np
 
 from stages.artifacts import KnownSphere
 from stages.errors import InputError
-from stages.posing.known import SUFFIX, KnownCamera, KnownPoses, image_size, nearest_rotation, reading
+from stages.posing.known import SUFFIX, KnownCamera, KnownPoses, check_masks, image_size, nearest_rotation, reading
 
 FILES = ("transforms.json", "transforms_train.json")
 SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG", ".webp")
@@ -63,6 +64,19 @@ def masks_of(frames: Iterable[Mapping[str, Any]], file: Path) -> dict[str, Path]
         if said:
             masks[name] = file.parent / said.replace("\\", "/")
     return masks
+
+
+def masks_folder(file: Path) -> Path | None:
+    """The folder that holds all masks that `file` names; None where it names none.
+
+    Raises:
+        InputError: the file cannot be read, or one of its masks is not there.
+    """
+    masks = masks_of(_load(file)["frames"], file)
+    if not masks:
+        return None
+    check_masks(masks, file)
+    return Path(os.path.commonpath([mask.resolve().parent for mask in masks.values()]))
 
 
 def _name(frame: Mapping[str, Any]) -> str:
