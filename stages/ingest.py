@@ -24,16 +24,18 @@ from stages.artifacts import IMAGE_SET, PHOTOS, ImageRecord, ImageSet, SkippedIm
 from stages.capture.background import PLAIN_PHOTOS, plain_mask
 from stages.capture.exif import ORIENTATION, camera_key, focal_px, gps_position
 from stages.capture.listing import NAMED, by_reason, list_captures, name_some
-from stages.capture.mask_doubts import MaskLook, find_doubts, is_black_and_white, look_at_mask, nothing_kept
+from stages.capture.mask_doubts import MaskLook, find_doubts, is_black_and_white, nothing_kept
 from stages.capture.mask_names import set_masks_aside
 from stages.capture.masks import (
     EMPTY,
     MASK_NOT_PHOTO,
     Mask,
     PairMasks,
+    alpha_of,
     check_size,
     choose_masks,
     load_mask,
+    look_at_mask,
     match_masks,
     missing_masks,
     tell_masks,
@@ -53,6 +55,7 @@ from stages.posing.reading import read_poses
 
 log = logging.getLogger(__name__)
 
+LOOK_SIDE, NEAREST = 1024, 0  # a look at a photo and its mask: longest side in pixels, and Pillow's resampling
 JPEG_QUALITY = 97  # re-encoded lossy photos; visually lossless, about a third of PNG's size
 
 # Photo [H, W, 3] uint8 -> mask [H, W] bool, None where there is nothing to mask.
@@ -115,7 +118,7 @@ def run(context: StageContext[IngestParams]) -> dict[str, Any]:
         skipped += without
     skipped.sort(key=lambda item: item.source)
     looks = [look for *_, look in taken if look is not None]
-    _judge_masks(looks, len(mask_files), skipped, params)
+    _judge_masks(looks, skipped, params)
 
     if len(images) < params.min_images:
         raise _too_few(source, len(images), params.min_images, skipped)
@@ -252,8 +255,8 @@ def read_mask_file(
     return Mask(mask, size)
 
 
-def _judge_masks(looks: list[MaskLook], given: int, skipped: list[SkippedImage], params: IngestParams) -> None:
-    """Say which masks are used and what is doubtful about them; `given`: how many files of masks there are.
+def _judge_masks(looks: list[MaskLook], skipped: list[SkippedImage], params: IngestParams) -> None:
+    """Say which masks are used and what is doubtful about them.
 
     Raises:
         InputError: nothing good can come of these masks.
@@ -261,7 +264,7 @@ def _judge_masks(looks: list[MaskLook], given: int, skipped: list[SkippedImage],
     empty = [item.source for item in skipped if item.reason.startswith(EMPTY)]
     if empty and not looks:
         raise InputError(*nothing_kept(len(empty), empty[0]))
-    if given:
+    if looks:
         log.info("masks: %s", tell_masks(looks))
     for doubt in find_doubts(looks, params.masks_keep != "auto"):
         if doubt.impossible:
@@ -342,16 +345,8 @@ def _take_photo(
     from PIL import Image
 
     photo = read_photo(file)
-    rgb, look = photo.rgb, None
-    if is_black_and_white(np.asarray(rgb)):
-        raise UnusableError(MASK_NOT_PHOTO)
-    given = _given_mask(photo, source, mask_file, context.params)
-    mask = None if given is None else given.kept
-    if given is not None:
-        called = mask_file.name if mask_file else f"the alpha channel of {source}"
-        if not given.kept.any():
-            raise UnusableError(f"{EMPTY} ({mask_file.name if mask_file else 'alpha channel'})")
-        look = look_at_mask(source, called, given.kept, given.stored_size, rgb.size, np.asarray(rgb))
+    rgb = photo.rgb
+    mask, look = _given_mask(photo, source, mask_file, context.params)
 
     scale = min(1.0, context.params.max_side / max(rgb.size))
     keep = photo.as_is and scale == 1
@@ -392,17 +387,26 @@ def _take_photo(
     return record, seen, look
 
 
-def _given_mask(photo: Photo, source: str, mask_file: Path | None, params: IngestParams) -> Mask | None:
-    """The mask that comes with a photo: its file, or the alpha channel."""
-    black_keeps = params.masks_keep == "black"
+def _given_mask(
+    photo: Photo, source: str, mask_file: Path | None, params: IngestParams
+) -> tuple[np.ndarray | None, MaskLook | None]:
+    """The mask [H, W] bool that comes with a photo, as its file or its alpha channel, and a look at it.
+
+    Raises:
+        UnusableError: the mask keeps nothing, or the photo is a mask itself.
+    """
+    size, black_keeps = photo.rgb.size, params.masks_keep == "black"
+    scale = min(1.0, LOOK_SIDE / max(size))
+    preview = np.asarray(photo.rgb.resize([max(1, round(side * scale)) for side in size], resample=NEAREST))
+    if is_black_and_white(preview):
+        raise UnusableError(MASK_NOT_PHOTO)
     if mask_file is not None:
-        pixels = np.asarray(photo.rgb)
-        return read_mask_file(
-            mask_file, source, photo.rgb.size, photo.stored_size, photo.orientation, black_keeps, pixels
-        )
-    if photo.alpha is None or not params.own_masks:
-        return None
-    return Mask(photo.alpha ^ black_keeps, photo.rgb.size)
+        mask = read_mask_file(mask_file, source, size, photo.stored_size, photo.orientation, black_keeps, preview)
+    elif photo.alpha is not None and params.own_masks:
+        mask = Mask(photo.alpha ^ black_keeps, size)
+    else:
+        return None, None
+    return mask.kept, look_at_mask(source, mask_file.name if mask_file else alpha_of(source), mask, preview)
 
 
 def _encoded_suffix(file: Path, lossy: bool) -> str:

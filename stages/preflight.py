@@ -191,7 +191,7 @@ def _of_masks(seen: Inspection, config: Config, folder: Path | None) -> tuple[li
     if error := missing_masks(photos, seen.masks.files, folder):
         refusals.append(f"{error.message} {error.hint}")
     if unusable := seen.masks.unusable:
-        more = f" So are {len(unusable) - 1} more masks." if len(unusable) > 1 else ""
+        more = f" {len(unusable) - 1} more masks cannot be used either." if len(unusable) > 1 else ""
         refusals.append(f"{unusable[0].message}{more} {unusable[0].hint}")
     empty = [item.source for item in seen.skipped if item.reason.startswith(EMPTY)]
     if empty and not seen.masks.looks:
@@ -210,12 +210,10 @@ def masks_in_words(seen: Inspection) -> str:
     said = []
     if seen.masks.looks:
         said.append(tell_masks(seen.masks.looks))
-    elif seen.masks.files:
-        said.append(f"{len(seen.masks.files)} are used; `--no-masks` leaves them out")
     elif seen.masks.unused is not None:
         said.append(f"none are used; `--masks {shlex.quote(str(seen.masks.unused))}` would use those there")
     aside = by_reason(item for item in seen.skipped if item.reason.startswith(ASIDE))
-    said += [f"left out {name_some(files)}: {reason}" for reason, files in aside.items()]
+    said += [f"Left out {name_some(files)}: {reason}" for reason, files in aside.items()]
     return ". ".join(said)
 
 

@@ -12,15 +12,16 @@ import numpy as np
 from stages.artifacts import SkippedImage
 from stages.capture.background import PLAIN_PHOTOS, find_background
 from stages.capture.listing import list_captures
-from stages.capture.mask_doubts import MaskLook, is_black_and_white, look_at_mask
+from stages.capture.mask_doubts import MaskLook, is_black_and_white
 from stages.capture.mask_names import set_masks_aside
 from stages.capture.masks import (
-    EMPTY,
     MASK_NOT_PHOTO,
     Mask,
     PairMasks,
+    alpha_of,
     choose_masks,
     load_mask,
+    look_at_mask,
     match_masks,
     turned_pixels,
     unused_folder,
@@ -190,20 +191,21 @@ def _look_closer(head: PhotoFile, file: Path, mask_file: Path | None, wanted: Ma
 def _look_at_mask(
     head: PhotoFile, file: Path, mask_file: Path | None, pixels: np.ndarray, wanted: MasksWanted
 ) -> MaskLook | InputError | None:
+    """At the mask of a photo, or what is wrong with it; None where there is none.
+
+    Raises:
+        UnusableError: the mask keeps nothing.
+    """
     size = head.width, head.height
-    if mask_file is None:
-        alpha = read_alpha(file) if wanted.own and wanted.folder is None else None
-        mask, called = None if alpha is None else Mask(alpha ^ wanted.black_keeps, size), "alpha channel"
-    else:
+    if mask_file is not None:
         try:
             mask = wanted.read(
                 mask_file, head.source, size, head.stored_size, head.orientation, wanted.black_keeps, pixels
             )
         except InputError as error:
             return error
-        called = mask_file.name
-    if mask is None:
+        return look_at_mask(head.source, mask_file.name, mask, pixels)
+    alpha = read_alpha(file) if wanted.own and wanted.folder is None else None
+    if alpha is None:
         return None
-    if not mask.kept.any():
-        raise UnusableError(f"{EMPTY} ({called})")
-    return look_at_mask(head.source, called, mask.kept, mask.stored_size, size, pixels)
+    return look_at_mask(head.source, alpha_of(head.source), Mask(alpha ^ wanted.black_keeps, size), pixels)

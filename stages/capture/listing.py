@@ -31,6 +31,8 @@ def list_captures(source: Path, masks_folder: Path | None = None) -> tuple[list[
         return [], [source.name], []
     if not source.is_dir():
         raise InputError(f"{source} is a file; a folder of photos or a video is needed.", f"hineus run {source.parent}")
+    if masks_folder is not None and masks_folder.is_file():
+        raise InputError(f"{masks_folder} is a file; a folder of masks is needed.", f"--masks {masks_folder.parent}")
     if masks_folder is not None and not masks_folder.is_dir():
         raise InputError(f"The mask folder {masks_folder} does not exist.", "Check the path given to --masks.")
     inside_masks = masks_folder.resolve() if masks_folder else None

@@ -65,18 +65,24 @@ class Doubt:
     impossible: bool = False
 
 
-def look_at_mask(
-    photo: str, file: str, mask: np.ndarray, size: tuple[int, int], photo_size: tuple[int, int], rgb: np.ndarray
-) -> MaskLook:
-    """Of `mask` [H, W] bool and its upright photo `rgb` [h, w, 3] uint8; `size`: of the mask's file."""
+def look(photo: str, file: str, mask: np.ndarray, size: tuple[int, int], rgb: np.ndarray) -> MaskLook:
+    """At `mask` [H, W] bool of the upright photo `rgb` [h, w, 3] uint8; `size`: width and height of the mask's file."""
     height, width = mask.shape
     edge = max(1, round(BORDER * max(mask.shape)))
     border = np.ones(mask.shape, bool)
     border[edge:-edge, edge:-edge] = False
     middle = mask[height // 4 : height - height // 4, width // 4 : width - width // 4]
-    same = hashlib.sha1(np.packbits(mask).tobytes(), usedforsecurity=False).hexdigest()
-    kept, kept_border, kept_middle = (float(part.mean()) for part in (mask, mask[border], middle))
-    return MaskLook(photo, file, kept, kept_border, kept_middle, same, size, photo_size, outline_fit(mask, rgb))
+    return MaskLook(
+        photo,
+        file,
+        kept=float(mask.mean()),
+        border=float(mask[border].mean()),
+        middle=float(middle.mean()),
+        same=hashlib.sha1(np.packbits(mask).tobytes(), usedforsecurity=False).hexdigest(),
+        size=size,
+        photo_size=(width, height),
+        fit=outline_fit(mask, rgb),
+    )
 
 
 def find_doubts(looks: Sequence[MaskLook], polarity_is_sure: bool = False) -> list[Doubt]:
@@ -152,6 +158,7 @@ def _same(seen: Sequence[MaskLook]) -> Doubt | None:
         f"All {len(cutting)} masks are one and the same picture, e.g. {cutting[0].file}; the outline of an object "
         "differs from photo to photo.",
         "A mask of what to ignore, as of the lens or a tripod, is none of the object: run without, `--no-masks`.",
+        impossible=len({look.file for look in cutting}) == 1,
     )
 
 

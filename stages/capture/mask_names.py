@@ -35,6 +35,11 @@ def is_mask_folder(name: str) -> bool:
     return _FOLDER.fullmatch(name) is not None
 
 
+def pair(photos: Sequence[str], masks: Sequence[str]) -> dict[str, str]:
+    """Photo -> its mask, by the names that programs give, or where there are none by what the names have in common."""
+    return pair_by_name(photos, masks) or pair_by_ending(photos, masks)
+
+
 def pair_by_name(photos: Sequence[str], masks: Iterable[str]) -> dict[str, str]:
     """Photo -> its mask. Where several fit, the one with more of its folders in common with the photo.
 
@@ -65,21 +70,20 @@ def pair_by_name(photos: Sequence[str], masks: Iterable[str]) -> dict[str, str]:
 
 
 def pair_by_ending(photos: Sequence[str], masks: Sequence[str]) -> dict[str, str]:
-    """As `pair_by_name`, where all are called like their photos but for one ending or beginning without digits."""
-    stems = {_folded(PurePosixPath(photo).stem): photo for photo in photos}
+    """As `pair_by_name`, where all masks are called like their photos but for the same ending or beginning."""
+    called = [_folded(PurePosixPath(photo).stem) for photo in photos]
+    stems = {stem: photo for stem, photo in zip(called, photos, strict=True) if called.count(stem) == 1}
     parts: Counter[tuple[str, str]] = Counter()
     for name in (_folded(PurePosixPath(mask).stem) for mask in masks):
         parts.update((before, after) for stem in stems for before, found, after in [name.partition(stem)] if found)
-    regular = [(count, part) for part, count in parts.items() if not re.search(r"\d", "".join(part))]
+    # digits beside a photo's number make another number
+    regular = [(count, part) for part, count in parts.items() if not (part[0][-1:].isdigit() or part[1][:1].isdigit())]
     count, (before, after) = max(regular, default=(0, ("", "")))
     if count < max(2, REGULAR * len(photos)):
         return {}
-    called = {}
-    for mask in masks:
-        name = _folded(PurePosixPath(mask).stem)
-        if name.startswith(before) and name.endswith(after):
-            called[mask] = name[len(before) : len(name) - len(after)]
-    return {stems[stem]: mask for mask, stem in called.items() if stem in stems}
+    names = {f"{before}{stem}{after}": photo for stem, photo in stems.items()}
+    found = {names.get(_folded(PurePosixPath(mask).stem)): mask for mask in masks}
+    return {photo: mask for photo, mask in found.items() if photo is not None}
 
 
 def set_masks_aside(photos: Sequence[str]) -> tuple[list[str], dict[str, str], list[str]]:
@@ -101,14 +105,13 @@ def set_masks_aside(photos: Sequence[str]) -> tuple[list[str], dict[str, str], l
         and (_is_for_all(path) or by_folder.get(_parents(path), set()) & set(_photo_names(path)))
         and _parents(path) in by_folder
     ]
-    if in_folder and bare:
-        paired = pair_by_name(bare, in_folder) or pair_by_ending(bare, in_folder)
-        folders = {_parents(mask) for mask in paired.values()}
-        aside += [path for path in in_folder if _parents(path) in folders and path not in aside]
+    for folder in {_parents(path) for path in in_folder}:
+        within = [path for path in in_folder if _parents(path) == folder]
+        if pair(bare, within):
+            aside += within
     masks = set(aside)
     kept = [path for path in photos if path not in masks]
-    single = [path for path in aside if not _is_for_all(path)]
-    return kept, pair_by_name(kept, single) or pair_by_ending(kept, single), sorted(masks)
+    return kept, pair(kept, [path for path in aside if not _is_for_all(path)]), sorted(masks)
 
 
 def _photo_names(mask: str) -> list[str]:

@@ -12,20 +12,20 @@ import numpy as np
 from stages.artifacts import SkippedImage
 from stages.capture.exif import ORIENTATION
 from stages.capture.listing import name_some
-from stages.capture.mask_doubts import MaskLook
+from stages.capture.mask_doubts import MaskLook, look
 from stages.capture.mask_fit import outline_fit
-from stages.capture.mask_names import is_mask_folder, pair_by_ending, pair_by_name
-from stages.capture.photo_reading import PHOTO_SUFFIXES
+from stages.capture.mask_names import is_mask_folder, pair
+from stages.capture.photo_reading import PHOTO_SUFFIXES, UnusableError
 from stages.errors import InputError
 
 # A mask's edges may be soft: this much of its range from black or white counts as neither, and as many such pixels as
 # are black (or white) are a photo, a depth map or labels. Masks of the development sets have 0 to 0.02 of them.
 SOFT, MAX_UNCLEAR = 0.1, 0.5
-JPEG_NOISE = 8  # a black picture of JPEG may have values up to this; masks of 0 and 1 have two values only
+JPEG_NOISE = 8  # a black picture may have values up to this in a JPEG
 MIN_CONTRAST = 0.25  # of the brightest value: less is a picture of one value, and its noise
 ASIDE = "masks among the photos"
 EMPTY = "its mask is empty"
-MASK_NOT_PHOTO = "a mask rather than a photo: it is black and white (`--masks FOLDER` takes masks)"
+MASK_NOT_PHOTO = "black and white, as a mask is: move it to a folder of its own and give `--masks FOLDER`"
 
 
 @dataclass(frozen=True)
@@ -46,8 +46,7 @@ def match_masks(photos: list[str], folder: Path, not_masks: Collection[Path] = (
     taken = {path.resolve() for path in not_masks}
     files = {path.relative_to(folder).as_posix(): path for path in sorted(folder.rglob("*")) if _is_picture(path)}
     names = [name for name, path in files.items() if path.resolve() not in taken]
-    paired = pair_by_name(photos, names) or pair_by_ending(photos, names)
-    return {photo: files[name] for photo, name in paired.items()}
+    return {photo: files[name] for photo, name in pair(photos, names).items()}
 
 
 def _is_picture(path: Path) -> bool:
@@ -89,7 +88,7 @@ def unused_masks(
 ) -> list[SkippedImage]:
     """Those of the masks among the photos that are not used, and why."""
     taken = {file.resolve() for file in used}
-    reason = f"{ASIDE} that belong to none of them"
+    reason = f"{ASIDE} that are of none of them, or one for all, which is no object's outline"
     if masks_folder is not None:
         reason = f"{ASIDE}, while --masks names others"
     elif not use_own:
@@ -105,9 +104,12 @@ def missing_masks(photos: Sequence[str], files: Mapping[str, Path], folder: Path
     message = f"{len(missing)} of {len(photos)} photos have no mask in {folder}: {name_some(missing)}."
     if not files:
         names = [path.relative_to(folder).as_posix() for path in sorted(folder.rglob("*")) if _is_picture(path)]
-        message += f" It holds {len(names)} pictures, e.g. {names[0]}." if names else " It holds no pictures."
+        others = [name for name in names if name not in photos]
+        holds = f"{len(others)} pictures, e.g. {others[0]}" if others else "no pictures"
+        message += " It holds the photos only." if names and not others else f" It holds {holds}."
     return InputError(
-        message, f"Add {Path(missing[0]).stem}.png and the like, move those photos away, or run with `--no-masks`."
+        message,
+        f"Add {Path(missing[0]).with_suffix('.png').as_posix()} and the like, move those photos away, or run with `--no-masks`.",
     )
 
 
@@ -115,11 +117,28 @@ def tell_masks(looks: Sequence[MaskLook]) -> str:
     """Which masks are used, in a sentence."""
     first = looks[0]
     scaled = [look for look in looks if look.size != look.photo_size]
-    said = f"{len(looks)} are used, e.g. {first.file} for {first.photo}; `--no-masks` leaves them out"
+    of_photo = "" if first.photo in first.file else f" for {first.photo}"
+    said = f"{len(looks)} are used, e.g. {first.file}{of_photo}; `--no-masks` leaves them out"
     if scaled:
-        (width, height), of_photo = scaled[0].size, scaled[0].photo_size
-        said += f". {len(scaled)} are scaled to their photos ({width} x {height} to {of_photo[0]} x {of_photo[1]})"
+        (width, height), (wide, high) = scaled[0].size, scaled[0].photo_size
+        said += f". {len(scaled)} are scaled to their photos ({width} x {height} to {wide} x {high})"
     return said
+
+
+def alpha_of(photo: str) -> str:
+    """What the mask in a photo's alpha channel is called."""
+    return f"alpha channel of {photo}"
+
+
+def look_at_mask(photo: str, called: str, mask: Mask, rgb: np.ndarray) -> MaskLook:
+    """A look at the mask of the upright photo `rgb` [h, w, 3] uint8 of any size.
+
+    Raises:
+        UnusableError: it keeps nothing.
+    """
+    if not mask.kept.any():
+        raise UnusableError(f"{EMPTY} ({called})")
+    return look(photo, called, mask.kept, mask.stored_size, rgb)
 
 
 def read_mask(
@@ -157,6 +176,7 @@ def load_mask(
         with Image.open(file) as stored:
             stored.load()
             image = stored.copy() if stored.mode != "P" else stored.convert("RGBA" if _sees_through(stored) else "RGB")
+            noisy = stored.format == "JPEG"
             own_orientation = stored.getexif().get(ORIENTATION, 1)
         candidates = [turned(image, own_orientation), image, turned(image, orientation)]
         fitting = [found for found in candidates if found.size == size]
@@ -165,7 +185,7 @@ def load_mask(
     except Exception as error:  # Pillow's decoders raise nearly anything on a damaged file
         raise InputError(f"The mask {file} cannot be read ({error}).", "Write it again as an 8-bit PNG.") from error
     check_size(file, photo, fitting[0].size, size)
-    kept = _black_and_white(values, file, photo) ^ black_keeps
+    kept = _black_and_white(values, noisy, file, photo) ^ black_keeps
     if own_orientation in (None, 0, 1) and len(fitting) > 2 and pixels is not None:  # as large either way
         kept = _better_turned(kept, turned(Image.fromarray(kept), orientation), pixels)
     found = kept.shape[1], kept.shape[0]
@@ -208,14 +228,14 @@ def _grey(image: Any) -> np.ndarray:
     return np.asarray(image.convert("L"))
 
 
-def _black_and_white(values: np.ndarray, file: Path, photo: str) -> np.ndarray:
+def _black_and_white(values: np.ndarray, noisy: bool, file: Path, photo: str) -> np.ndarray:
     """[H, W] bool, True on the brighter of two values; masks of 0 and 1 are as common as masks of 0 and 255.
 
     Raises:
         InputError: there are not two.
     """
     darkest, brightest = float(values.min()), float(values.max())
-    if brightest <= JPEG_NOISE and len(np.unique(values)) > 2:
+    if noisy and brightest <= JPEG_NOISE:
         return np.zeros(values.shape, bool)
     if brightest - darkest < MIN_CONTRAST * brightest:
         return np.ones(values.shape, bool)
