@@ -29,6 +29,16 @@ class IngestParams(Section):
         "key), an error where it is not plain; salient: what a network takes for the subject, used where the photos "
         "agree on it to cut the mesh and find the region; needs `pip install 'hineus[masks]'`",
     )
+    masks_keep: Literal["auto", "white", "black"] = Field(
+        "auto",
+        description="colour of the object in masks (opaque is white); auto: white, and masks that seem inverted are an "
+        "error",
+    )
+    own_masks: bool = Field(
+        True,
+        description="use the masks that lie among the photos (IMG_1_mask.png, masks/IMG_1.png, ...) and alpha "
+        "channels, where no `--masks` is given",
+    )
     leave_out: tuple[str, ...] = Field(
         (), description="photos that no stage sees, as names or patterns (test_*.jpg) relative to the photo folder"
     )

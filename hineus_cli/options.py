@@ -87,7 +87,20 @@ Poses = Annotated[
     ),
 ]
 NoPoses = Annotated[bool, typer.Option("--no-poses", help="Forget the poses of the last run and find them.")]
-NoMasks = Annotated[bool, typer.Option("--no-masks", help="Forget the masks of the last run.")]
+NoMasks = Annotated[
+    bool,
+    typer.Option(
+        "--no-masks", help="Use no masks: forget those of the last run, and leave out those among the photos."
+    ),
+]
+BlackKeeps = Annotated[
+    bool | None,
+    typer.Option(
+        "--masks-black-keeps/--masks-white-keeps",
+        help="Whether black or white is the object in masks: sets ingest.masks_keep.",
+        show_default=False,
+    ),
+]
 Control = Annotated[
     Path | None,
     typer.Option(
@@ -161,6 +174,8 @@ def settings(
     no_ground: bool = False,
     watertight: bool = False,
     deterministic: bool = False,
+    no_masks: bool = False,
+    black_keeps: bool | None = None,
 ) -> tuple[str, ...]:
     """Those of --set, then what other options stand for; an option that was not given says nothing."""
     stood_for = {
@@ -169,6 +184,8 @@ def settings(
         "cleanup.remove_ground": no_ground or None,
         "cleanup.keep_closed": watertight or None,
         "sfm.deterministic": deterministic or None,
+        "ingest.own_masks": False if no_masks else None,
+        "ingest.masks_keep": None if black_keeps is None else "black" if black_keeps else "white",
     }
     given = (f"{key}={json.dumps(value)}" for key, value in stood_for.items() if value is not None)
     return (*(sets or ()), *given)
@@ -180,6 +197,7 @@ def of_a_run(
     other_photos: OtherPhotos = False,
     masks: Masks = None,
     no_masks: NoMasks = False,
+    black_keeps: BlackKeeps = None,
     poses: Poses = None,
     no_poses: NoPoses = False,
     control: Control = None,
@@ -208,7 +226,7 @@ def of_a_run(
         no_control=no_control,
         preset=preset,
         config=config,
-        sets=settings(sets, time, hold_out, no_ground, watertight, deterministic),
+        sets=settings(sets, time, hold_out, no_ground, watertight, deterministic, no_masks, black_keeps),
         device=device,
         workers=workers,
     )

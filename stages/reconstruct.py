@@ -28,7 +28,7 @@ from stages.kept import what_is_kept
 from stages.limits import available_cores
 from stages.posing.control_files import CONTROL
 from stages.posing.reading import locate_poses, masks_beside
-from stages.preflight import Preflight, in_short, preflight
+from stages.preflight import Preflight, in_short, masks_in_words, preflight
 from stages.request import Request
 from stages.whereabouts import default_workspace, find_source, holds_files, refuse_other_photos
 
@@ -87,9 +87,7 @@ def reconstruct(request: Request, pipeline: Sequence[Stage], listener: Listener 
         _tell_sources(request, workspace, sources)
         photos = sources["photos"]
         if photos is not None and not workspace.stage_folder("ingest").exists():
-            control = sources[CONTROL]
-            done = preflight(photos, sources["masks"], workspace.root, config, device, workers, False, control)
-            _tell_preflight(done)
+            _tell_preflight(_preflight(sources, workspace.root, config, device, workers, decode=False))
         elif photos is not None and photos.exists():
             digests = SourceDigests({"photos": photos}, workspace.digest_cache)
             if kept := what_is_kept(workspace, config, digests.files("photos") or {}, _forced(request, pipeline)):
@@ -123,7 +121,10 @@ def check_photos(request: Request) -> Preflight:
     config = load_config(request.preset or default_preset(), request.config, request.sets)
     workers, folder = request.workers or available_cores(), choose_folder(request)
     device = choose_device(request.device)
-    done = preflight(photos, request.masks, folder, config, device, workers, True, request.control)
+    poses = locate_poses(request.poses) if request.poses else None
+    masks = request.masks or _masks_of(poses, request.no_masks)
+    sources = {"photos": photos, "masks": masks, "poses": poses, CONTROL: request.control}
+    done = _preflight(sources, folder, config, device, workers, decode=True)
     done = replace(done, refusals=(*done.refusals, *_workspace_refusals(request)))
     if not (folder / "workspace.json").exists():
         return done
@@ -144,9 +145,20 @@ def _workspace_refusals(request: Request) -> list[str]:
     return []
 
 
+def _preflight(
+    sources: Mapping[str, Path | None], folder: Path, config: Config, device: str, workers: int, decode: bool
+) -> Preflight:
+    photos = sources["photos"]
+    assert photos is not None, "there is nothing to look at"
+    given = sources["poses"], sources[CONTROL]
+    return preflight(photos, sources["masks"], folder, config, device, workers, decode, *given)
+
+
 def _tell_preflight(done: Preflight) -> None:
     """In short. A no-go does not stop the run: estimates may be wrong, and the stages say what they need."""
     log.info("%s", in_short(done))
+    if done.inspection.masks.unused is not None:
+        log.info("masks: %s", masks_in_words(done.inspection))
     for line in (*done.refusals, *done.shortages, *done.warnings):
         log.warning("%s", line)
 
@@ -235,8 +247,8 @@ def choose_sources(request: Request, workspace: Workspace, digests: SourceDigest
         masks = masks or (None if request.no_masks else find_source(workspace, "masks", photos))
         poses = poses or (None if request.no_poses else find_source(workspace, "poses", photos))
         control = control or (None if request.no_control else find_source(workspace, CONTROL, photos))
-    if masks is None and request.poses and poses is not None and not request.no_masks:
-        masks = masks_beside(poses)
+    if masks is None and request.poses:
+        masks = _masks_of(poses, request.no_masks)
     return {"photos": photos, "masks": masks, "poses": poses, CONTROL: control}
 
 
@@ -284,10 +296,16 @@ def _gone(name: str, place: Path, root: Path) -> str:
     )
 
 
+def _masks_of(poses: Path | None, without: bool) -> Path | None:
+    """The folder of the masks that come with these poses."""
+    return masks_beside(poses) if poses is not None and not without else None
+
+
 def choose_config(request: Request, workspace: Workspace) -> tuple[str | None, Config]:
     """The preset's name and the settings.
 
-    A workspace goes on with the settings it was last run with, `--set` on top, until a preset or a file is named.
+    A workspace goes on with the settings it was last run with, `--set` on top, until a preset or a file is named;
+    a preset says nothing of its masks.
 
     Raises:
         ConfigError: see `load_config`.
@@ -295,7 +313,7 @@ def choose_config(request: Request, workspace: Workspace) -> tuple[str | None, C
     kept = request.preset is None and request.config is None and workspace.config_path.exists()
     if not kept:
         named = request.preset or default_preset()
-        return named, load_config(named, request.config, request.sets)
+        return named, load_config(named, request.config, [*_of_these_masks(request, workspace), *request.sets])
     preset = workspace.record.preset
     log.info("settings: those of the last run (preset %s); name a --preset to start anew", preset or "none")
     try:
@@ -306,6 +324,19 @@ def choose_config(request: Request, workspace: Workspace) -> tuple[str | None, C
         raise ConfigError(
             error.message, "These are the settings of the last run. Name a preset to start anew: `--preset cpu`."
         ) from error
+
+
+def _of_these_masks(request: Request, workspace: Workspace) -> list[str]:
+    """What the last run said of masks, where only a preset is new: a workspace remembers its masks, too."""
+    recorded = workspace.record.sources.get("photos")
+    same_photos = request.photos is None or str(request.photos.resolve()) == recorded
+    if not same_photos or request.masks or request.no_masks or request.config or not workspace.config_path.exists():
+        return []
+    try:
+        before = load_config(None, workspace.config_path).ingest
+    except ConfigError:  # of another version; the preset replaces it
+        return []
+    return [f"ingest.masks_keep={before.masks_keep}", f"ingest.own_masks={str(before.own_masks).lower()}"]
 
 
 def choose_device(name: str) -> str:

@@ -8,11 +8,14 @@ from typing import Annotated
 import typer
 
 from hineus_cli.options import (
+    BlackKeeps,
     ConfigFile,
     Control,
     Device,
     Json,
     Masks,
+    NoMasks,
+    Poses,
     Preset,
     Sets,
     Time,
@@ -30,6 +33,9 @@ def check(
     photos: Annotated[Path, typer.Argument(help="Folder of photos, or a video.", show_default=False)],
     workspace: WorkspaceOption = None,
     masks: Masks = None,
+    no_masks: NoMasks = False,
+    black_keeps: BlackKeeps = None,
+    poses: Poses = None,
     control: Control = None,
     preset: Preset = None,
     config: ConfigFile = None,
@@ -46,10 +52,12 @@ def check(
         photos=photos,
         workspace=workspace,
         masks=masks,
+        no_masks=no_masks,
+        poses=poses,
         control=control,
         preset=preset,
         config=config,
-        sets=settings(sets, time),
+        sets=settings(sets, time, no_masks=no_masks, black_keeps=black_keeps),
         device=device,
         workers=workers,
     )

@@ -141,6 +141,19 @@ def _likeness(first: str, second: str) -> tuple[int, bool]:
     return common, PurePosixPath(first).suffix.lower() == PurePosixPath(second).suffix.lower()
 
 
+def check_masks(masks: Mapping[str, Path], origin: Path) -> None:
+    """
+    Raises:
+        InputError: a mask that the poses' file `origin` names is not there.
+    """
+    missing = sorted(str(file) for file in masks.values() if not file.is_file())
+    if missing:
+        raise InputError(
+            f"{len(missing)} of {len(masks)} masks that {origin} names are not there, e.g. {missing[0]}.",
+            "Put them there, name another folder with `--masks FOLDER`, or run without: `--no-masks`.",
+        )
+
+
 # ---------------------------------------------------------------- what readers share
 @contextmanager
 def reading(what: str, needs: str) -> Iterator[None]:
