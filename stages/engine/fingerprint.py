@@ -42,6 +42,8 @@ class Identity:
         inputs: artifact that is read ("undistort/cameras.json") -> digest of its files as published. Also what
             `manifest_key` and RUN_KEY stand for, where a stage reads those.
         sources: outside path ("photos") -> its files' digests, None where it was not given.
+        previous: digest of the stage's own publication that it was given to go on from; None where there was none. It
+            is history, so it never makes a result stale.
     """
 
     stage: str
@@ -49,11 +51,13 @@ class Identity:
     params: Mapping[str, Any]
     inputs: Mapping[str, str] = field(default_factory=dict)
     sources: Mapping[str, FileDigests | None] = field(default_factory=dict)
+    previous: str | None = None
 
     @property
     def parts(self) -> dict[str, Any]:
         """The fingerprint's ingredients, one digest each."""
-        return {
+        history = {} if self.previous is None else {"previous": self.previous}
+        return history | {
             "stage": self.stage,
             "version": self.version,
             "params": digest(dict(self.params)),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -15,7 +15,7 @@ from stages.engine.fingerprint import Identity, SourceDigests
 from stages.engine.manifest import Manifest, current_versions, describe_outputs, jsonable, now
 from stages.engine.resources import ResourceMeter
 from stages.engine.stage import Stage, StageContext
-from stages.engine.status import Present, StageStatus, stage_status
+from stages.engine.status import Present, StageStatus, previous_to_continue, stage_status
 from stages.engine.system import requirement_error
 from stages.engine.workspace import Workspace, disk_full_error, is_disk_full, storage_errors
 from stages.errors import ConfigError, HineusError, InputError, did_you_mean
@@ -107,7 +107,10 @@ def run_pipeline(
             else:
                 reason = forced[stage.name] if status.state == "fresh" else status.reason
                 listener.stage_started(stage, reason)
-                manifest = _run_stage(stage, present, status, device, workers, listener)
+                previous = None
+                if stage.name not in forced:
+                    previous = previous_to_continue(stage, workspace, config)
+                manifest = _run_stage(stage, present, status, previous, device, workers, listener)
                 outcome = _outcome("ran", reason, manifest)
                 status = StageStatus(stage.name, "fresh", (), manifest, manifest.identity)
             statuses[stage.name] = status
@@ -146,12 +149,19 @@ def _select(
 
 
 def _run_stage(
-    stage: Stage[Any], present: Present, status: StageStatus, device: str, workers: int, listener: Listener
+    stage: Stage[Any],
+    present: Present,
+    status: StageStatus,
+    previous: Manifest | None,
+    device: str,
+    workers: int,
+    listener: Listener,
 ) -> Manifest:
     workspace, config, digests = present.workspace, present.config, present.digests
     identity = status.identity
     if identity is None:
         raise ValueError(f"stage {stage.name} was asked to run before the stages it needs: {status.reason}")
+    identity = replace(identity, previous=previous.digest if previous else None)
     given = {name: path for name in stage.sources if (path := digests.sources.get(name)) is not None}
     for name, path in given.items():
         if not digests.available(name):
@@ -178,6 +188,7 @@ def _run_stage(
         manifests={name: manifest for name in stage.reads_manifests if (manifest := workspace.published(name))},
         record=workspace.record if stage.reads_run else None,
         config=config if stage.reads_run else None,
+        previous=workspace.stage_folder(stage.name) if previous else None,
     )
     with ResourceMeter() as meter:
         numbers = _call(stage, context, workspace, status)

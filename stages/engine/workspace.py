@@ -15,7 +15,6 @@ removed. `recover` completes whichever of these steps a crash cut off.
 from __future__ import annotations
 
 import errno
-import fcntl
 import json
 import os
 import shutil
@@ -29,6 +28,7 @@ from typing import Any
 import psutil
 
 from stages.artifacts.artifact import WORKSPACE_RECORD, is_workspace
+from stages.engine.locking import take
 from stages.engine.manifest import (
     MANIFEST,
     Manifest,
@@ -154,9 +154,9 @@ class Workspace:
 
     def _take(self, descriptor: int) -> None:
         try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            take(descriptor)
         except BlockingIOError:
-            raise _busy_error(self.root, os.pread(descriptor, 4096, 0)) from None
+            raise _busy_error(self.root, (self.root / ".lock").read_bytes()) from None
         except OSError as error:
             # Some network file systems have no locks. Working without one is better than not working.
             if error.errno not in LOCKS_UNSUPPORTED:
@@ -164,7 +164,8 @@ class Workspace:
         holder = {"pid": os.getpid(), "host": socket.gethostname(), "since": now()}
         with storage_errors(self.root, "opening the workspace"):
             os.ftruncate(descriptor, 0)
-            os.pwrite(descriptor, json.dumps(holder).encode(), 0)
+            os.lseek(descriptor, 0, os.SEEK_SET)
+            os.write(descriptor, json.dumps(holder).encode())
 
     def in_use(self) -> bool:
         """Whether a process on this machine that took the lock is still there. Takes no lock, so it disturbs none."""
@@ -413,6 +414,8 @@ def _write(path: Path, text: str) -> None:
 
 
 def _sync(path: Path) -> None:
+    if os.name == "nt":  # it syncs neither folders nor files that are open for reading
+        return
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
