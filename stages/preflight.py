@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from collections import Counter
 from dataclasses import asdict, dataclass
@@ -12,7 +13,7 @@ from configs.params import Config
 from stages.capture.inspection import Inspection, inspect
 from stages.capture.listing import NAMED, by_reason, name_some
 from stages.capture.salient import INSTALL, find_weights
-from stages.limits import available_memory
+from stages.limits import available_memory, nearest_existing
 
 Verdict = Literal["go", "go with warnings", "no-go"]
 
@@ -104,8 +105,7 @@ def preflight(
     """
     seen = inspect(source, masks, config.ingest.video_frames, workers, decode)
     needs = estimate(seen, config, device, workers)
-    while not folder.exists():
-        folder = folder.parent
+    folder = nearest_existing(folder)
     memory, disk = available_memory() / GIB, shutil.disk_usage(folder).free / 1e9
     refusals, shortages = [], []
     if len(seen.sizes) < config.ingest.min_images:
@@ -115,6 +115,8 @@ def preflight(
             f"It may take {needs.memory_gib:.1f} GiB of memory, {memory:.1f} are free: close other programs, or try "
             "`--set undistort.max_side=800`, `--workers 1`."
         )
+    if not os.access(folder, os.W_OK):
+        shortages.append(f"{folder} cannot be written: try `--workspace DIR`.")
     if needs.disk_gb > disk:
         shortages.append(f"It may take {needs.disk_gb:.1f} GB of disk, {disk:.1f} are free: try `--workspace DIR`.")
     warnings = _warnings(seen, config)
