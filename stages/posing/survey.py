@@ -197,8 +197,8 @@ def _too_few(control: GroundControl, seen: Sequence[_SeenPoint], reason: str) ->
         f"The {len(fitted)} control points in {control.origin}{checks} do not tell the scale: {reason}"
         f"{': ' + trouble if trouble else ''}.",
         f"Mark at least {MIN_FOR_SCALE} points ({MIN_FOR_PLACE} for place and direction) in {MIN_PHOTOS} photos or "
-        "more each, from apart; pixels count from the upper left corner of the upright photo in full size. `--no-control` "
-        "leaves control points out.",
+        "more each, from apart; pixels count from the upper left corner of the upright photo in full size. "
+        "`--no-control` leaves control points out.",
     )
 
 
