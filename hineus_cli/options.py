@@ -62,7 +62,18 @@ Photos = Annotated[
 OfWorkspace = Annotated[Path, typer.Argument(help="The workspace's folder.")]
 WorkspaceOption = Annotated[
     Path | None,
-    typer.Option("--workspace", "-w", help="Folder for all results; default: PHOTOS_hineus here.", show_default=False),
+    typer.Option(
+        "--workspace",
+        "-w",
+        help="Folder for all results; default: PHOTOS_hineus beside the photos.",
+        show_default=False,
+    ),
+]
+OtherPhotos = Annotated[
+    bool,
+    typer.Option(
+        "--other-photos", help="Use a workspace that was made of other photos, too: its results are replaced."
+    ),
 ]
 Masks = Annotated[
     Path | None, typer.Option(help="Folder of masks, named like the photos, white on the object.", show_default=False)
@@ -154,6 +165,7 @@ def settings(
 def of_a_run(
     photos: Photos = None,
     workspace: WorkspaceOption = None,
+    other_photos: OtherPhotos = False,
     masks: Masks = None,
     no_masks: NoMasks = False,
     poses: Poses = None,
@@ -175,6 +187,7 @@ def of_a_run(
     return Request(
         photos=photos,
         workspace=workspace,
+        other_photos=other_photos,
         masks=masks,
         no_masks=no_masks,
         poses=poses,

@@ -20,7 +20,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from configs.params import IngestParams
-from stages.artifacts import IMAGE_SET, PHOTOS, ImageRecord, ImageSet, SkippedImage
+from stages.artifacts import IMAGE_SET, LEFT_OUT, PHOTOS, ImageRecord, ImageSet, SkippedImage
 from stages.capture.background import PLAIN_PHOTOS, plain_mask
 from stages.capture.exif import ORIENTATION, camera_key, focal_px, read_gps
 from stages.capture.listing import NAMED, by_reason, list_captures, name_some
@@ -65,7 +65,7 @@ def run(context: StageContext[IngestParams]) -> dict[str, Any]:
         paths = list(cameras)
         _tell_unused(poses, {camera.name for camera in cameras.values()})
     unseen = {path for path in paths if any(fnmatchcase(path, pattern) for pattern in params.leave_out)}
-    skipped += [SkippedImage(path, "named in ingest.leave_out") for path in paths if path in unseen]
+    skipped += [SkippedImage(path, LEFT_OUT) for path in paths if path in unseen]
     paths = [path for path in paths if path not in unseen]
 
     unique, copies = _without_copies(paths, files, context)

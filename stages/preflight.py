@@ -62,6 +62,7 @@ class Preflight:
 
     Attributes:
         refusals: reasons for "no-go" that lie in the photos; `shortages`: those that lie in the machine.
+        kept: what a run would keep of the workspace that is there, see `stages.kept`; empty where nothing has changed.
     """
 
     inspection: Inspection
@@ -69,6 +70,7 @@ class Preflight:
     warnings: tuple[str, ...]
     refusals: tuple[str, ...]
     shortages: tuple[str, ...]
+    kept: str = ""
 
     @property
     def verdict(self) -> Verdict:
@@ -94,6 +96,7 @@ class Preflight:
             "warnings": list(self.warnings),
             "refusals": list(self.refusals),
             "shortages": list(self.shortages),
+            "kept": self.kept,
         }
 
 
@@ -227,6 +230,8 @@ def facts(done: Preflight) -> list[tuple[str, str]]:
                 "object out",
             )
         )
+    if done.kept:
+        lines.append(("workspace", done.kept))
     minutes = "not measured on a GPU" if needs.minutes is None else f"about {needs.minutes:.0f} min"
     lines.append(("needs", f"{minutes}, {needs.memory_gib:.1f} GiB of memory, {needs.disk_gb:.1f} GB of disk"))
     return lines

@@ -83,6 +83,8 @@ def write_capture(
     folder = artifacts.MODEL.load(sfm)
     folder.mkdir(parents=True)
     model.write(str(folder))
+    contents = {record.name: record.sha256 for record in records}
+    artifacts.PHOTO_CONTENTS.save(sfm, artifacts.PhotoContents(lineage="first", contents=contents))
     return {"ingest": ingest, "sfm": sfm}
 
 

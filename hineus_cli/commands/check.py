@@ -61,18 +61,18 @@ def check(
     from rich.table import Table
     from rich.text import Text
 
-    from hineus_cli.console import product
+    from hineus_cli.console import plain, product
     from stages.preflight import facts
 
     table = Table.grid(padding=(0, 2))
     for what, found in facts(done):
-        table.add_row(Text(what, style="bold"), Text(found))
+        table.add_row(Text(what, style="bold"), Text(plain(found)))
     for what, style, lines in (
         ("warning", "yellow", done.warnings),
         ("no-go", "red", (*done.refusals, *done.shortages)),
     ):
         for line in lines:
-            table.add_row(Text(what, style=style), Text(line))
+            table.add_row(Text(what, style=style), Text(plain(line)))
     table.add_row(Text("verdict", style="bold"), Text(done.verdict))
     product().print(table)
     raise typer.Exit(exit_code)

@@ -11,6 +11,8 @@ from stages.artifacts.pictures import pictures_of
 
 _RECORDS = "images.json"
 
+LEFT_OUT = "named in ingest.leave_out"  # why a photo was skipped that no stage may see
+
 
 @dataclass(frozen=True)
 class ImageRecord:
