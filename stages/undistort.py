@@ -224,10 +224,9 @@ def _chosen(
             sentence = (
                 f"Only what {len(taken.photos)} photos are about is reconstructed ({_named(names, taken)}). "
                 f"{len(other.photos)} others ({_named(names, other)}) are about something {away:.0f} times its "
-                "radius away."
+                "radius away. Its model takes the place of this one: work in a copy of the workspace to keep both."
             )
             command = f"hineus run --workspace WORKSPACE --set undistort.subject={k}"
-            log.warning("%s Its model: `%s`, in a copy of the workspace to keep both.", sentence, command)
             warnings.append({"sentence": sentence, "command": command})
     return taken.photos, warnings
 

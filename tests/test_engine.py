@@ -580,6 +580,21 @@ def test_many_reasons_are_counted() -> None:
     assert StageStatus("sfm", "fresh").reason == "nothing changed"
 
 
+def test_a_warning_s_command_names_this_workspace(tmp_path: Path, caplog) -> None:
+    def warning(context: StageContext) -> dict[str, Any]:
+        numbers = TOY[1].run(context)
+        return {**numbers, "warnings": [{"sentence": "A cut.", "command": "hineus run --workspace WORKSPACE --x"}]}
+
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    workspace = Workspace.open(tmp_path / "my work", create=True)
+    run_pipeline(with_stage("sfm", run=warning), workspace, Config(), {"photos": photos, "masks": None})
+    assert f"A cut. Try: `hineus run --workspace '{tmp_path}/my work' --x`" in caplog.text
+    made = workspace.published("sfm")
+    assert made is not None
+    assert made.numbers["warnings"][0]["command"] == "hineus run --workspace WORKSPACE --x"
+
+
 # ---------------------------------------------------------------- going on from the last publication
 def _longer(context: StageContext) -> dict[str, Any]:
     """Adds a letter to what was published before, after a try that fails."""

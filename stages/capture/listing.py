@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from stages.artifacts import SkippedImage
+from stages.artifacts import WORKSPACE_RECORD, SkippedImage
 from stages.capture.photo_reading import PHOTO_SUFFIXES, RAW_SUFFIXES
 from stages.errors import InputError
 
@@ -31,15 +31,25 @@ def list_captures(source: Path, masks_folder: Path | None = None) -> tuple[list[
         return [], [source.name], []
     if not source.is_dir():
         raise InputError(f"{source} is a file; a folder of photos or a video is needed.", f"hineus run {source.parent}")
+    if masks_folder is not None and masks_folder.is_file():
+        raise InputError(f"{masks_folder} is a file; a folder of masks is needed.", f"--masks {masks_folder.parent}")
     if masks_folder is not None and not masks_folder.is_dir():
         raise InputError(f"The mask folder {masks_folder} does not exist.", "Check the path given to --masks.")
     inside_masks = masks_folder.resolve() if masks_folder else None
+    if inside_masks and source.resolve() not in inside_masks.parents:  # the photos may lie in the masks' folder
+        inside_masks = None
     photos, videos, skipped = [], [], []
+    workspaces = {path.parent for path in source.rglob(WORKSPACE_RECORD)} - {source}
+    skipped += [
+        SkippedImage(path.relative_to(source).as_posix(), "a workspace of hineus") for path in sorted(workspaces)
+    ]
     for path in sorted(source.rglob("*")):
         relative = path.relative_to(source)
         if not path.is_file() or any(part.startswith((".", "__MACOSX")) for part in relative.parts):
             continue
-        if inside_masks and inside_masks != source.resolve() and inside_masks in path.resolve().parents:
+        if inside_masks and inside_masks in path.resolve().parents:
+            continue
+        if workspaces.intersection(path.parents):
             continue
         name, suffix = relative.as_posix(), path.suffix.lower()
         if suffix in PHOTO_SUFFIXES | RAW_SUFFIXES:

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from stages.capture.exif import ORIENTATION, camera_key, focal_px
+from stages.capture.exif import NO_GPS, ORIENTATION, Gps, camera_key, focal_px, read_gps
 
 # What COLMAP's reader takes as it is; the rest is re-encoded.
 COLMAP_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"})
@@ -40,6 +40,8 @@ class PhotoFile:
         width, height: upright size in pixels.
         camera: photos with the same value share one camera's intrinsics.
         has_focal: whether EXIF gives the focal length.
+        gps: what EXIF says of the place.
+        orientation: EXIF's, of the stored pixels.
     """
 
     source: str
@@ -47,6 +49,13 @@ class PhotoFile:
     height: int
     camera: str
     has_focal: bool
+    gps: Gps = NO_GPS
+    orientation: int = 1
+
+    @property
+    def stored_size(self) -> tuple[int, int]:
+        """Width and height in pixels before it is turned upright."""
+        return (self.height, self.width) if self.orientation in TURNED else (self.width, self.height)
 
 
 @dataclass(frozen=True)
@@ -109,9 +118,11 @@ def read_head(file: Path, source: str) -> PhotoFile:
                 # the PNG plug-in's own `getexif` would decode the pixels, to look behind them
                 exif, size = Image.Image.getexif(stored), stored.size
     _check_side(size)
-    width, height = size[::-1] if exif.get(ORIENTATION) in TURNED else size
+    orientation = exif.get(ORIENTATION, 1)
+    width, height = size[::-1] if orientation in TURNED else size
     camera = camera_key(exif, (width, height), source)
-    return PhotoFile(source, width, height, camera, has_focal=focal_px(exif, size) is not None)
+    focal = focal_px(exif, size) is not None
+    return PhotoFile(source, width, height, camera, focal, gps=read_gps(exif), orientation=orientation)
 
 
 def read_preview(file: Path) -> np.ndarray:
@@ -128,6 +139,22 @@ def read_preview(file: Path) -> np.ndarray:
         with Image.open(file) as stored:
             stored.draft("RGB", (PREVIEW_SIDE, PREVIEW_SIDE))
             return np.asarray(stored.convert("RGB"))
+
+
+def read_alpha(file: Path) -> np.ndarray | None:
+    """[H, W] bool of the upright photo, what its alpha channel keeps; None where it cuts nothing out.
+
+    Raises:
+        UnusableError: it cannot be decoded.
+    """
+    from PIL import Image
+
+    if _is_raw(file):
+        return None
+    with Image.open(file) as stored:
+        if not {"A", "a"} & set(stored.getbands()) and "transparency" not in stored.info:
+            return None
+    return read_photo(file).alpha
 
 
 def _is_raw(file: Path) -> bool:

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from configs.dotted import flatten
+from stages.artifacts.artifact import is_workspace
 from stages.errors import InputError
 
 CHUNK_BYTES = 1 << 20
@@ -146,9 +147,10 @@ def file_sha256(path: Path) -> str:
 
 
 def walk_files(folder: Path) -> Iterator[Path]:
-    """All files below `folder` in sorted order, hidden ones (".DS_Store") and hidden folders left out."""
+    """All files below `folder` in sorted order, hidden ones (".DS_Store"), hidden folders and workspaces left out."""
     for parent, folders, files in os.walk(folder):
-        folders[:] = sorted(name for name in folders if not name.startswith("."))
+        shown = (name for name in folders if not name.startswith(".") and not is_workspace(Path(parent) / name))
+        folders[:] = sorted(shown)
         for name in sorted(files):
             if not name.startswith("."):
                 yield Path(parent) / name

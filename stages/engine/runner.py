@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -119,6 +120,12 @@ def run_pipeline(
     return outcomes
 
 
+def naming_command(source: str, root: Path) -> str:
+    """The command that names the place of an outside path ("photos", "masks") to the workspace at `root`."""
+    option = "" if source == "photos" else f"--{source} "
+    return f"hineus run {option}{source.upper()} --workspace {shlex.quote(str(root))}"
+
+
 def _select(
     pipeline: Sequence[Stage[Any]], from_stage: str | None, until: str | None, force: Sequence[str]
 ) -> tuple[Sequence[Stage[Any]], dict[str, str]]:
@@ -160,7 +167,7 @@ def _run_stage(
         if not digests.available(name):
             raise InputError(
                 f"Stage {stage.name} must run ({status.reason}), but its {name} are not at {path} any more.",
-                f"Bring them back, or name the new place: `hineus run PHOTOS --workspace {workspace.root}`.",
+                f"Bring them back, or name the new place: `{naming_command(name, workspace.root)}`.",
             )
 
     def progress(done: float, total: float, note: str = "") -> None:
@@ -185,6 +192,7 @@ def _run_stage(
     )
     with ResourceMeter() as meter:
         numbers = _call(stage, context, workspace, status)
+    _tell_warnings(numbers, workspace.root)
     manifest = _describe(identity, out, numbers, meter, workspace)
     _check_outputs(stage, manifest)
     workspace.publish(stage.name, manifest)
@@ -213,6 +221,14 @@ def _call(
         if wanted := requirement_error(error, stage.name):
             raise wanted from error
         raise
+
+
+def _tell_warnings(numbers: Mapping[str, Any], root: Path) -> None:
+    """Those with a command to try. Results know no paths: the workspace is named here, and by the report's page."""
+    for warning in numbers.get("warnings", ()):
+        if command := warning.get("command"):
+            named = command.replace("--workspace WORKSPACE", f"--workspace {shlex.quote(str(root))}")
+            log.warning("%s Try: `%s`", warning["sentence"], named)
 
 
 def _check_outputs(stage: Stage[Any], manifest: Manifest) -> None:

@@ -176,7 +176,9 @@ def _by_artifact(inputs: Mapping[str, str], stage: Stage[Any], earlier: Mapping[
 
 
 def _source_files(name: str, digests: SourceDigests, before: Identity | None) -> FileDigests | None:
-    # Photos that are no longer there are no reason to lose what was made from them.
-    if before is not None and name in before.sources and not digests.available(name):
+    # Photos that are no longer there are no reason to lose what was made from them; an empty folder is where a disk
+    # was mounted.
+    files = digests.files(name) if digests.available(name) else {}
+    if files == {} and before is not None and name in before.sources:
         return before.sources[name]
     return digests.files(name)
