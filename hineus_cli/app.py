@@ -111,7 +111,6 @@ def build_app(pipeline: Sequence[Stage] = PIPELINE) -> typer.Typer:
     app = typer.Typer(
         cls=Group,
         no_args_is_help=True,
-        add_completion=False,
         pretty_exceptions_enable=False,
         rich_markup_mode="rich",
     )

@@ -11,7 +11,7 @@ import logging
 import math
 import shutil
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from fnmatch import fnmatchcase
 from pathlib import Path, PurePosixPath
@@ -22,10 +22,27 @@ import numpy as np
 from configs.params import IngestParams
 from stages.artifacts import IMAGE_SET, LEFT_OUT, PHOTOS, ImageRecord, ImageSet, SkippedImage
 from stages.capture.background import PLAIN_PHOTOS, plain_mask
-from stages.capture.exif import ORIENTATION, camera_key, focal_px, gps_position
+from stages.capture.exif import ORIENTATION, camera_key, focal_px, read_gps
 from stages.capture.listing import NAMED, by_reason, list_captures, name_some
-from stages.capture.masks import check_size, match_masks, read_mask, write_mask
-from stages.capture.photo_reading import Photo, UnusableError, read_photo
+from stages.capture.mask_doubts import MaskLook, find_doubts, is_black_and_white, nothing_kept
+from stages.capture.mask_names import set_masks_aside
+from stages.capture.masks import (
+    EMPTY,
+    MASK_NOT_PHOTO,
+    Mask,
+    PairMasks,
+    alpha_of,
+    check_size,
+    choose_masks,
+    load_mask,
+    look_at_mask,
+    match_masks,
+    missing_masks,
+    tell_masks,
+    unused_masks,
+    write_mask,
+)
+from stages.capture.photo_reading import TURNED, Photo, UnusableError, read_photo
 from stages.capture.quality import Appearance, appearance, find_oddities
 from stages.capture.salient import SalientNetwork
 from stages.capture.video import extract_frames
@@ -34,12 +51,13 @@ from stages.engine.stage import Stage, StageContext
 from stages.errors import InputError
 from stages.inputs.folders import short_name, unique_name
 from stages.inputs.formats import PHOTO_SUFFIXES, RAW_SUFFIXES
-from stages.posing.known import KnownPoses, match_photos
+from stages.posing.known import KnownPoses, check_masks, match_photos
 from stages.posing.nero import DEPTH, read_depth_mask
 from stages.posing.reading import read_poses
 
 log = logging.getLogger(__name__)
 
+LOOK_SIDE, NEAREST = 1024, 0  # a look at a photo and its mask: longest side in pixels, and Pillow's resampling
 JPEG_QUALITY = 97  # re-encoded lossy photos; visually lossless, about a third of PNG's size
 
 # Photo [H, W, 3] uint8 -> mask [H, W] bool, None where there is nothing to mask.
@@ -52,9 +70,10 @@ def run(context: StageContext[IngestParams]) -> dict[str, Any]:
     """Read every photo once, write images/, masks/ and images.json."""
     params, source = context.params, context.sources["photos"]
     masks_folder = context.sources.get("masks")
-    photos, videos, skipped = list_captures(source, masks_folder)
+    captured, videos, skipped = list_captures(source, masks_folder)
+    photos, own_masks, aside = set_masks_aside(list(captured))
     frames, damaged = _frames_of(videos, context)
-    files = photos | frames
+    files = {path: captured[path] for path in photos} | frames
     skipped += damaged
     paths = sorted(files)
     poses = read_poses(context.sources["poses"]) if "poses" in context.sources else None
@@ -70,11 +89,16 @@ def run(context: StageContext[IngestParams]) -> dict[str, Any]:
     unique, copies = _without_copies(paths, files, context)
     skipped += copies
 
-    mask_files = find_masks(list(unique), masks_folder, poses) if masks_folder else {}
+    mask_files = choose_masks(
+        {path: files[path] for path in unique}, own_masks, captured, masks_folder, params.own_masks, pairs_of(poses)
+    )
+    skipped += unused_masks(aside, captured, mask_files.values(), params.own_masks, masks_folder)
+    if not mask_files and (none := missing_masks(list(unique), mask_files, masks_folder)):
+        raise none
     names, make_mask = _Names(unique), _mask_maker(params)
     done = 0
 
-    def take(path: str) -> tuple[ImageRecord, Appearance, str] | SkippedImage:
+    def take(path: str) -> tuple[ImageRecord, Appearance, MaskLook | None, str] | SkippedImage:
         nonlocal done
         try:
             return _take_photo(files[path], path, unique[path], mask_files.get(path), make_mask, names, context)
@@ -86,34 +110,33 @@ def run(context: StageContext[IngestParams]) -> dict[str, Any]:
 
     outcomes = _in_threads(take, unique, context.workers)
     taken = [o for o in outcomes if not isinstance(o, SkippedImage)]
-    images = sorted((record for record, _, _ in taken), key=lambda record: record.name)
+    images = sorted((record for record, *_ in taken), key=lambda record: record.name)
     skipped += [o for o in outcomes if isinstance(o, SkippedImage)]
     if params.auto_mask == "plain":
         images, without = _before_plain_backgrounds(images, context)
         skipped += without
     skipped.sort(key=lambda item: item.source)
+    looks = [look for _, _, look, _ in taken if look is not None]
+    _judge_masks(looks, skipped, params)
 
     if len(images) < params.min_images:
         raise _too_few(source, len(images), params.min_images, skipped)
-    missing = [record.source for record in images if masks_folder and record.source not in mask_files]
-    if missing:
-        raise InputError(
-            f"{len(missing)} of {len(images)} photos have no mask in {masks_folder}: {name_some(missing)}.",
-            f"Add {Path(missing[0]).stem}.png and the like, move those photos away, or run with `--no-masks`.",
-        )
+    if some := missing_masks([record.source for record in images], mask_files, masks_folder):
+        raise some
     for expected, level in ((True, logging.INFO), (False, logging.WARNING)):
         for reason, sources in by_reason(item for item in skipped if item.expected is expected).items():
             log.log(level, "left out %s: %s", name_some(sources), reason)
-    doubtful = [SkippedImage(record.source, problem) for record, _, problem in taken if problem]
+    doubtful = [SkippedImage(record.source, problem) for record, *_, problem in taken if problem]
     for problem, sources in by_reason(doubtful).items():
         log.warning("%s: %s", name_some(sources), problem)
     # a video's frames are the sharpest of their stretch and near each other by choice
-    odd = find_oddities([seen for _, seen, _ in taken if seen.source not in frames])
+    odd = find_oddities([seen for _, seen, *_ in taken if seen.source not in frames])
     for warning in odd.warnings:
         log.warning("%s", warning)
     masked = sum(record.has_mask for record in images)
     if 0 < masked < len(images):
-        origin = "nothing stands out in the others" if params.auto_mask == "salient" else "from their alpha channel"
+        origin = "found among them" if mask_files else "from their alpha channel"
+        origin = "nothing stands out in the others" if params.auto_mask == "salient" else origin
         log.warning("only %d of %d photos have a mask (%s)", masked, len(images), origin)
     context.write(IMAGE_SET, ImageSet(tuple(images), tuple(skipped)))
     return {
@@ -193,28 +216,63 @@ def _tell_unused(poses: KnownPoses, used: set[str]) -> None:
         log.warning("%d of %d poses in %s have no photo: %s", len(unused), total, file, name_some(unused))
 
 
-def find_masks(photos: list[str], folder: Path, poses: KnownPoses | None) -> dict[str, Path]:
-    """Photo -> its mask file in `folder`; as the poses' format pairs them where it is that format's own folder."""
-    if poses is None or {file.parent.resolve() for file in poses.masks.values()} != {folder.resolve()}:
-        return match_masks(photos, folder)
+def pairs_of(poses: KnownPoses | None) -> PairMasks:
+    """`find_masks` with these poses."""
+    return lambda photos, folder, not_masks: find_masks(photos, folder, poses, not_masks)
+
+
+def find_masks(
+    photos: list[str], folder: Path, poses: KnownPoses | None, not_masks: Collection[Path] = ()
+) -> dict[str, Path]:
+    """Photo -> its mask file in `folder`; as the poses' file pairs them where it is the folder of that file's masks.
+
+    Raises:
+        InputError: the poses name masks that are not there.
+    """
+    own = poses.masks if poses is not None else {}
+    if poses is None or not own or not all(file.resolve().is_relative_to(folder.resolve()) for file in own.values()):
+        return match_masks(photos, folder, not_masks)
+    check_masks(own, poses.origin)
     cameras = match_photos(poses, photos)
-    named = {photo: poses.masks.get(camera.name) for photo, camera in cameras.items()}
-    return {photo: file for photo, file in named.items() if file is not None}
+    return {photo: own[camera.name] for photo, camera in cameras.items() if camera.name in own}
 
 
 def read_mask_file(
-    file: Path, photo: str, size: tuple[int, int], stored_size: tuple[int, int], orientation: int
-) -> np.ndarray:
-    """Mask [H, W] bool of the upright photo, of a picture or of a depth image.
+    file: Path,
+    photo: str,
+    size: tuple[int, int],
+    stored_size: tuple[int, int],
+    orientation: int,
+    black_keeps: bool = False,
+    pixels: np.ndarray | None = None,
+) -> Mask:
+    """Mask of the upright photo, of a picture (see `load_mask`) or of a depth image.
 
     Raises:
         InputError: it cannot be read, or is not of the upright photo's size (width, height).
     """
     if not file.name.endswith(DEPTH):
-        return read_mask(file, photo, size, stored_size, orientation)
+        return load_mask(file, photo, size, stored_size, orientation, black_keeps, pixels)
     mask = read_depth_mask(file)
-    check_size(file, photo, mask.shape[::-1], size)
-    return mask
+    check_size(file, photo, (mask.shape[1], mask.shape[0]), size)
+    return Mask(mask, size)
+
+
+def _judge_masks(looks: list[MaskLook], skipped: list[SkippedImage], params: IngestParams) -> None:
+    """Say which masks are used and what is doubtful about them.
+
+    Raises:
+        InputError: nothing good can come of these masks.
+    """
+    empty = [item.source for item in skipped if item.reason.startswith(EMPTY)]
+    if empty and not looks:
+        raise InputError(*nothing_kept(len(empty), empty[0]))
+    if looks:
+        log.info("masks: %s", tell_masks(looks))
+    for doubt in find_doubts(looks, params.masks_keep != "auto"):
+        if doubt.impossible:
+            raise InputError(doubt.message, doubt.hint)
+        log.warning("%s %s", doubt.message, doubt.hint)
 
 
 class _Names:
@@ -298,15 +356,12 @@ def _take_photo(
     make_mask: MaskMaker | None,
     names: _Names,
     context: StageContext[IngestParams],
-) -> tuple[ImageRecord, Appearance, str]:
-    """Its record, its looks, and what is wrong with its colours, in words."""
+) -> tuple[ImageRecord, Appearance, MaskLook | None, str]:
+    """Its record, its looks, a look at the mask it came with, and what is wrong with its colours, in words."""
     max_side = context.params.max_side
     photo = read_photo(file, max_side)
-    rgb, mask = photo.rgb, photo.alpha
-    if mask_file is not None:
-        mask = read_mask_file(mask_file, source, photo.size, photo.stored_size, photo.orientation)
-    if mask is not None and not mask.any():
-        raise UnusableError(f"its mask is empty ({mask_file.name if mask_file else 'alpha channel'})")
+    rgb = photo.rgb
+    mask, look = _given_mask(photo, source, mask_file, context.params)
 
     made_mask = ""
     if mask is None and make_mask is not None:
@@ -336,10 +391,33 @@ def _take_photo(
         blur=seen.sharpness,
         has_mask=mask is not None,
         sha256=digest,
-        gps=gps_position(photo.exif),
+        gps=read_gps(photo.exif).position,
         made_mask=made_mask,
+        taken=photo.stored_size[::-1] if photo.orientation in TURNED else photo.stored_size,
     )
-    return record, seen, photo.colours.problem
+    return record, seen, look, photo.colours.problem
+
+
+def _given_mask(
+    photo: Photo, source: str, mask_file: Path | None, params: IngestParams
+) -> tuple[np.ndarray | None, MaskLook | None]:
+    """The mask [H, W] bool that comes with a photo, as its file or its alpha channel, and a look at it.
+
+    Raises:
+        UnusableError: the mask keeps nothing, or the photo is a mask itself.
+    """
+    black_keeps = params.masks_keep == "black"
+    scale = min(1.0, LOOK_SIDE / max(photo.rgb.size))
+    preview = np.asarray(photo.rgb.resize([max(1, round(side * scale)) for side in photo.rgb.size], resample=NEAREST))
+    if is_black_and_white(preview):
+        raise UnusableError(MASK_NOT_PHOTO)
+    if mask_file is not None:
+        mask = read_mask_file(mask_file, source, photo.size, photo.stored_size, photo.orientation, black_keeps, preview)
+    elif photo.alpha is not None and params.own_masks:
+        mask = Mask(photo.alpha ^ black_keeps, photo.size)
+    else:
+        return None, None
+    return mask.kept, look_at_mask(source, mask_file.name if mask_file else alpha_of(source), mask, preview)
 
 
 def _encoded_suffixes(photo: Photo) -> tuple[str, ...]:

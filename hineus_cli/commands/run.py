@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from hineus_cli.completing import stage_names
 from hineus_cli.options import Json, Until, Verbose, with_options_of_a_run
 from hineus_cli.session import Session, as_argument, print_json
 from stages.engine.stage import Stage
@@ -22,11 +23,18 @@ def run(
     context: typer.Context,
     request: Request,
     from_stage: Annotated[
-        str | None, typer.Option("--from", help="Run this stage and all after it, even if fresh.", show_default=False)
+        str | None,
+        typer.Option(
+            "--from",
+            help="Run this stage and all after it, even if fresh.",
+            show_default=False,
+            autocompletion=stage_names,
+        ),
     ] = None,
     until: Until = None,
     force: Annotated[
-        list[str] | None, typer.Option(help="Run this stage even if fresh. Repeatable.", show_default=False)
+        list[str] | None,
+        typer.Option(help="Run this stage even if fresh. Repeatable.", show_default=False, autocompletion=stage_names),
     ] = None,
     as_json: Json = False,
     verbose: Verbose = False,

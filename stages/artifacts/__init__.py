@@ -7,7 +7,15 @@ finished workspace loads them from the folder of the stage that owns them: `arti
 from stages.artifacts.artifact import Artifact
 from stages.artifacts.atlas import ATLAS_MESH, AtlasMesh
 from stages.artifacts.bake import BASE_COLOR, NORMAL_MAP, OCCLUSION, PROVENANCE, QUALITY, VertexQuality
-from stages.artifacts.export import ASSET, asset_path, collision_path, lod_path, obj_normal_map_path
+from stages.artifacts.export import (
+    ASSET,
+    GEOREFERENCE,
+    METADATA,
+    asset_path,
+    collision_path,
+    lod_path,
+    obj_normal_map_path,
+)
 from stages.artifacts.ingest import IMAGE_SET, LEFT_OUT, PHOTOS, ImageRecord, ImageSet, SkippedImage
 from stages.artifacts.json_files import read_json, write_json
 from stages.artifacts.mesh import CLEAN_FULL_MESH, CLEAN_MESH, RAW_MESH

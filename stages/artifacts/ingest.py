@@ -30,6 +30,7 @@ class ImageRecord:
         gps: latitude and longitude in degrees (WGS 84) and altitude in metres, where EXIF has all three.
         made_mask: the way of `ingest.auto_mask` in which its mask was made; empty where it came with the photo or
             there is none. What "salient" made is a guess, see `SILHOUETTES`.
+        taken: upright width and height in pixels of the source, which may have been reduced; None in older workspaces.
     """
 
     name: str
@@ -43,6 +44,7 @@ class ImageRecord:
     sha256: str
     gps: tuple[float, float, float] | None = None
     made_mask: str = ""
+    taken: tuple[int, int] | None = None
 
 
 @dataclass(frozen=True)

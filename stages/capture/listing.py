@@ -51,15 +51,19 @@ def list_captures(source: Path, masks_folder: Path | None = None) -> tuple[Files
         return {}, {readable(source.name): source}, []
     if not source.is_dir():
         raise InputError(f"{source} is a file; a folder of photos or a video is needed.", f"hineus run {source.parent}")
+    if masks_folder is not None and masks_folder.is_file():
+        raise InputError(f"{masks_folder} is a file; a folder of masks is needed.", f"--masks {masks_folder.parent}")
     if masks_folder is not None and not masks_folder.is_dir():
         raise InputError(f"The mask folder {masks_folder} does not exist.", "Check the path given to --masks.")
     inside_masks = masks_folder.resolve() if masks_folder else None
+    if inside_masks and source.resolve() not in inside_masks.parents:  # the photos may lie in the masks' folder
+        inside_masks = None
     photos: Files = {}
     videos: Files = {}
     files, left = named_files(source)
     skipped = [SkippedImage(item.name, item.reason, expected=not item.missed) for item in left]
     for name, path in files.items():
-        if inside_masks and inside_masks != source.resolve() and inside_masks in path.resolve().parents:
+        if inside_masks and inside_masks in path.resolve().parents:
             continue
         try:
             kind, words = _kind(path)

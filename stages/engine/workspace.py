@@ -15,7 +15,6 @@ removed. `recover` completes whichever of these steps a crash cut off.
 from __future__ import annotations
 
 import errno
-import fcntl
 import json
 import os
 import shutil
@@ -28,6 +27,7 @@ from typing import Any
 
 import psutil
 
+from stages.engine.locking import take
 from stages.engine.manifest import (
     MANIFEST,
     Manifest,
@@ -155,9 +155,9 @@ class Workspace:
 
     def _take(self, descriptor: int) -> None:
         try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            take(descriptor)
         except BlockingIOError:
-            raise _busy_error(self.root, os.pread(descriptor, 4096, 0)) from None
+            raise _busy_error(self.root, (self.root / ".lock").read_bytes()) from None
         except OSError as error:
             # Some network file systems have no locks. Working without one is better than not working.
             if error.errno not in LOCKS_UNSUPPORTED:
@@ -165,7 +165,8 @@ class Workspace:
         holder = {"pid": os.getpid(), "host": socket.gethostname(), "since": now()}
         with storage_errors(self.root, "opening the workspace"):
             os.ftruncate(descriptor, 0)
-            os.pwrite(descriptor, json.dumps(holder).encode(), 0)
+            os.lseek(descriptor, 0, os.SEEK_SET)
+            os.write(descriptor, json.dumps(holder).encode())
 
     def in_use(self) -> bool:
         """Whether a process on this machine that took the lock is still there. Takes no lock, so it disturbs none."""
@@ -265,7 +266,7 @@ def storage_errors(root: Path, doing: str, needed: int | None = None) -> Iterato
         yield
     except OSError as error:
         if error.errno in DISK_FULL:
-            raise disk_full_error(root, doing, needed) from error
+            raise disk_full_error(root, doing, error, needed) from error
         if error.errno in NOT_WRITABLE:
             raise WorkspaceError(
                 f"The workspace {root} cannot be written while {doing}: {error.strerror} ({error.filename}).",
@@ -274,10 +275,16 @@ def storage_errors(root: Path, doing: str, needed: int | None = None) -> Iterato
         raise
 
 
-def disk_full_error(root: Path, doing: str, needed: int | None = None) -> WorkspaceError:
+def disk_full_error(root: Path, doing: str, error: BaseException, needed: int | None = None) -> WorkspaceError:
+    free = free_bytes(root)
+    if isinstance(error, OSError) and error.errno == errno.EDQUOT:
+        return WorkspaceError(
+            f"Your quota is used up while {doing}, though the disk at {root} has {show_bytes(free)} free.",
+            "Nothing published is lost: free some of yours (`quota -s`) and run the same command again to go on.",
+        )
     least = f"at least {show_bytes(needed)} more needed" if needed else "more is needed"
     return WorkspaceError(
-        f"The disk is full while {doing}: {show_bytes(free_bytes(root))} free at {root}, {least}.",
+        f"The disk is full while {doing}: {show_bytes(free)} free at {root}, {least}.",
         "Nothing published is lost: free some space and run the same command again to go on.",
     )
 
@@ -425,6 +432,8 @@ def _write(path: Path, text: str) -> None:
 
 
 def _sync(path: Path) -> None:
+    if os.name == "nt":  # it syncs neither folders nor files that are open for reading
+        return
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)

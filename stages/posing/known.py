@@ -88,14 +88,12 @@ def match_photos(poses: KnownPoses, photos: Iterable[str]) -> dict[str, KnownCam
     photos = list(photos)
     by_stem: dict[str, list[str]] = {}
     for photo in photos:
-        by_stem.setdefault(_parts(photo)[-1], []).append(photo)
+        by_stem.setdefault(stem(photo), []).append(photo)
     cameras_of: dict[str, list[tuple[tuple[int, bool], KnownCamera]]] = {}
     for camera in poses.cameras:
-        scored = [(_likeness(camera.name, photo), photo) for photo in by_stem.get(_parts(camera.name)[-1], [])]
-        if not scored:
+        best, fitting = best_fits(camera.name, by_stem.get(stem(camera.name), []))
+        if not fitting:
             continue
-        best = max(score for score, _ in scored)
-        fitting = [photo for score, photo in scored if score == best]
         if len(fitting) > 1:
             raise InputError(
                 f"The pose of {camera.name} in {poses.origin} fits {len(fitting)} photos: {fitting[0]}, {fitting[1]}.",
@@ -116,6 +114,22 @@ def match_photos(poses: KnownPoses, photos: Iterable[str]) -> dict[str, KnownCam
     return matched
 
 
+def best_fits(name: str, photos: Iterable[str]) -> tuple[tuple[int, bool], list[str]]:
+    """How well photos fit a name that another program gave one, and those that fit it best: one where all is well.
+
+    Args:
+        photos: relative posix paths, of which only those count whose last part agrees, suffix aside.
+    """
+    scored = [(_likeness(name, photo), photo) for photo in photos]
+    best = max((score for score, _ in scored), default=(0, False))
+    return best, [photo for score, photo in scored if score == best and score[0] > 0]
+
+
+def stem(name: str) -> str:
+    """The last part of a posix path, suffix aside; "frame.0001" has none."""
+    return _parts(name)[-1]
+
+
 def _parts(name: str) -> tuple[str, ...]:
     """Of a path with "/", or with "\\" as Windows has it; photos' names with that in them are cut alike.
 
@@ -133,6 +147,19 @@ def _likeness(first: str, second: str) -> tuple[int, bool]:
             break
         common += 1
     return common, PurePosixPath(first).suffix.lower() == PurePosixPath(second).suffix.lower()
+
+
+def check_masks(masks: Mapping[str, Path], origin: Path) -> None:
+    """
+    Raises:
+        InputError: a mask that the poses' file `origin` names is not there.
+    """
+    missing = sorted(str(file) for file in masks.values() if not file.is_file())
+    if missing:
+        raise InputError(
+            f"{len(missing)} of {len(masks)} masks that {origin} names are not there, e.g. {missing[0]}.",
+            "Put them there, name another folder with `--masks FOLDER`, or run without: `--no-masks`.",
+        )
 
 
 # ---------------------------------------------------------------- what readers share

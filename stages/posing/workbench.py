@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 import shutil
 import tempfile
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
@@ -38,6 +38,7 @@ from stages.posing.turning import check_parallax, parallaxes
 
 log = logging.getLogger(__name__)
 
+POSITION_DIGITS = 7  # of degrees: a centimetre
 DEFAULT_FOCAL_FACTOR = 1.2  # COLMAP's guess where nothing is known: focal = 1.2 x longest side (about 45 degrees)
 # A focal length that comes out this many times longer or shorter than the photos' EXIF says makes the EXIF doubtful:
 # rounding in EXIF costs a few percent, stabilised or cropped pictures up to a fifth.
@@ -128,7 +129,7 @@ class Workbench:
         self._first = self._latest = Base(masked=params.masks == "always")
         self._import(self._latest)
         with pycolmap.Database.open(self.database(self._latest)) as database:
-            self.located = database.num_pose_priors()
+            self.located = count_located([prior.position for prior in database.read_all_pose_priors()])
             cameras = [camera for camera in database.read_all_cameras() if camera.has_prior_focal_length]
             self.priors = {camera.camera_id: camera.mean_focal_length() for camera in cameras}
         self.matcher = choose_matcher(params, self.located, len(self.names))
@@ -595,6 +596,12 @@ def learned_weights() -> Path | None:
 
 
 # ---------------------------------------------------------------- on databases
+def count_located(positions: Sequence[np.ndarray]) -> int:
+    """Photos whose GPS position tells which others are near: all that carry one, unless most carry the same ones."""
+    apart = len({tuple(np.round(position[:2], POSITION_DIGITS).tolist()) for position in positions})
+    return len(positions) if 2 * apart > len(positions) else apart
+
+
 def choose_matcher(params: Any, located: int, num_images: int) -> str:
     """auto: all pairs of small sets, neighbours in space where most photos carry GPS, else in name.
 
