@@ -42,14 +42,14 @@ from stages.capture.masks import (
     unused_masks,
     write_mask,
 )
-from stages.capture.photo_reading import TURNED, Photo, UnusableError, read_photo
+from stages.capture.photo_reading import Photo, UnusableError, read_photo
 from stages.capture.quality import Appearance, appearance, find_oddities
 from stages.capture.salient import SalientNetwork
 from stages.capture.video import extract_frames
 from stages.engine.fingerprint import file_sha256
 from stages.engine.stage import Stage, StageContext
 from stages.errors import InputError
-from stages.inputs.folders import short_name, unique_name
+from stages.inputs.folders import readable, short_name, unique_name
 from stages.inputs.formats import PHOTO_SUFFIXES, RAW_SUFFIXES
 from stages.posing.known import KnownPoses, check_masks, match_photos
 from stages.posing.nero import DEPTH, read_depth_mask
@@ -70,10 +70,10 @@ def run(context: StageContext[IngestParams]) -> dict[str, Any]:
     """Read every photo once, write images/, masks/ and images.json."""
     params, source = context.params, context.sources["photos"]
     masks_folder = context.sources.get("masks")
-    captured, videos, skipped = list_captures(source, masks_folder)
-    photos, own_masks, aside = set_masks_aside(list(captured))
+    photos, videos, skipped = list_captures(source, masks_folder)
+    photos, own_masks, aside = set_masks_aside(photos)
     frames, damaged = _frames_of(videos, context)
-    files = {path: captured[path] for path in photos} | frames
+    files = photos | frames
     skipped += damaged
     paths = sorted(files)
     poses = read_poses(context.sources["poses"]) if "poses" in context.sources else None
@@ -90,9 +90,9 @@ def run(context: StageContext[IngestParams]) -> dict[str, Any]:
     skipped += copies
 
     mask_files = choose_masks(
-        {path: files[path] for path in unique}, own_masks, captured, masks_folder, params.own_masks, pairs_of(poses)
+        {path: files[path] for path in unique}, own_masks, masks_folder, params.own_masks, pairs_of(poses)
     )
-    skipped += unused_masks(aside, captured, mask_files.values(), params.own_masks, masks_folder)
+    skipped += unused_masks(aside, mask_files.values(), params.own_masks, masks_folder)
     if not mask_files and (none := missing_masks(list(unique), mask_files, masks_folder)):
         raise none
     names, make_mask = _Names(unique), _mask_maker(params)
@@ -357,7 +357,7 @@ def _take_photo(
     names: _Names,
     context: StageContext[IngestParams],
 ) -> tuple[ImageRecord, Appearance, MaskLook | None, str]:
-    """Its record, its looks, a look at the mask it came with, and what is wrong with its colours, in words."""
+    """Its record, its looks and its mask's, and what is wrong with its colours, in words."""
     max_side = context.params.max_side
     photo = read_photo(file, max_side)
     rgb = photo.rgb
@@ -393,7 +393,7 @@ def _take_photo(
         sha256=digest,
         gps=read_gps(photo.exif).position,
         made_mask=made_mask,
-        taken=photo.stored_size[::-1] if photo.orientation in TURNED else photo.stored_size,
+        taken=photo.size,
     )
     return record, seen, look, photo.colours.problem
 
@@ -406,18 +406,18 @@ def _given_mask(
     Raises:
         UnusableError: the mask keeps nothing, or the photo is a mask itself.
     """
-    black_keeps = params.masks_keep == "black"
+    size, black_keeps = photo.size, params.masks_keep == "black"
     scale = min(1.0, LOOK_SIDE / max(photo.rgb.size))
     preview = np.asarray(photo.rgb.resize([max(1, round(side * scale)) for side in photo.rgb.size], resample=NEAREST))
     if is_black_and_white(preview):
         raise UnusableError(MASK_NOT_PHOTO)
     if mask_file is not None:
-        mask = read_mask_file(mask_file, source, photo.size, photo.stored_size, photo.orientation, black_keeps, preview)
+        mask = read_mask_file(mask_file, source, size, photo.stored_size, photo.orientation, black_keeps, preview)
     elif photo.alpha is not None and params.own_masks:
-        mask = Mask(photo.alpha ^ black_keeps, photo.size)
+        mask = Mask(photo.alpha ^ black_keeps, size)
     else:
         return None, None
-    return mask.kept, look_at_mask(source, mask_file.name if mask_file else alpha_of(source), mask, preview)
+    return mask.kept, look_at_mask(source, readable(mask_file.name) if mask_file else alpha_of(source), mask, preview)
 
 
 def _encoded_suffixes(photo: Photo) -> tuple[str, ...]:

@@ -30,6 +30,7 @@ from stages.capture.photo_reading import PhotoFile, UnusableError, read_alpha, r
 from stages.capture.quality import Appearance, Oddities, appearance, find_oddities
 from stages.capture.video import video_size
 from stages.errors import InputError
+from stages.inputs.folders import readable
 
 
 @dataclass(frozen=True)
@@ -137,11 +138,9 @@ def inspect(
     """
     wanted = masks or MasksWanted(masks_folder)
     photos, videos, skipped = list_captures(source, masks_folder)
-    captured = photos
-    names, own, aside = set_masks_aside(list(captured))
-    photos = {path: captured[path] for path in names}
-    files = choose_masks(photos, own, captured, masks_folder, wanted.own, wanted.pair)
-    skipped += unused_masks(aside, captured, files.values(), wanted.own, masks_folder)
+    photos, own, aside = set_masks_aside(photos)
+    files = choose_masks(photos, own, masks_folder, wanted.own, wanted.pair)
+    skipped += unused_masks(aside, files.values(), wanted.own, masks_folder)
 
     def look(path: str) -> _Seen | Video | SkippedImage:
         try:
@@ -167,7 +166,7 @@ def inspect(
             files,
             tuple(item.mask for item in seen if isinstance(item.mask, MaskLook)),
             tuple(item.mask for item in seen if isinstance(item.mask, InputError)),
-            None if files or not source.is_dir() else unused_folder(source, names),
+            None if files or not source.is_dir() else unused_folder(source, list(photos)),
         ),
     )
 
@@ -200,7 +199,7 @@ def _look_at_mask(
             )
         except InputError as error:
             return error
-        return look_at_mask(head.source, mask_file.name, mask, pixels)
+        return look_at_mask(head.source, readable(mask_file.name), mask, pixels)
     alpha = read_alpha(file) if wanted.own and wanted.folder is None else None
     if alpha is None:
         return None

@@ -52,7 +52,7 @@ def match_masks(photos: list[str], folder: Path, not_masks: Collection[Path] = (
 
 
 def _pictures(folder: Path) -> dict[str, Path]:
-    """File by readable path of the pictures in a folder of masks."""
+    """By readable path, see `named_files`."""
     return {name: path for name, path in named_files(folder)[0].items() if path.suffix.lower() in PHOTO_SUFFIXES}
 
 
@@ -70,8 +70,7 @@ def unused_folder(source: Path, photos: list[str]) -> Path | None:
 
 def choose_masks(
     photos: Mapping[str, Path],
-    own: Mapping[str, str],
-    files: Mapping[str, Path],
+    own: Mapping[str, Path],
     masks_folder: Path | None,
     use_own: bool,
     pair: PairMasks = match_masks,
@@ -79,25 +78,24 @@ def choose_masks(
     """Photo -> its mask file: of `masks_folder` if that is given, else of those among the photos.
 
     Args:
-        photos: photo -> its file. own: photo -> its mask, as `set_masks_aside` found them.
-        files: path -> file of all pictures, masks among them.
+        photos: photo -> its file. own: photo -> the file of its mask, as `set_masks_aside` found them.
     """
     if masks_folder is not None:
         return dict(pair(list(photos), masks_folder, list(photos.values())))
-    return {photo: files[mask] for photo, mask in own.items() if use_own and photo in photos}
+    return {photo: mask for photo, mask in own.items() if use_own and photo in photos}
 
 
 def unused_masks(
-    aside: Iterable[str], files: Mapping[str, Path], used: Iterable[Path], use_own: bool, masks_folder: Path | None
+    aside: Mapping[str, Path], used: Iterable[Path], use_own: bool, masks_folder: Path | None
 ) -> list[SkippedImage]:
-    """Those of the masks among the photos that are not used, and why; `files`: path -> file."""
+    """Those of the masks among the photos that are not used, and why."""
     taken = {file.resolve() for file in used}
     reason = f"{ASIDE} that are of none of them, or one for all, which is no object's outline"
     if masks_folder is not None:
         reason = f"{ASIDE}, while --masks names others"
     elif not use_own:
         reason = f"{ASIDE}, not used (`--no-masks`; `--set ingest.own_masks=true` uses them)"
-    return [SkippedImage(mask, reason, expected=True) for mask in aside if files[mask].resolve() not in taken]
+    return [SkippedImage(mask, reason, expected=True) for mask, file in aside.items() if file.resolve() not in taken]
 
 
 def missing_masks(photos: Sequence[str], files: Mapping[str, Path], folder: Path | None) -> InputError | None:
