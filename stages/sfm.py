@@ -42,7 +42,7 @@ from stages.posing.adding import STAYED, KnownPhotos, known_lenses, put_back, sa
 from stages.posing.adjustment import LastAdjustment, adjust_last
 from stages.posing.evidence import MIN_VERIFIED, Evidence
 from stages.posing.known import match_photos
-from stages.posing.ladder import Solution, Step, better, climb, describe, photos_wanted
+from stages.posing.ladder import Solution, Step, climb, describe, photos_wanted
 from stages.posing.reading import read_poses
 from stages.posing.triangulation import triangulate
 from stages.posing.turning import from_one_place, parallaxes
@@ -52,6 +52,7 @@ log = logging.getLogger(__name__)
 
 FEW_POINTS = 10  # fewer points than this a photo are worth a warning where the poses are known
 DOUBTFUL_ERROR_PX = 2.0  # COLMAP's own models are below one
+MIN_CONNECTED = 0.5  # of new photos must be placed beside the known ones, or poses are found anew from all
 FEATURES_EXTRA = "pip install 'hineus[features]'"
 
 
@@ -170,21 +171,26 @@ def _solve(bench: Workbench, wanted: int, enough: int, params: SfmParams) -> tup
     known = bench.known
     if known is None:
         return climb(bench.rungs(), wanted, enough)
-    connected = len(known.poses) + photos_wanted(len(known.new), params.wanted)
+    share = max(params.wanted, MIN_CONNECTED)
+    of_new = max(
+        min(photos_wanted(len(known.new), share), photos_wanted(len(bench.names), share) - len(known.poses)),
+        photos_wanted(len(known.new), MIN_CONNECTED),
+    )
+    needed = len(known.poses) + of_new
     beside, steps = None, list[Step]()
     try:
         beside, steps = climb([bench.adding()], wanted, enough)
     except (RuntimeError, ValueError) as error:  # COLMAP's checks
         log.warning("the known poses are no start: %s", " ".join(str(error).split()))
     placed = 0 if beside is None else len(beside.registered)
-    if beside is not None and (placed >= min(connected, wanted) or not known.changed):
+    if beside is not None and (placed >= needed or not known.changed):
         return beside, steps
     log.warning(
         "beside the known photos %d of %d photos could be placed (%d wanted): poses are found anew from all",
-        placed, len(bench.names), min(connected, wanted),
+        placed, len(bench.names), needed,
     )  # fmt: skip
     anew, more = climb(bench.rungs(), wanted, enough)
-    if better(anew, beside):
+    if anew is not None and len(anew.registered) > placed:
         return anew, steps + more
     log.info("poses of the known photos stay, since no more photos were placed")
     return beside, [replace(step, kept=False) for step in more] + steps
