@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shlex
 import shutil
@@ -18,7 +19,7 @@ from stages.capture.mask_doubts import find_doubts, nothing_kept
 from stages.capture.masks import ASIDE, EMPTY, missing_masks, tell_masks
 from stages.capture.salient import INSTALL, find_weights
 from stages.ingest import pairs_of, read_mask_file
-from stages.limits import available_memory
+from stages.limits import available_memory, nearest_existing
 from stages.posing.control_files import read_control
 from stages.posing.marks import foresee
 from stages.posing.reading import read_poses
@@ -134,8 +135,7 @@ def preflight(
     wanted = MasksWanted(masks, params.own_masks, params.masks_keep == "black", pairs, read_mask_file)
     seen = inspect(source, masks, params.video_frames, workers, decode, wanted)
     needs = estimate(seen, config, device, workers)
-    while not folder.exists():
-        folder = folder.parent
+    folder = nearest_existing(folder)
     memory, disk = available_memory() / GIB, shutil.disk_usage(folder).free / 1e9
     refusals, shortages = [], []
     if len(seen.sizes) < config.ingest.min_images:
@@ -153,6 +153,8 @@ def preflight(
             f"It may take {needs.memory_gib:.1f} GiB of memory, {memory:.1f} are free: close other programs, or try "
             "`--set undistort.max_side=800`, `--workers 1`."
         )
+    if not os.access(folder, os.W_OK):
+        shortages.append(f"{folder} cannot be written: try `--workspace DIR`.")
     if needs.disk_gb > disk:
         shortages.append(f"It may take {needs.disk_gb:.1f} GB of disk, {disk:.1f} are free: try `--workspace DIR`.")
     doubts, impossible = _of_masks(seen, config, masks if decode or poses is None else None)

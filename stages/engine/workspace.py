@@ -265,7 +265,7 @@ def storage_errors(root: Path, doing: str, needed: int | None = None) -> Iterato
         yield
     except OSError as error:
         if error.errno in DISK_FULL:
-            raise disk_full_error(root, doing, needed) from error
+            raise disk_full_error(root, doing, error, needed) from error
         if error.errno in NOT_WRITABLE:
             raise WorkspaceError(
                 f"The workspace {root} cannot be written while {doing}: {error.strerror} ({error.filename}).",
@@ -274,10 +274,16 @@ def storage_errors(root: Path, doing: str, needed: int | None = None) -> Iterato
         raise
 
 
-def disk_full_error(root: Path, doing: str, needed: int | None = None) -> WorkspaceError:
+def disk_full_error(root: Path, doing: str, error: BaseException, needed: int | None = None) -> WorkspaceError:
+    free = free_bytes(root)
+    if isinstance(error, OSError) and error.errno == errno.EDQUOT:
+        return WorkspaceError(
+            f"Your quota is used up while {doing}, though the disk at {root} has {show_bytes(free)} free.",
+            "Nothing published is lost: free some of yours (`quota -s`) and run the same command again to go on.",
+        )
     least = f"at least {show_bytes(needed)} more needed" if needed else "more is needed"
     return WorkspaceError(
-        f"The disk is full while {doing}: {show_bytes(free_bytes(root))} free at {root}, {least}.",
+        f"The disk is full while {doing}: {show_bytes(free)} free at {root}, {least}.",
         "Nothing published is lost: free some space and run the same command again to go on.",
     )
 
