@@ -36,9 +36,10 @@ from stages.artifacts import (
 )
 from stages.capture.salient import INSTALL, find_weights
 from stages.engine.fingerprint import digest, file_sha256
+from stages.engine.photos_since import compare_photos
 from stages.engine.stage import Stage, StageContext
 from stages.errors import InputError, ReconstructionError
-from stages.posing.adding import STAYED, KnownPhotos, known_lenses, put_back, same_contents
+from stages.posing.adding import STAYED, KnownPhotos, known_lenses, put_back
 from stages.posing.adjustment import LastAdjustment, adjust_last
 from stages.posing.evidence import MIN_VERIFIED, Evidence
 from stages.posing.known import match_photos
@@ -137,6 +138,11 @@ def _contents(photos: Pictures, names: Iterable[str]) -> dict[str, str]:
     return {name: digest([file_sha256(path) for path in paths if path.exists()]) for name, paths in files.items()}
 
 
+def _names_then(before: dict[str, str], now: dict[str, str]) -> dict[str, str]:
+    """Photo now -> the photo before with the same contents (name -> digest)."""
+    return {name: then for then, name in compare_photos(before, now, same_folder=True).kept.items()}
+
+
 def _known_photos(
     context: StageContext[SfmParams], contents: dict[str, str], image_set: ImageSet
 ) -> KnownPhotos | None:
@@ -146,7 +152,7 @@ def _known_photos(
     before, folder = context.read_previous(PHOTO_CONTENTS), context.read_previous(FEATURES)
     if before is None or folder is None or not folder.exists():
         return None
-    names = same_contents(before.contents, contents)
+    names = _names_then(before.contents, contents)
     registration = context.read_previous(REGISTRATION)
     known = KnownPhotos(
         names=names,
@@ -372,7 +378,7 @@ def _lineage_of_given(context: StageContext[SfmParams], model: Any, contents: di
         return None
     then = pycolmap.Reconstruction(str(context.read_previous(MODEL)))
     poses = {image.name: image.cam_from_world().matrix() for image in then.images.values()}
-    names = same_contents(before.contents, contents)
+    names = _names_then(before.contents, contents)
     images = [image for image in model.images.values() if names.get(image.name) in poses]
     same = all(np.allclose(image.cam_from_world().matrix(), poses[names[image.name]]) for image in images)
     return before.lineage if images and same else None
