@@ -38,8 +38,9 @@ def what_is_kept(workspace: Workspace, config: Config, now: FileDigests, forced:
         return ""
     since = compare_photos(before, now, same_folder=True)
     known = [path for path in since.kept if _is_capture(path)]
-    new = [path for path in since.added if _is_capture(path)]
-    gone = [path for path in since.removed if _is_capture(path)]
+    contents_then, contents_now = set(before.values()), set(now.values())  # a copy is no other photo
+    new = [path for path in since.added if _is_capture(path) and now[path] not in contents_then]
+    gone = [path for path in since.removed if _is_capture(path) and before[path] not in contents_now]
     if not known or not (new or gone):
         return ""
     counts = f"{len(known)} photos known, {len(new)} new, {len(gone)} gone"

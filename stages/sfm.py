@@ -168,7 +168,7 @@ def _known_photos(
     if not known.enough:
         log.info("%s, %d placed before: too few, poses are found anew", known.describe(), len(known.poses))
         return None
-    log.info("%s: poses of the known stay, and the new are placed beside them", known.describe())
+    log.info("%s: poses of the known stay%s", known.describe(), ", the new go beside them" if known.new else "")
     return known
 
 
@@ -211,7 +211,7 @@ def _since(
         return None, {}
     moved = put_back(known, model) if known.changed else 0.0
     stayed = moved is not None and moved <= STAYED
-    if moved is not None:
+    if moved is not None and known.changed:
         log.info(
             "known photos are %s: %.3g %% of the distance to what they see (median)",
             "where they were" if stayed else "elsewhere",
