@@ -201,6 +201,7 @@ def sources(workspace: Path) -> dict[str, str | None]:
 
 
 def test_photos_moved_with_the_same_workspace_keep_masks_and_poses(masked: Path) -> None:
+    """Case 21."""
     before = sources(masked / "a/ws")
     shutil.copytree(masked / "a/images", masked / "copy")
     answer = run("copy", "-w", "a/ws")
