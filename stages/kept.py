@@ -33,14 +33,14 @@ def what_is_kept(workspace: Workspace, config: Config, now: FileDigests, forced:
     except ManifestDamaged:
         return ""
     before = made.identity.sources.get("photos") if made else None
-    if not before:
+    if not before or not now:  # photos that are nowhere to be found are not removed
         return ""
     since = compare_photos(before, now, same_folder=True)
+    known = [path for path in since.kept if _is_capture(path)]
     new = [path for path in since.added if _is_capture(path)]
     gone = [path for path in since.removed if _is_capture(path)]
-    if not new and not gone:
+    if not known or not (new or gone):
         return ""
-    known = [path for path in since.kept if _is_capture(path)]
     counts = f"{len(known)} photos known, {len(new)} new, {len(gone)} gone"
     return f"{counts}: {_of_poses_and_training(workspace, config, set(since.kept), len(new), len(gone), forced)}"
 
