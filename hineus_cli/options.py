@@ -11,6 +11,7 @@ from typing import Annotated, Any
 
 import typer
 
+from hineus_cli.completing import devices, preset_names, setting_keys, stage_names
 from stages.errors import ConfigError
 from stages.request import HOLD_OUT, Request
 
@@ -62,7 +63,18 @@ Photos = Annotated[
 OfWorkspace = Annotated[Path, typer.Argument(help="The workspace's folder.")]
 WorkspaceOption = Annotated[
     Path | None,
-    typer.Option("--workspace", "-w", help="Folder for all results; default: PHOTOS_hineus here.", show_default=False),
+    typer.Option(
+        "--workspace",
+        "-w",
+        help="Folder for all results; default: PHOTOS_hineus beside the photos.",
+        show_default=False,
+    ),
+]
+OtherPhotos = Annotated[
+    bool,
+    typer.Option(
+        "--other-photos", help="Use a workspace that was made of other photos, too: its results are replaced."
+    ),
 ]
 Masks = Annotated[
     Path | None, typer.Option(help="Folder of masks, named like the photos, white on the object.", show_default=False)
@@ -89,19 +101,39 @@ BlackKeeps = Annotated[
         show_default=False,
     ),
 ]
+Control = Annotated[
+    Path | None,
+    typer.Option(
+        help="Ground control: a CSV of name, x, y, z, photo, px, py, OpenDroneMap's gcp_list.txt, or a folder "
+        "of two tables, of points and of marks.",
+        show_default=False,
+    ),
+]
+NoControl = Annotated[bool, typer.Option("--no-control", help="Forget the ground control points of the last run.")]
 Preset = Annotated[
     str | None,
-    typer.Option(help="See `hineus presets`; default: gpu with a CUDA device, else cpu.", show_default=False),
+    typer.Option(
+        help="See `hineus presets`; default: gpu with a CUDA device, else cpu.",
+        show_default=False,
+        autocompletion=preset_names,
+    ),
 ]
 ConfigFile = Annotated[
     Path | None, typer.Option("--config", help="YAML file of settings, over the preset.", show_default=False)
 ]
 Sets = Annotated[
     list[str] | None,
-    typer.Option("--set", help="One setting, over all else: section.key=value. Repeatable.", show_default=False),
+    typer.Option(
+        "--set",
+        help="One setting, over all else: section.key=value. Repeatable.",
+        show_default=False,
+        autocompletion=setting_keys,
+    ),
 ]
-Until = Annotated[str | None, typer.Option(help="Stop after this stage.", show_default=False)]
-Device = Annotated[str, typer.Option(help="auto, cpu or cuda.")]
+Until = Annotated[
+    str | None, typer.Option(help="Stop after this stage.", show_default=False, autocompletion=stage_names)
+]
+Device = Annotated[str, typer.Option(help="auto, cpu or cuda.", autocompletion=devices)]
 Workers = Annotated[int | None, typer.Option(min=1, help="CPU threads; default: all.", show_default=False)]
 Time = Annotated[
     float | None,
@@ -162,11 +194,14 @@ def settings(
 def of_a_run(
     photos: Photos = None,
     workspace: WorkspaceOption = None,
+    other_photos: OtherPhotos = False,
     masks: Masks = None,
     no_masks: NoMasks = False,
     black_keeps: BlackKeeps = None,
     poses: Poses = None,
     no_poses: NoPoses = False,
+    control: Control = None,
+    no_control: NoControl = False,
     preset: Preset = None,
     config: ConfigFile = None,
     sets: Sets = None,
@@ -182,10 +217,13 @@ def of_a_run(
     return Request(
         photos=photos,
         workspace=workspace,
+        other_photos=other_photos,
         masks=masks,
         no_masks=no_masks,
         poses=poses,
         no_poses=no_poses,
+        control=control,
+        no_control=no_control,
         preset=preset,
         config=config,
         sets=settings(sets, time, hold_out, no_ground, watertight, deterministic, no_masks, black_keeps),

@@ -20,9 +20,9 @@ from typing import Any, TypeVar
 import numpy as np
 
 from configs.params import IngestParams
-from stages.artifacts import IMAGE_SET, PHOTOS, ImageRecord, ImageSet, SkippedImage
+from stages.artifacts import IMAGE_SET, LEFT_OUT, PHOTOS, ImageRecord, ImageSet, SkippedImage
 from stages.capture.background import PLAIN_PHOTOS, plain_mask
-from stages.capture.exif import ORIENTATION, camera_key, focal_px, gps_position
+from stages.capture.exif import ORIENTATION, camera_key, focal_px, read_gps
 from stages.capture.listing import NAMED, by_reason, list_captures, name_some
 from stages.capture.mask_doubts import MaskLook, find_doubts, is_black_and_white, nothing_kept
 from stages.capture.mask_names import set_masks_aside
@@ -42,7 +42,7 @@ from stages.capture.masks import (
     unused_masks,
     write_mask,
 )
-from stages.capture.photo_reading import Photo, UnusableError, read_photo, register_formats
+from stages.capture.photo_reading import TURNED, Photo, UnusableError, read_photo, register_formats
 from stages.capture.quality import Appearance, appearance, find_oddities
 from stages.capture.salient import SalientNetwork
 from stages.capture.video import extract_frames
@@ -84,7 +84,7 @@ def run(context: StageContext[IngestParams]) -> dict[str, Any]:
         paths = list(cameras)
         _tell_unused(poses, {camera.name for camera in cameras.values()})
     unseen = {path for path in paths if any(fnmatchcase(path, pattern) for pattern in params.leave_out)}
-    skipped += [SkippedImage(path, "named in ingest.leave_out") for path in paths if path in unseen]
+    skipped += [SkippedImage(path, LEFT_OUT) for path in paths if path in unseen]
     paths = [path for path in paths if path not in unseen]
 
     unique, copies = _without_copies(paths, files, context)
@@ -381,8 +381,9 @@ def _take_photo(
         blur=seen.sharpness,
         has_mask=mask is not None,
         sha256=digest,
-        gps=gps_position(photo.exif),
+        gps=read_gps(photo.exif).position,
         made_mask=made_mask,
+        taken=photo.stored_size[::-1] if photo.orientation in TURNED else photo.stored_size,
     )
     return record, seen, look
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import re
 import shlex
 import shutil
 from collections import Counter
@@ -10,18 +12,23 @@ from pathlib import Path
 from typing import Any, Literal
 
 from configs.params import Config
+from stages.capture.gps import gps_warnings
 from stages.capture.inspection import Inspection, MasksWanted, inspect
 from stages.capture.listing import NAMED, by_reason, name_some
 from stages.capture.mask_doubts import find_doubts, nothing_kept
 from stages.capture.masks import ASIDE, EMPTY, missing_masks, tell_masks
 from stages.capture.salient import INSTALL, find_weights
 from stages.ingest import pairs_of, read_mask_file
+from stages.limits import available_memory, nearest_existing
+from stages.posing.control_files import read_control
+from stages.posing.marks import foresee
 from stages.posing.reading import read_poses
 
 Verdict = Literal["go", "go with warnings", "no-go"]
 
 MOSTLY_PLAIN = 0.5  # so many plain backgrounds are meant; too few for masks from the background's colour alone
 FEW_PHOTOS = 20  # a full turn in steps of less than 20 degrees; sets below it lose photos
+CONTROL_NAME = re.compile(r"(gcp|ground.?control)[^/]*\.(txt|csv)$", re.IGNORECASE)
 # Reasons to leave a file out that are no news.
 EXPECTED = ("not an image", "the raw file of", "the clip of", ASIDE)
 
@@ -63,6 +70,7 @@ class Preflight:
 
     Attributes:
         refusals: reasons for "no-go" that lie in the photos; `shortages`: those that lie in the machine.
+        kept: what a run would keep of the workspace that is there, see `stages.kept`; empty where nothing has changed.
     """
 
     inspection: Inspection
@@ -70,6 +78,7 @@ class Preflight:
     warnings: tuple[str, ...]
     refusals: tuple[str, ...]
     shortages: tuple[str, ...]
+    kept: str = ""
 
     @property
     def verdict(self) -> Verdict:
@@ -88,6 +97,7 @@ class Preflight:
             "sizes": [[*size, count] for size, count in Counter(seen.sizes).most_common()],
             "cameras": dict(Counter(photo.camera for photo in seen.photos)),
             "with_focal": sum(photo.has_focal for photo in seen.photos),
+            "with_gps": _located(seen),
             **asdict(seen.oddities),
             "plain_background": seen.plain,
             "masks": len(seen.masks.looks or seen.masks.files),
@@ -95,6 +105,7 @@ class Preflight:
             "warnings": list(self.warnings),
             "refusals": list(self.refusals),
             "shortages": list(self.shortages),
+            "kept": self.kept,
         }
 
 
@@ -107,35 +118,44 @@ def preflight(
     workers: int,
     decode: bool,
     poses: Path | None = None,
+    control: Path | None = None,
 ) -> Preflight:
     """Look at the photos, and at the memory and the disk of `folder`, where the workspace will lie.
 
     `decode`: whether to judge the photos' pixels, too; before a run that is left to ingest, which decodes them anyway.
+    `poses`, `control`: files or folders of known poses and of ground control points.
 
     Raises:
-        InputError: there is no such folder or video, or the poses cannot be read.
+        InputError: there is no such folder or video, or the poses or control points cannot be used.
+        ConfigError, SystemRequirementError: the points' coordinates cannot be converted.
     """
-    import psutil
-
     params = config.ingest
     pairs = pairs_of(read_poses(poses) if decode and poses is not None and masks is not None else None)
     wanted = MasksWanted(masks, params.own_masks, params.masks_keep == "black", pairs, read_mask_file)
     seen = inspect(source, masks, params.video_frames, workers, decode, wanted)
     needs = estimate(seen, config, device, workers)
-    while not folder.exists():
-        folder = folder.parent
-    memory, disk = psutil.virtual_memory().available / GIB, shutil.disk_usage(folder).free / 1e9
+    folder = nearest_existing(folder)
+    memory, disk = available_memory() / GIB, shutil.disk_usage(folder).free / 1e9
     refusals, shortages = [], []
     if len(seen.sizes) < config.ingest.min_images:
         refusals.append(f"{len(seen.sizes)} usable photos, {config.ingest.min_images} are needed.")
+    warnings = _warnings(seen, config)
+    if control is None:
+        warnings += _unused_control(seen, source)
+    if control is not None and not seen.videos:  # frames have no names yet
+        found = read_control(control)
+        sizes = {photo.source: (photo.width, photo.height) for photo in seen.photos}
+        more, doubts = foresee(found, found.system(config.place.control_epsg), sizes)
+        refusals, warnings = refusals + more, warnings + doubts
     if needs.memory_gib > memory:
         shortages.append(
             f"It may take {needs.memory_gib:.1f} GiB of memory, {memory:.1f} are free: close other programs, or try "
             "`--set undistort.max_side=800`, `--workers 1`."
         )
+    if not os.access(folder, os.W_OK):
+        shortages.append(f"{folder} cannot be written: try `--workspace DIR`.")
     if needs.disk_gb > disk:
         shortages.append(f"It may take {needs.disk_gb:.1f} GB of disk, {disk:.1f} are free: try `--workspace DIR`.")
-    warnings = _warnings(seen, config)
     doubts, impossible = _of_masks(seen, config, masks if decode or poses is None else None)
     warnings += doubts
     refusals += impossible
@@ -178,8 +198,24 @@ def _warnings(seen: Inspection, config: Config) -> list[str]:
     if config.ingest.min_images <= len(seen.sizes) < FEW_PHOTOS:
         found.append(f"Only {len(seen.sizes)} photos; 30 to 100 that overlap by two thirds give a whole object.")
     found += seen.oddities.warnings
+    if config.place.gps:
+        found += gps_warnings({photo.source: photo.gps for photo in seen.photos})
     unusable = by_reason(item for item in seen.skipped if not item.reason.startswith(EXPECTED))
     return found + [f"Left out {name_some(names)}: {reason}." for reason, names in unusable.items()]
+
+
+def _located(seen: Inspection) -> int:
+    """Photos that say where they were taken."""
+    return sum(photo.gps.position is not None for photo in seen.photos)
+
+
+def _unused_control(seen: Inspection, source: Path) -> list[str]:
+    """That a file of ground control points lies among the photos, where none is given."""
+    return [
+        f"{item.source} looks like ground control points, which are used with `--control {source / item.source}`."
+        for item in seen.skipped
+        if CONTROL_NAME.search(item.source)
+    ]
 
 
 def _of_masks(seen: Inspection, config: Config, folder: Path | None) -> tuple[list[str], list[str]]:
@@ -231,6 +267,8 @@ def facts(done: Preflight) -> list[tuple[str, str]]:
     with_focal = sum(photo.has_focal for photo in seen.photos)
     estimated = "" if with_focal == len(seen.photos) else "; else it is estimated"
     lines.append(("focal length", f"in the EXIF of {with_focal} of {len(seen.photos)} photos{estimated}"))
+    if located := _located(seen):
+        lines.append(("GPS", f"a position in {located} of {len(seen.photos)} photos"))
     if seen.plain:
         lines.append(("background", "plain: `--set ingest.auto_mask=plain` would cut the object out"))
     elif seen.plain_share >= MOSTLY_PLAIN:
@@ -244,6 +282,8 @@ def facts(done: Preflight) -> list[tuple[str, str]]:
         )
     if said := masks_in_words(seen):
         lines.append(("masks", said))
+    if done.kept:
+        lines.append(("workspace", done.kept))
     minutes = "not measured on a GPU" if needs.minutes is None else f"about {needs.minutes:.0f} min"
     lines.append(("needs", f"{minutes}, {needs.memory_gib:.1f} GiB of memory, {needs.disk_gb:.1f} GB of disk"))
     return lines

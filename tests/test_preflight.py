@@ -9,7 +9,6 @@ from types import SimpleNamespace
 
 import cv2
 import numpy as np
-import psutil
 import pytest
 from PIL import Image, ImageFile, ImageFilter
 from typer.testing import CliRunner, Result
@@ -20,6 +19,7 @@ from stages import preflight as module
 from stages import reconstruct
 from stages.capture.inspection import Inspection, Video, inspect
 from stages.capture.photo_reading import read_head
+from stages.errors import InputError
 from stages.preflight import GIB, estimate, preflight
 
 SIZE = (320, 240)
@@ -48,7 +48,7 @@ def photos(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def room(monkeypatch: pytest.MonkeyPatch, memory_gib: float, disk_gb: float) -> None:
-    monkeypatch.setattr(psutil, "virtual_memory", lambda: SimpleNamespace(available=memory_gib * GIB))
+    monkeypatch.setattr(module, "available_memory", lambda: memory_gib * GIB)
     monkeypatch.setattr(module.shutil, "disk_usage", lambda path: SimpleNamespace(free=disk_gb * 1e9))
 
 
@@ -216,3 +216,92 @@ def test_a_run_decodes_each_photo_once(photos: Path, monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(ImageFile.ImageFile, "load", counted)
     assert CliRunner().invoke(app, ["run", "photos", "--until", "ingest"]).exit_code == 0
     assert sorted(decoded) == sorted(file.name for file in photos.iterdir())
+
+
+# ---------------------------------------------------------------- GPS and control points
+def located(folder: Path, positions: dict[int, tuple[float, float, float | None]]) -> None:
+    """These photos carry a GPS position; `positions`: number of the photo -> latitude, longitude, altitude."""
+    for i, (latitude, longitude, altitude) in positions.items():
+        exif = Image.Exif()
+        exif[0x0110] = "Drone"
+        tags = exif.get_ifd(0x8825)
+        tags[1], tags[2] = "S" if latitude < 0 else "N", (abs(latitude), 0.0, 0.0)
+        tags[3], tags[4] = "W" if longitude < 0 else "E", (abs(longitude), 0.0, 0.0)
+        if altitude is not None:
+            tags[5], tags[6] = b"\0", altitude
+        picture(i).save(folder / f"{i:02d}.jpg", exif=exif)
+
+
+def warned(folder: Path, *more: str) -> str:
+    return " ".join(json.loads(check(str(folder), "--json", *more).stdout)["warnings"])
+
+
+def test_good_positions_are_counted(photos: Path):
+    # across the 180th meridian
+    located(photos, {i: (-17 + i / 1e5, (180 - i / 1e5) * (-1) ** i, 5.0) for i in range(24)})
+    result = check(str(photos))
+    assert "a position in 24 of 24 photos" in result.stdout
+    assert result.stdout.split()[-1] == "go"
+
+
+def test_positions_that_cannot_be_are_named(photos: Path):
+    good = {i: (47.0, 8 + i / 1e5, 400.0) for i in range(24)}
+    located(photos, good | {3: (47.0, 8.0, None), 5: (0.0, 0.0, 0.0), 7: (47.0, 200.0, 1.0), 9: (56.0, 8.0, 400.0)})
+    text = warned(photos)
+    assert "GPS is not used of 03.jpg: it has no altitude." in text
+    assert "GPS is not used of 05.jpg: it says 0, 0, as cameras do without a fix." in text
+    assert "GPS is not used of 07.jpg: its latitude or longitude is beyond 90 or 180 degrees." in text
+    assert "GPS puts 09.jpg 1,000 km from the other photos" in text
+    assert warned(photos, "--set", "place.gps=false") == ""
+
+
+def test_altitudes_of_0_among_others_are_named(photos: Path):
+    located(photos, {i: (47 + i / 1e5, 8.0, 0.0 if i in (3, 8) else 400.0) for i in range(24)})
+    assert "GPS has 03.jpg, 08.jpg at an altitude of 0, the other photos at about 400 m" in warned(photos)
+
+
+def test_photos_of_one_position_tell_no_scale(photos: Path):
+    located(photos, {i: (47.0, 8.0, 400.0) for i in range(24)})
+    assert "All 24 photos carry the same GPS position" in warned(photos)
+
+
+def gcp(folder: Path, rows: list[str], head: str = "name,x,y,z,photo,px,py") -> str:
+    file = folder.parent / "gcp.csv"
+    file.write_text("\n".join([head, *rows]))
+    return str(file)
+
+
+@pytest.mark.parametrize(
+    ("points", "verdict", "text"),
+    [
+        ("ABC", "go", ""),
+        ("AB", "go with warnings", "2 of 2 control points are marked in two photos or more: they tell the scale"),
+        ("A", "no-go", "1 of 1 control points are marked in two photos or more, 2 are needed for the scale"),
+    ],
+)
+def test_control_points_are_counted(photos: Path, points: str, verdict: str, text: str):
+    rows = [f"{name},{ord(name)},{ord(name) ** 2},3,{photo}.jpg,10,20" for name in points for photo in ("00", "05")]
+    data = json.loads(check(str(photos), "--json", "--control", gcp(photos, rows)).stdout)
+    assert data["verdict"] == verdict
+    assert text in " ".join(data["warnings"] + data["refusals"])
+
+
+@pytest.mark.parametrize(
+    ("row", "text"),
+    [
+        ("A,1,2,3,IMG_1.jpg,10,20", "photos are called e.g. 00.jpg"),
+        ("A,1,2,3,00.jpg,400,20", "A is marked at 400 20 in 00.jpg, which has 320 x 240 pixels"),
+        ("A;1,5;2;3;00.jpg;10;20", "1,5 has a decimal comma"),
+    ],
+)
+def test_control_points_that_cannot_be_used_are_refused_before_a_run(photos: Path, tmp_path: Path, row: str, text: str):
+    file = gcp(photos, [row], "name;x;y;z;photo;px;py" if ";" in row else "name,x,y,z,photo,px,py")
+    for command in (["check"], ["run", "--workspace", str(tmp_path / "ws")]):
+        result = CliRunner().invoke(app, [*command, str(photos), "--control", file, "--preset", "tiny"])
+        assert result.exit_code == InputError.exit_code
+        assert text in " ".join(result.output.split())
+
+
+def test_a_list_of_control_points_among_the_photos_is_noticed(photos: Path):
+    (photos / "gcp_list.txt").write_text("EPSG:32632\n")
+    assert f"which are used with `--control {photos / 'gcp_list.txt'}`" in warned(photos)

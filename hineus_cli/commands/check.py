@@ -10,6 +10,7 @@ import typer
 from hineus_cli.options import (
     BlackKeeps,
     ConfigFile,
+    Control,
     Device,
     Json,
     Masks,
@@ -35,6 +36,7 @@ def check(
     no_masks: NoMasks = False,
     black_keeps: BlackKeeps = None,
     poses: Poses = None,
+    control: Control = None,
     preset: Preset = None,
     config: ConfigFile = None,
     sets: Sets = None,
@@ -52,6 +54,7 @@ def check(
         masks=masks,
         no_masks=no_masks,
         poses=poses,
+        control=control,
         preset=preset,
         config=config,
         sets=settings(sets, time, no_masks=no_masks, black_keeps=black_keeps),
@@ -66,18 +69,18 @@ def check(
     from rich.table import Table
     from rich.text import Text
 
-    from hineus_cli.console import product
+    from hineus_cli.console import plain, product
     from stages.preflight import facts
 
     table = Table.grid(padding=(0, 2))
     for what, found in facts(done):
-        table.add_row(Text(what, style="bold"), Text(found))
+        table.add_row(Text(what, style="bold"), Text(plain(found)))
     for what, style, lines in (
         ("warning", "yellow", done.warnings),
         ("no-go", "red", (*done.refusals, *done.shortages)),
     ):
         for line in lines:
-            table.add_row(Text(what, style=style), Text(line))
+            table.add_row(Text(what, style=style), Text(plain(line)))
     table.add_row(Text("verdict", style="bold"), Text(done.verdict))
     product().print(table)
     raise typer.Exit(exit_code)

@@ -11,6 +11,8 @@ from stages.artifacts.pictures import pictures_of
 
 _RECORDS = "images.json"
 
+LEFT_OUT = "named in ingest.leave_out"  # why a photo was skipped that no stage may see
+
 
 @dataclass(frozen=True)
 class ImageRecord:
@@ -28,6 +30,7 @@ class ImageRecord:
         gps: latitude and longitude in degrees (WGS 84) and altitude in metres, where EXIF has all three.
         made_mask: the way of `ingest.auto_mask` in which its mask was made; empty where it came with the photo or
             there is none. What "salient" made is a guess, see `SILHOUETTES`.
+        taken: upright width and height in pixels of the source, which may have been reduced; None in older workspaces.
     """
 
     name: str
@@ -41,6 +44,7 @@ class ImageRecord:
     sha256: str
     gps: tuple[float, float, float] | None = None
     made_mask: str = ""
+    taken: tuple[int, int] | None = None
 
 
 @dataclass(frozen=True)

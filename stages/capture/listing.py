@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from stages.artifacts import SkippedImage
+from stages.artifacts import WORKSPACE_RECORD, SkippedImage
 from stages.capture.photo_reading import PHOTO_SUFFIXES, RAW_SUFFIXES
 from stages.errors import InputError
 
@@ -39,11 +39,17 @@ def list_captures(source: Path, masks_folder: Path | None = None) -> tuple[list[
     if inside_masks and source.resolve() not in inside_masks.parents:  # the photos may lie in the masks' folder
         inside_masks = None
     photos, videos, skipped = [], [], []
+    workspaces = {path.parent for path in source.rglob(WORKSPACE_RECORD)} - {source}
+    skipped += [
+        SkippedImage(path.relative_to(source).as_posix(), "a workspace of hineus") for path in sorted(workspaces)
+    ]
     for path in sorted(source.rglob("*")):
         relative = path.relative_to(source)
         if not path.is_file() or any(part.startswith((".", "__MACOSX")) for part in relative.parts):
             continue
         if inside_masks and inside_masks in path.resolve().parents:
+            continue
+        if workspaces.intersection(path.parents):
             continue
         name, suffix = relative.as_posix(), path.suffix.lower()
         if suffix in PHOTO_SUFFIXES | RAW_SUFFIXES:

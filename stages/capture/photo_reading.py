@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from stages.capture.exif import ORIENTATION, camera_key, focal_px
+from stages.capture.exif import NO_GPS, ORIENTATION, Gps, camera_key, focal_px, read_gps
 
 # What COLMAP's reader takes as it is; the rest is re-encoded.
 COLMAP_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"})
@@ -40,6 +40,7 @@ class PhotoFile:
         width, height: upright size in pixels.
         camera: photos with the same value share one camera's intrinsics.
         has_focal: whether EXIF gives the focal length.
+        gps: what EXIF says of the place.
         orientation: EXIF's, of the stored pixels.
     """
 
@@ -48,6 +49,7 @@ class PhotoFile:
     height: int
     camera: str
     has_focal: bool
+    gps: Gps = NO_GPS
     orientation: int = 1
 
     @property
@@ -119,7 +121,8 @@ def read_head(file: Path, source: str) -> PhotoFile:
     orientation = exif.get(ORIENTATION, 1)
     width, height = size[::-1] if orientation in TURNED else size
     camera = camera_key(exif, (width, height), source)
-    return PhotoFile(source, width, height, camera, focal_px(exif, size) is not None, orientation)
+    focal = focal_px(exif, size) is not None
+    return PhotoFile(source, width, height, camera, focal, gps=read_gps(exif), orientation=orientation)
 
 
 def read_preview(file: Path) -> np.ndarray:

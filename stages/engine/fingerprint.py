@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from configs.dotted import flatten
+from stages.artifacts.artifact import is_workspace
 from stages.errors import InputError
 
 CHUNK_BYTES = 1 << 20
@@ -41,6 +42,8 @@ class Identity:
         inputs: artifact that is read ("undistort/cameras.json") -> digest of its files as published. Also what
             `manifest_key` and RUN_KEY stand for, where a stage reads those.
         sources: outside path ("photos") -> its files' digests, None where it was not given.
+        previous: digest of the stage's own publication that it was given to go on from; None where there was none. It
+            is history, so it never makes a result stale.
     """
 
     stage: str
@@ -48,11 +51,13 @@ class Identity:
     params: Mapping[str, Any]
     inputs: Mapping[str, str] = field(default_factory=dict)
     sources: Mapping[str, FileDigests | None] = field(default_factory=dict)
+    previous: str | None = None
 
     @property
     def parts(self) -> dict[str, Any]:
         """The fingerprint's ingredients, one digest each."""
-        return {
+        history = {} if self.previous is None else {"previous": self.previous}
+        return history | {
             "stage": self.stage,
             "version": self.version,
             "params": digest(dict(self.params)),
@@ -142,9 +147,10 @@ def file_sha256(path: Path) -> str:
 
 
 def walk_files(folder: Path) -> Iterator[Path]:
-    """All files below `folder` in sorted order, hidden ones (".DS_Store") and hidden folders left out."""
+    """All files below `folder` in sorted order, hidden ones (".DS_Store"), hidden folders and workspaces left out."""
     for parent, folders, files in os.walk(folder):
-        folders[:] = sorted(name for name in folders if not name.startswith("."))
+        shown = (name for name in folders if not name.startswith(".") and not is_workspace(Path(parent) / name))
+        folders[:] = sorted(shown)
         for name in sorted(files):
             if not name.startswith("."):
                 yield Path(parent) / name

@@ -85,14 +85,12 @@ def match_photos(poses: KnownPoses, photos: Iterable[str]) -> dict[str, KnownCam
     photos = list(photos)
     by_stem: dict[str, list[str]] = {}
     for photo in photos:
-        by_stem.setdefault(_parts(photo)[-1], []).append(photo)
+        by_stem.setdefault(stem(photo), []).append(photo)
     cameras_of: dict[str, list[tuple[tuple[int, bool], KnownCamera]]] = {}
     for camera in poses.cameras:
-        scored = [(_likeness(camera.name, photo), photo) for photo in by_stem.get(_parts(camera.name)[-1], [])]
-        if not scored:
+        best, fitting = best_fits(camera.name, by_stem.get(stem(camera.name), []))
+        if not fitting:
             continue
-        best = max(score for score, _ in scored)
-        fitting = [photo for score, photo in scored if score == best]
         if len(fitting) > 1:
             raise InputError(
                 f"The pose of {camera.name} in {poses.origin} fits {len(fitting)} photos: {fitting[0]}, {fitting[1]}.",
@@ -111,6 +109,22 @@ def match_photos(poses: KnownPoses, photos: Iterable[str]) -> dict[str, KnownCam
             "Name the folder of the photos these poses belong to: `hineus run PHOTOS --poses FILE`.",
         )
     return matched
+
+
+def best_fits(name: str, photos: Iterable[str]) -> tuple[tuple[int, bool], list[str]]:
+    """How well photos fit a name that another program gave one, and those that fit it best: one where all is well.
+
+    Args:
+        photos: relative posix paths, of which only those count whose last part agrees, suffix aside.
+    """
+    scored = [(_likeness(name, photo), photo) for photo in photos]
+    best = max((score for score, _ in scored), default=(0, False))
+    return best, [photo for score, photo in scored if score == best and score[0] > 0]
+
+
+def stem(name: str) -> str:
+    """The last part of a posix path, suffix aside; "frame.0001" has none."""
+    return _parts(name)[-1]
 
 
 def _parts(name: str) -> tuple[str, ...]:

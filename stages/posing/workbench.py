@@ -9,11 +9,11 @@ from __future__ import annotations
 import logging
 import shutil
 import tempfile
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import combinations
+from itertools import combinations, product
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ import numpy as np
 from stages.artifacts import ImageSet
 from stages.errors import InputError
 from stages.extras import package_file
+from stages.posing.adding import KnownPhotos, copy_features, known_model, renamed_model
 from stages.posing.evidence import MIN_PNP, MIN_VERIFIED
 from stages.posing.joining import join_models
 from stages.posing.ladder import Rung, Solution, better
@@ -33,10 +34,11 @@ from stages.posing.settings import (
     match_options,
     verification_options,
 )
-from stages.posing.turning import check_parallax
+from stages.posing.turning import check_parallax, parallaxes
 
 log = logging.getLogger(__name__)
 
+POSITION_DIGITS = 7  # of degrees: a centimetre
 DEFAULT_FOCAL_FACTOR = 1.2  # COLMAP's guess where nothing is known: focal = 1.2 x longest side (about 45 degrees)
 # A focal length that comes out this many times longer or shorter than the photos' EXIF says makes the EXIF doubtful:
 # rounding in EXIF costs a few percent, stabilised or cropped pictures up to a fifth.
@@ -45,6 +47,7 @@ DOUBTFUL_FOCAL = 1.25
 # the camera moves, only photos that are nearly the same have such matches.
 STATIONARY_SHARE = 0.5
 RELAXED = "relaxed thresholds"
+ADDED = "beside the known photos"
 # Relaxed thresholds, with COLMAP's defaults: matches of a pair, 3D points that agree on a photo's position and their
 # share, matches and angle of the first pair.
 RELAXED_VERIFIED, RELAXED_PNP, RELAXED_PNP_SHARE = 10, 12, 0.1  # 15, 30, 0.25
@@ -79,6 +82,13 @@ class Base:
         parts += ["masked"] * self.masked + ["no-priors"] * (not self.focal_priors)
         return "-".join(parts) + ".db"
 
+    @staticmethod
+    def of_file(name: str) -> Base:
+        """The base whose `file` has this name."""
+        flags = (False, True)
+        bases = (Base(*each) for each in product(flags, flags, flags, flags))
+        return next(base for base in bases if base.file == name)
+
 
 class Workbench:
     """The photos of one capture, and one method for each rung.
@@ -89,6 +99,7 @@ class Workbench:
         params: `configs.params.SfmParams`.
         threads: for what depends on their number (matching, mapping). workers: for the rest.
         cuda: whether to use a GPU.
+        known: what an earlier model says of these photos.
     """
 
     def __init__(
@@ -102,9 +113,11 @@ class Workbench:
         workers: int,
         cuda: bool,
         progress: Progress,
+        known: KnownPhotos | None = None,
     ) -> None:
         import pycolmap
 
+        self.known = known
         self.work, self.images_folder, self.masks_folder = work, images_folder, masks_folder
         self.image_set, self.params = image_set, params
         self.names = frozenset(record.name for record in image_set.images)
@@ -113,10 +126,10 @@ class Workbench:
         self._progress, self._rung = progress, ""
         self._other = "global" if params.mapper == "incremental" else "incremental"
         self._guided = self._relaxed = self._stationary = False
-        self._latest = Base(masked=params.masks == "always")
+        self._first = self._latest = Base(masked=params.masks == "always")
         self._import(self._latest)
         with pycolmap.Database.open(self.database(self._latest)) as database:
-            self.located = database.num_pose_priors()
+            self.located = count_located([prior.position for prior in database.read_all_pose_priors()])
             cameras = [camera for camera in database.read_all_cameras() if camera.has_prior_focal_length]
             self.priors = {camera.camera_id: camera.mean_focal_length() for camera in cameras}
         self.matcher = choose_matcher(params, self.located, len(self.names))
@@ -165,12 +178,31 @@ class Workbench:
 
         return Rung(name, named, applies)
 
+    def adding(self) -> Rung:
+        """The attempt that keeps what is `known`."""
+        return self._rung_of(ADDED, self.added)
+
     # ------------------------------------------------------------ rungs
+    def added(self, best: Solution | None) -> Solution | None:
+        """New photos matched with all and placed beside the known ones, which stay where they are."""
+        assert self.known is not None
+        base = Base.of_file(self.known.features.name)
+        if not self.database(base).exists():
+            self._import(base)
+        if not base.focal_priors:
+            forget_focal_priors(self.database(base), self.params.camera_model)
+        self._features_and_matches(base, best)
+        self.parallaxes = parallaxes(self.database())
+        if not self.known.changed:
+            return self._solution_of(base, [renamed_model(self.known)])
+        start = known_model(self.known, self.database(base), self._mapping().min_num_matches)
+        return self._solution_of(base, self._map_incremental(base, start, fixed=True))
+
     def first(self, best: Solution | None) -> Solution | None:
         """The chosen matcher and mapper."""
-        self._features_and_matches(self._latest, best)
+        self._features_and_matches(self._first, best)
         self.parallaxes = check_parallax(self.database())
-        return self._solve(self._latest, self.params.mapper)
+        return self._solve(self._first, self.params.mapper)
 
     def all_pairs(self, best: Solution | None) -> Solution | None:
         """Photos left out against all others."""
@@ -368,6 +400,8 @@ class Workbench:
                 image_names=[record.name for record in records],
                 options=options,
             )
+        if self.known is not None and self.known.features.name == base.file:
+            copy_features(self.known.features, path, self.known.names)
 
     def _extract(self, base: Base) -> None:
         """Features; finding them is deterministic with any number of threads."""
@@ -501,8 +535,8 @@ class Workbench:
             options.mapper.init_min_tri_angle = RELAXED_INIT_ANGLE_DEG
         return options
 
-    def _map_incremental(self, base: Base, start: Any | None) -> list[Any]:
-        """Photos placed one after another, from the model `start` on where there is one."""
+    def _map_incremental(self, base: Base, start: Any | None, fixed: bool = False) -> list[Any]:
+        """Photos placed one after another, from the model `start` on where there is one; `fixed`: its poses stay."""
         import pycolmap
 
         placed, total, out, input_path = 2, len(self.names), self._new_folder(), ""
@@ -518,11 +552,13 @@ class Workbench:
             part = min(1.0, placed / max(total, 1))
             self._tell(PART_MATCHES + (1 - PART_MATCHES) * part, f"{min(placed, total)} of {total} photos placed")
 
+        options = self._mapping()
+        options.fix_existing_frames = fixed
         models = pycolmap.incremental_mapping(
             self.database(base),
             self.images_folder,
             out,
-            self._mapping(),
+            options,
             input_path=input_path,
             next_image_callback=one_more,
         )
@@ -560,6 +596,12 @@ def learned_weights() -> Path | None:
 
 
 # ---------------------------------------------------------------- on databases
+def count_located(positions: Sequence[np.ndarray]) -> int:
+    """Photos whose GPS position tells which others are near: all that carry one, unless most carry the same ones."""
+    apart = len({tuple(np.round(position[:2], POSITION_DIGITS).tolist()) for position in positions})
+    return len(positions) if 2 * apart > len(positions) else apart
+
+
 def choose_matcher(params: Any, located: int, num_images: int) -> str:
     """auto: all pairs of small sets, neighbours in space where most photos carry GPS, else in name.
 
