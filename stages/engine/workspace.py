@@ -27,7 +27,6 @@ from typing import Any
 
 import psutil
 
-from stages.artifacts.artifact import WORKSPACE_RECORD, is_workspace
 from stages.engine.locking import take
 from stages.engine.manifest import (
     MANIFEST,
@@ -40,6 +39,7 @@ from stages.engine.manifest import (
 )
 from stages.engine.system import installed_version
 from stages.errors import WorkspaceError
+from stages.inputs.folders import WORKSPACE_RECORD, is_workspace, readable
 
 FORMAT = 1
 WORKSPACE_SUFFIX = "_hineus"  # of the folder that is made beside photos
@@ -90,6 +90,7 @@ class Workspace:
                 holds something else, which stages would overwrite.
         """
         root = Path(root).absolute()
+        _check_name(root)
         path = root / WORKSPACE_RECORD
         try:
             text = path.read_text(encoding="utf-8")
@@ -331,6 +332,17 @@ def _busy_error(root: Path, holder: bytes) -> WorkspaceError:
 
 
 # ---------------------------------------------------------------- opening
+def _check_name(root: Path) -> None:
+    """Raises WorkspaceError where libraries that read and write in the workspace cannot take its path."""
+    try:
+        str(root).encode()
+    except UnicodeEncodeError as error:
+        raise WorkspaceError(
+            f"The workspace {readable(str(root))} has a name that is not UTF-8, which OpenCV cannot read.",
+            "Choose another folder with `--workspace DIR`, or rename what is in its way with `mv`.",
+        ) from error
+
+
 def _new_workspace(root: Path, create: bool) -> Workspace:
     if root.exists() and not root.is_dir():
         raise WorkspaceError(f"{root} is a file, not a workspace folder.", "Choose another one with `--workspace DIR`.")
