@@ -185,14 +185,9 @@ def estimate(seen: Inspection, config: Config, device: str, workers: int) -> Nee
     read_gib = max((photo.bytes_to_read for photo in seen.photos), default=0) / GIB
     later_gib = MEMORY_BASE_GIB + MEMORY_OF_PHOTOS * 3 * trained_on / GIB
     return Needs(
-<<<<<<< HEAD
         memory_gib=max(read_gib, sfm_gib, later_gib),
-        disk_gb=DISK_BASE_GB + (seen.num_bytes + DISK_BYTES_PER_PIXEL * trained_on) / 1e9,
-=======
-        memory_gib=max(sfm_gib, later_gib),
         disk_gb=DISK_BASE_GB
         + (seen.num_bytes + DISK_BYTES_PER_PIXEL * trained_on + FEATURE_BYTES_PER_PIXEL * sum(looked_at)) / 1e9,
->>>>>>> added
         minutes=_minutes(looked_at, config, workers) if device == "cpu" else None,
     )
 

@@ -88,17 +88,9 @@ def reconstruct(request: Request, pipeline: Sequence[Stage], listener: Listener 
         photos = sources["photos"]
         if photos is not None and not workspace.stage_folder("ingest").exists():
             _tell_preflight(_preflight(sources, workspace.root, config, device, workers, decode=False))
-<<<<<<< HEAD
-        elif photos is not None and holds_files(photos):
-            digests = SourceDigests({"photos": photos}, workspace.digest_cache)
-            if kept := what_is_kept(workspace, config, digests.files("photos") or {}, _forced(request, pipeline)):
-                log.info("%s", kept)
-            digests.save()
-=======
         now = digests.files("photos") if digests.available("photos") else None
         if kept := what_is_kept(workspace, config, now or {}, _forced(request, pipeline)):
             log.info("%s", kept)
->>>>>>> added
         log.debug("preset %s, device %s, %d workers, %s", preset, device, workers, sources)
         outcomes = run_pipeline(
             pipeline,
