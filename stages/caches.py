@@ -20,7 +20,7 @@ from pathlib import Path
 
 log = logging.getLogger(__name__)
 
-PROBE = bytes(1 << 16)  # a full quota may still take some bytes
+PROBE = bytes(1 << 22)  # all compiled code takes about 3 MB, and a full quota may still take some bytes
 ENOUGH_TEMPORARY = 1 << 29  # bytes; a USDZ with the largest textures takes a third of it
 
 
@@ -50,10 +50,13 @@ def cache_folder() -> tuple[Path, str | None]:
     Raises:
         OSError: nothing can be written anywhere.
     """
-    usual = _user_cache()
-    problem = why_unusable(usual, private=True)
-    if problem is None:
-        return usual, None
+    try:
+        usual = _user_cache().resolve()  # a link that the user made is fine
+        problem = why_unusable(usual, private=True)
+        if problem is None:
+            return usual, None
+    except RuntimeError as error:  # neither HOME nor an entry in the list of users
+        problem = str(error)
     if (temporary := system_temporary()) is not None:
         shared = temporary / f"hineus-{_user_id()}"
         if why_unusable(shared, private=True) is None:

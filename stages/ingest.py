@@ -11,7 +11,7 @@ import logging
 import math
 import shutil
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from fnmatch import fnmatchcase
 from pathlib import Path, PurePosixPath
@@ -42,13 +42,15 @@ from stages.capture.masks import (
     unused_masks,
     write_mask,
 )
-from stages.capture.photo_reading import TURNED, Photo, UnusableError, read_photo, register_formats
+from stages.capture.photo_reading import Photo, UnusableError, read_photo
 from stages.capture.quality import Appearance, appearance, find_oddities
 from stages.capture.salient import SalientNetwork
 from stages.capture.video import extract_frames
 from stages.engine.fingerprint import file_sha256
 from stages.engine.stage import Stage, StageContext
 from stages.errors import InputError
+from stages.inputs.folders import readable, short_name, unique_name
+from stages.inputs.formats import PHOTO_SUFFIXES, RAW_SUFFIXES
 from stages.posing.known import KnownPoses, check_masks, match_photos
 from stages.posing.nero import DEPTH, read_depth_mask
 from stages.posing.reading import read_poses
@@ -69,12 +71,9 @@ def run(context: StageContext[IngestParams]) -> dict[str, Any]:
     params, source = context.params, context.sources["photos"]
     masks_folder = context.sources.get("masks")
     photos, videos, skipped = list_captures(source, masks_folder)
-    register_formats()
-    folder = source if source.is_dir() else source.parent
     photos, own_masks, aside = set_masks_aside(photos)
-    files = {path: folder / path for path in photos}
-    frames, damaged = _frames_of(videos, folder, context)
-    files |= frames
+    frames, damaged = _frames_of(videos, context)
+    files = photos | frames
     skipped += damaged
     paths = sorted(files)
     poses = read_poses(context.sources["poses"]) if "poses" in context.sources else None
@@ -91,15 +90,15 @@ def run(context: StageContext[IngestParams]) -> dict[str, Any]:
     skipped += copies
 
     mask_files = choose_masks(
-        {path: files[path] for path in unique}, own_masks, folder, masks_folder, params.own_masks, pairs_of(poses)
+        {path: files[path] for path in unique}, own_masks, masks_folder, params.own_masks, pairs_of(poses)
     )
-    skipped += unused_masks(aside, folder, mask_files.values(), params.own_masks, masks_folder)
+    skipped += unused_masks(aside, mask_files.values(), params.own_masks, masks_folder)
     if not mask_files and (none := missing_masks(list(unique), mask_files, masks_folder)):
         raise none
     names, make_mask = _Names(unique), _mask_maker(params)
     done = 0
 
-    def take(path: str) -> tuple[ImageRecord, Appearance, MaskLook | None] | SkippedImage:
+    def take(path: str) -> tuple[ImageRecord, Appearance, MaskLook | None, str] | SkippedImage:
         nonlocal done
         try:
             return _take_photo(files[path], path, unique[path], mask_files.get(path), make_mask, names, context)
@@ -117,17 +116,21 @@ def run(context: StageContext[IngestParams]) -> dict[str, Any]:
         images, without = _before_plain_backgrounds(images, context)
         skipped += without
     skipped.sort(key=lambda item: item.source)
-    looks = [look for *_, look in taken if look is not None]
+    looks = [look for _, _, look, _ in taken if look is not None]
     _judge_masks(looks, skipped, params)
 
     if len(images) < params.min_images:
         raise _too_few(source, len(images), params.min_images, skipped)
     if some := missing_masks([record.source for record in images], mask_files, masks_folder):
         raise some
-    for reason, sources in by_reason(skipped).items():
-        log.warning("left out %s: %s", name_some(sources), reason)
+    for expected, level in ((True, logging.INFO), (False, logging.WARNING)):
+        for reason, sources in by_reason(item for item in skipped if item.expected is expected).items():
+            log.log(level, "left out %s: %s", name_some(sources), reason)
+    doubtful = [SkippedImage(record.source, problem) for record, *_, problem in taken if problem]
+    for problem, sources in by_reason(doubtful).items():
+        log.warning("%s: %s", name_some(sources), problem)
     # a video's frames are the sharpest of their stretch and near each other by choice
-    odd = find_oddities([seen for _, seen, _ in taken if seen.source not in frames])
+    odd = find_oddities([seen for _, seen, *_ in taken if seen.source not in frames])
     for warning in odd.warnings:
         log.warning("%s", warning)
     masked = sum(record.has_mask for record in images)
@@ -138,7 +141,8 @@ def run(context: StageContext[IngestParams]) -> dict[str, Any]:
     context.write(IMAGE_SET, ImageSet(tuple(images), tuple(skipped)))
     return {
         "images": len(images),
-        "skipped": len(skipped),
+        "skipped": sum(not item.expected for item in skipped),
+        **({"companions": companions} if (companions := sum(item.expected for item in skipped)) else {}),
         **({"videos": len(videos) - len(damaged)} if videos else {}),
         "masks": masked,
         "cameras": len({record.camera for record in images}),
@@ -153,21 +157,20 @@ def run(context: StageContext[IngestParams]) -> dict[str, Any]:
 
 # ---------------------------------------------------------------- which files
 def _frames_of(
-    videos: list[str], folder: Path, context: StageContext[IngestParams]
+    videos: dict[str, Path], context: StageContext[IngestParams]
 ) -> tuple[dict[str, Path], list[SkippedImage]]:
     """Frames of each video, as `clip.mp4/000120.jpg` -> file, so that no photo can have that name; and bad videos."""
     found: dict[str, Path] = {}
     damaged = []
     shutil.rmtree(context.scratch / "frames", ignore_errors=True)
-    for done, video in enumerate(videos):
+    for done, (video, file) in enumerate(videos.items()):
 
         def tell(part: float, done: int = done, video: str = video) -> None:
             context.progress(done + part, len(videos), f"frames of {video}")
 
         try:
-            frames = extract_frames(
-                folder / video, context.scratch / "frames" / video, context.params.video_frames, tell
-            )
+            folder = context.scratch / "frames" / str(done)  # a video's name may be too long
+            frames = extract_frames(file, folder, context.params.video_frames, tell)
         except UnusableError as reason:
             damaged.append(SkippedImage(video, str(reason)))
             continue
@@ -273,25 +276,37 @@ def _judge_masks(looks: list[MaskLook], skipped: list[SkippedImage], params: Ing
 
 
 class _Names:
-    """Gives each photo one name under images/. Names depend on the folder, never on the order of work."""
+    """Gives each photo one name under images/. Names depend on the folder, never on the order of work.
+
+    They are unique whatever the case of letters, for file systems that do not tell it, and short enough for all.
+    """
 
     def __init__(self, paths: Iterable[str]) -> None:
-        own = set(paths)
-        # case-insensitive file systems must not merge two photos
-        self._lower = {path.lower() for path in own}
-        self._stems = Counter(str(PurePosixPath(path).with_suffix("")).lower() for path in own)
+        self._own: dict[str, str] = {}
+        lower: set[str] = set()
+        for path in sorted(paths):
+            self._own[path] = unique_name(short_name(path), lower, str.lower)
+            lower.add(self._own[path].lower())
+        self._lower = lower
+        self._stems = Counter(_stem(name).lower() for name in self._own.values())
 
-    def target(self, path: str, suffix: str | None) -> str:
-        """`path` itself (suffix None or unchanged), or its stem with `suffix`, unique in the folder."""
-        own = PurePosixPath(path)
-        if suffix is None or own.suffix.lower() == suffix:
-            return path
-        if self._stems[str(own.with_suffix("")).lower()] == 1:
-            return own.with_suffix(suffix).as_posix()
-        name = path + suffix
+    def target(self, path: str, suffixes: Sequence[str]) -> str:
+        """The photo's own name where it has one of these suffixes, else with the first of them in place of its own."""
+        name = self._own[path]
+        if PurePosixPath(name).suffix.lower() in suffixes:
+            return name
+        if self._stems[_stem(name).lower()] == 1:
+            return _stem(name) + suffixes[0]
+        name += suffixes[0]
         while name.lower() in self._lower:
-            name = name[: -len(suffix)] + "_" + suffix
+            name = name[: -len(suffixes[0])] + "_" + suffixes[0]
         return name
+
+
+def _stem(name: str) -> str:
+    """Without what is a photo's suffix: "frame.0001" has none."""
+    suffix = PurePosixPath(name).suffix
+    return name.removesuffix(suffix) if suffix.lower() in PHOTO_SUFFIXES | RAW_SUFFIXES else name
 
 
 def _in_threads(function: Callable[[Item], Result], items: Iterable[Item], workers: int) -> list[Result]:
@@ -341,28 +356,23 @@ def _take_photo(
     make_mask: MaskMaker | None,
     names: _Names,
     context: StageContext[IngestParams],
-) -> tuple[ImageRecord, Appearance, MaskLook | None]:
-    from PIL import Image
-
-    photo = read_photo(file)
+) -> tuple[ImageRecord, Appearance, MaskLook | None, str]:
+    """Its record, its looks and its mask's, and what is wrong with its colours, in words."""
+    max_side = context.params.max_side
+    photo = read_photo(file, max_side)
     rgb = photo.rgb
     mask, look = _given_mask(photo, source, mask_file, context.params)
 
-    scale = min(1.0, context.params.max_side / max(rgb.size))
-    keep = photo.as_is and scale == 1
-    if scale < 1:
-        rgb = rgb.resize([max(1, round(side * scale)) for side in rgb.size], Image.Resampling.LANCZOS)
     made_mask = ""
     if mask is None and make_mask is not None:
         mask = make_mask(np.asarray(rgb))
         made_mask = "" if mask is None else context.params.auto_mask
-    suffix = None if keep else _encoded_suffix(file, photo.lossy)
-    name = names.target(source, suffix)
+    name = names.target(source, photo.as_is or _encoded_suffixes(photo))
 
     pictures = context.to_write(PHOTOS)
     target = pictures.path(name)
     target.parent.mkdir(parents=True, exist_ok=True)
-    if keep:
+    if photo.as_is:
         shutil.copyfile(file, target)
     else:
         _encode(rgb, target, photo.lossy, photo.exif)
@@ -376,16 +386,16 @@ def _take_photo(
         source=source,
         width=rgb.width,
         height=rgb.height,
-        focal_px=None if focal is None else focal * scale,
+        focal_px=None if focal is None else focal * min(1.0, max_side / max(photo.size)),
         camera=camera_key(photo.exif, rgb.size, source),
         blur=seen.sharpness,
         has_mask=mask is not None,
         sha256=digest,
         gps=read_gps(photo.exif).position,
         made_mask=made_mask,
-        taken=photo.stored_size[::-1] if photo.orientation in TURNED else photo.stored_size,
+        taken=photo.size,
     )
-    return record, seen, look
+    return record, seen, look, photo.colours.problem
 
 
 def _given_mask(
@@ -396,9 +406,9 @@ def _given_mask(
     Raises:
         UnusableError: the mask keeps nothing, or the photo is a mask itself.
     """
-    size, black_keeps = photo.rgb.size, params.masks_keep == "black"
-    scale = min(1.0, LOOK_SIDE / max(size))
-    preview = np.asarray(photo.rgb.resize([max(1, round(side * scale)) for side in size], resample=NEAREST))
+    size, black_keeps = photo.size, params.masks_keep == "black"
+    scale = min(1.0, LOOK_SIDE / max(photo.rgb.size))
+    preview = np.asarray(photo.rgb.resize([max(1, round(side * scale)) for side in photo.rgb.size], resample=NEAREST))
     if is_black_and_white(preview):
         raise UnusableError(MASK_NOT_PHOTO)
     if mask_file is not None:
@@ -407,15 +417,11 @@ def _given_mask(
         mask = Mask(photo.alpha ^ black_keeps, size)
     else:
         return None, None
-    return mask.kept, look_at_mask(source, mask_file.name if mask_file else alpha_of(source), mask, preview)
+    return mask.kept, look_at_mask(source, readable(mask_file.name) if mask_file else alpha_of(source), mask, preview)
 
 
-def _encoded_suffix(file: Path, lossy: bool) -> str:
-    """A re-encoded photo keeps its own suffix where that suffix is true."""
-    own = file.suffix.lower()
-    if lossy:
-        return own if own in (".jpg", ".jpeg") else ".jpg"
-    return ".png"
+def _encoded_suffixes(photo: Photo) -> tuple[str, ...]:
+    return (".jpg", ".jpeg") if photo.lossy else (".png",)
 
 
 def _encode(rgb: Any, target: Path, lossy: bool, exif: Any) -> None:
@@ -425,7 +431,7 @@ def _encode(rgb: Any, target: Path, lossy: bool, exif: Any) -> None:
         metadata = exif.tobytes()
     except Exception:  # damaged maker notes; poses do without
         metadata = b""
-    extra = {"exif": metadata} if metadata else {}
+    extra: dict[str, Any] = {"icc_profile": None} | ({"exif": metadata} if metadata else {})
     if lossy:
         rgb.save(target, format="JPEG", quality=JPEG_QUALITY, subsampling=0, **extra)
     else:

@@ -7,14 +7,13 @@ from pathlib import PurePosixPath
 
 from configs.params import Config
 from stages import artifacts
-from stages.capture.listing import VIDEO_SUFFIXES
-from stages.capture.photo_reading import PHOTO_SUFFIXES, RAW_SUFFIXES
 from stages.engine.fingerprint import FileDigests
 from stages.engine.manifest import ManifestDamaged
 from stages.engine.photos_since import compare_photos
 from stages.engine.status import previous_to_continue
 from stages.engine.workspace import Workspace
 from stages.ingest import INGEST
+from stages.inputs.formats import PHOTO_SUFFIXES, RAW_SUFFIXES, VIDEO_SUFFIXES
 from stages.posing.adding import enough_placed
 from stages.sfm import SFM
 from stages.train import TRAIN, little_changed

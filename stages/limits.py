@@ -32,6 +32,11 @@ def total_memory() -> int:
     return min([psutil.virtual_memory().total, *(limit for limit, _ in _memory_limits())])
 
 
+def nearest_existing(folder: Path) -> Path:
+    """The folder, or the one above it that is there: on the disk on which it will lie."""
+    return next(place for place in (folder, *folder.parents) if place.exists())
+
+
 # ---------------------------------------------------------------- control groups of Linux, versions 1 and 2
 def _cpu_quotas() -> Iterator[float]:
     """Cores that each group around this process may use; nothing for those without a limit."""

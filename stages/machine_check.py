@@ -16,7 +16,7 @@ from typing import Literal
 from stages.caches import cache_folder, compiler_folder, system_temporary, why_unusable
 from stages.capture.salient import INSTALL, PACKAGE
 from stages.engine.system import SYSTEM_LIBRARIES, apt_line, installed_version, missing_libraries
-from stages.limits import available_cores, available_memory, total_memory
+from stages.limits import available_cores, available_memory, nearest_existing, total_memory
 
 OWN_PACKAGES = ("hineus_cli", "stages", "configs")
 
@@ -140,7 +140,10 @@ def _gpu() -> Finding:
         return Finding("GPU", "note", f"unknown: {error}")
     name = found.stdout.strip() or "unknown: torch does not import"
     if name.startswith(("none", "unknown")):
-        return Finding("GPU", "note", name, "everything runs on the CPU, with smaller settings")
+        advice = "everything runs on the CPU, with smaller settings"
+        if "without CUDA" in name and shutil.which("nvidia-smi"):
+            advice += "; for the GPU: `pip install --force-reinstall torch`, without the index of CPU builds"
+        return Finding("GPU", "note", name, advice)
     return Finding("GPU", "ok", name)
 
 
@@ -158,8 +161,11 @@ def _memory() -> Finding:
 
 
 def _disk(folder: Path) -> Finding:
-    free = shutil.disk_usage(folder).free / 1e9
+    there = nearest_existing(folder)
+    free = shutil.disk_usage(there).free / 1e9
     found = f"{free:.1f} GB free at {folder}"
+    if not os.access(there, os.W_OK):
+        return Finding("disk", "note", f"{found}, which cannot be written", "`--workspace DIR` puts results elsewhere")
     if free < ENOUGH_DISK_GB:
         return Finding("disk", "note", found, f"a workspace may take up to {ENOUGH_DISK_GB:.0f} GB")
     return Finding("disk", "ok", found)

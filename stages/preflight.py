@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shlex
 import shutil
@@ -11,6 +12,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from configs.params import Config
+from stages.artifacts import SkippedImage
 from stages.capture.gps import gps_warnings
 from stages.capture.inspection import Inspection, MasksWanted, inspect
 from stages.capture.listing import NAMED, by_reason, name_some
@@ -18,7 +20,7 @@ from stages.capture.mask_doubts import find_doubts, nothing_kept
 from stages.capture.masks import ASIDE, EMPTY, missing_masks, tell_masks
 from stages.capture.salient import INSTALL, find_weights
 from stages.ingest import pairs_of, read_mask_file
-from stages.limits import available_memory
+from stages.limits import available_memory, nearest_existing
 from stages.posing.control_files import read_control
 from stages.posing.marks import foresee
 from stages.posing.reading import read_poses
@@ -28,8 +30,6 @@ Verdict = Literal["go", "go with warnings", "no-go"]
 MOSTLY_PLAIN = 0.5  # so many plain backgrounds are meant; too few for masks from the background's colour alone
 FEW_PHOTOS = 20  # a full turn in steps of less than 20 degrees; sets below it lose photos
 CONTROL_NAME = re.compile(r"(gcp|ground.?control)[^/]*\.(txt|csv)$", re.IGNORECASE)
-# Reasons to leave a file out that are no news.
-EXPECTED = ("not an image", "the raw file of", "the clip of", ASIDE)
 
 # All measured with `benchmarks/run_sets.py` on two cores, see docs/benchmarks/results.md.
 GIB = 1 << 30
@@ -68,11 +68,13 @@ class Preflight:
     """What was seen, what it needs, and what to make of it.
 
     Attributes:
+        max_side: what photos are reduced to, longest side in pixels.
         refusals: reasons for "no-go" that lie in the photos; `shortages`: those that lie in the machine.
         kept: what a run would keep of the workspace that is there, see `stages.kept`; empty where nothing has changed.
     """
 
     inspection: Inspection
+    max_side: int
     needs: Needs
     warnings: tuple[str, ...]
     refusals: tuple[str, ...]
@@ -84,6 +86,11 @@ class Preflight:
         if self.refusals or self.shortages:
             return "no-go"
         return "go with warnings" if self.warnings else "go"
+
+    @property
+    def reduced(self) -> int:
+        """How many photos are larger than `max_side`."""
+        return sum(max(size) > self.max_side for size in self.inspection.sizes)
 
     def as_dict(self) -> dict[str, Any]:
         """JSON-able."""
@@ -97,6 +104,8 @@ class Preflight:
             "cameras": dict(Counter(photo.camera for photo in seen.photos)),
             "with_focal": sum(photo.has_focal for photo in seen.photos),
             "with_gps": _located(seen),
+            "reduced": self.reduced,
+            "colour_profiles": dict(Counter(photo.colours.name for photo in seen.photos if photo.colours.name)),
             **asdict(seen.oddities),
             "plain_background": seen.plain,
             "masks": len(seen.masks.looks or seen.masks.files),
@@ -131,10 +140,9 @@ def preflight(
     params = config.ingest
     pairs = pairs_of(read_poses(poses) if decode and poses is not None and masks is not None else None)
     wanted = MasksWanted(masks, params.own_masks, params.masks_keep == "black", pairs, read_mask_file)
-    seen = inspect(source, masks, params.video_frames, workers, decode, wanted)
+    seen = inspect(source, masks, params.video_frames, params.max_side, workers, decode, wanted)
     needs = estimate(seen, config, device, workers)
-    while not folder.exists():
-        folder = folder.parent
+    folder = nearest_existing(folder)
     memory, disk = available_memory() / GIB, shutil.disk_usage(folder).free / 1e9
     refusals, shortages = [], []
     if len(seen.sizes) < config.ingest.min_images:
@@ -152,6 +160,8 @@ def preflight(
             f"It may take {needs.memory_gib:.1f} GiB of memory, {memory:.1f} are free: close other programs, or try "
             "`--set undistort.max_side=800`, `--workers 1`."
         )
+    if not os.access(folder, os.W_OK):
+        shortages.append(f"{folder} cannot be written: try `--workspace DIR`.")
     if needs.disk_gb > disk:
         shortages.append(f"It may take {needs.disk_gb:.1f} GB of disk, {disk:.1f} are free: try `--workspace DIR`.")
     doubts, impossible = _of_masks(seen, config, masks if decode or poses is None else None)
@@ -159,7 +169,7 @@ def preflight(
     refusals += impossible
     if memory / MEMORY_MARGIN < needs.memory_gib <= memory:
         warnings.append(f"It may take {needs.memory_gib:.1f} of the {memory:.1f} GiB of memory that are free.")
-    return Preflight(seen, needs, tuple(warnings), tuple(refusals), tuple(shortages))
+    return Preflight(seen, config.ingest.max_side, needs, tuple(warnings), tuple(refusals), tuple(shortages))
 
 
 def estimate(seen: Inspection, config: Config, device: str, workers: int) -> Needs:
@@ -171,9 +181,10 @@ def estimate(seen: Inspection, config: Config, device: str, workers: int) -> Nee
     looked_at = pixels(min(config.ingest.max_side, config.sfm.max_image_size))
     trained_on = sum(pixels(min(config.ingest.max_side, config.undistort.max_side)))
     sfm_gib = SFM_BASE_GIB + workers * SFM_GIB_PER_THREAD_MP * max(looked_at, default=0) / 1e6
+    read_gib = max((photo.bytes_to_read for photo in seen.photos), default=0) / GIB
     later_gib = MEMORY_BASE_GIB + MEMORY_OF_PHOTOS * 3 * trained_on / GIB
     return Needs(
-        memory_gib=max(sfm_gib, later_gib),
+        memory_gib=max(read_gib, sfm_gib, later_gib),
         disk_gb=DISK_BASE_GB + (seen.num_bytes + DISK_BYTES_PER_PIXEL * trained_on) / 1e9,
         minutes=_minutes(looked_at, config, workers) if device == "cpu" else None,
     )
@@ -198,8 +209,10 @@ def _warnings(seen: Inspection, config: Config) -> list[str]:
     found += seen.oddities.warnings
     if config.place.gps:
         found += gps_warnings({photo.source: photo.gps for photo in seen.photos})
-    unusable = by_reason(item for item in seen.skipped if not item.reason.startswith(EXPECTED))
-    return found + [f"Left out {name_some(names)}: {reason}." for reason, names in unusable.items()]
+    unusable = by_reason(item for item in seen.skipped if not item.expected)
+    found += [f"Left out {name_some(names)}: {reason}." for reason, names in unusable.items()]
+    doubtful = by_reason(SkippedImage(photo.source, photo.colours.problem) for photo in seen.photos)
+    return found + [f"{name_some(names)}: {problem}." for problem, names in doubtful.items() if problem]
 
 
 def _located(seen: Inspection) -> int:
@@ -263,10 +276,18 @@ def facts(done: Preflight) -> list[tuple[str, str]]:
     if len(cameras) > NAMED:
         lines.append(("camera", f"and {len(cameras) - NAMED} more"))
     with_focal = sum(photo.has_focal for photo in seen.photos)
+    if done.reduced:
+        lines.append(
+            ("reduced", f"{done.reduced} of {len(seen.sizes)} to {done.max_side} pixels, by `ingest.max_side`")
+        )
+    profiles = Counter(photo.colours.name for photo in seen.photos if photo.colours.name).most_common()
+    lines += [("colours", f"{name} ({count} photos), converted to sRGB") for name, count in profiles[:NAMED]]
     estimated = "" if with_focal == len(seen.photos) else "; else it is estimated"
     lines.append(("focal length", f"in the EXIF of {with_focal} of {len(seen.photos)} photos{estimated}"))
     if located := _located(seen):
         lines.append(("GPS", f"a position in {located} of {len(seen.photos)} photos"))
+    companions = by_reason(item for item in seen.skipped if item.expected and not item.reason.startswith(ASIDE))
+    lines += [("set aside", f"{name_some(names)}: {reason}") for reason, names in companions.items()]
     if seen.plain:
         lines.append(("background", "plain: `--set ingest.auto_mask=plain` would cut the object out"))
     elif seen.plain_share >= MOSTLY_PLAIN:

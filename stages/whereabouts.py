@@ -8,10 +8,10 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from stages.engine.fingerprint import walk_files
 from stages.engine.photos_since import PhotosSince
 from stages.engine.workspace import WORKSPACE_SUFFIX, Workspace
 from stages.errors import WorkspaceError
+from stages.inputs.folders import named_files, readable
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ def _named(photos: Path) -> Path:
 
 def _beside(photos: Path) -> Path:
     name = photos.stem if photos.is_file() else photos.name
-    return photos.parent / f"{name}{WORKSPACE_SUFFIX}"
+    return photos.parent / f"{readable(name)}{WORKSPACE_SUFFIX}"
 
 
 def _is_of(folder: Path, photos: Path) -> bool:
@@ -81,7 +81,7 @@ def _moved_places(workspace: Workspace, recorded: Path, photos: Path | None) -> 
 
 def holds_files(path: Path) -> bool:
     """Whether there is a file at all: not in a folder that was emptied, nor where a disk is no longer mounted."""
-    return path.is_file() or next(walk_files(path), None) is not None
+    return path.is_file() or (path.is_dir() and bool(named_files(path)[0]))
 
 
 # ---------------------------------------------------------------- other photos

@@ -191,6 +191,20 @@ def test_a_mark_on_the_wrong_thing_is_found_out():
     assert found.errors[2] == pytest.approx(np.hypot(25, 10))
 
 
+def test_marks_that_were_set_by_hand_all_count():
+    rough = np.random.default_rng(0).normal(scale=3, size=(8, 2))
+    pixels = np.array([pixel(photo, POINTS[0]) for photo in PHOTOS]) + rough
+    found = place_point(PHOTOS, {1: LENS}, pixels)
+    assert found.agrees.all()
+    np.testing.assert_allclose(found.position, POINTS[0], atol=0.03)
+
+
+def test_where_most_marks_are_wrong_none_is_believed():
+    pixels = np.array([pixel(photo, POINTS[0]) for photo in PHOTOS])
+    for other in (pixels / 2, pixels * (1, -1) + (0, 480), pixels[:, ::-1]):
+        assert place_point(PHOTOS, {1: LENS}, other).position is None
+
+
 def test_one_mark_or_two_that_do_not_meet_place_nothing():
     pixels = np.array([pixel(photo, POINTS[0]) for photo in PHOTOS])
     assert place_point(PHOTOS[:1], {1: LENS}, pixels[:1]).position is None
@@ -267,7 +281,10 @@ def test_marks_that_miss_and_points_that_are_not_placed_are_named():
     at = next(i for i, each in enumerate(marks) if (each.point, each.photo) == ("P1", "003.jpg"))
     marks[at] = replace(marks[at], pixel=(marks[at].pixel[0] + 60, marks[at].pixel[1]))
     found = surveyed(replace(given, sightings=tuple(marks)))
-    assert any("P1 in dir/003.jpg is marked 60 px from" in warning for warning in found.warnings)
+    assert found.warnings[0] == (
+        "1 of 8 marks of control point P1 are not used, because they miss where the other photos see it: by 60 px in "
+        "dir/003.jpg."
+    )
     assert any("P5 (marked in 1 photo with a pose, 2 are needed)" in warning for warning in found.warnings)
     assert found.fit.residual < 1e-6
     assert found.points[5].miss is None

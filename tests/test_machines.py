@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import stat
 import subprocess
@@ -17,10 +18,12 @@ import pytest
 from hineus_cli.__main__ import shadowed
 from stages import caches, limits, machine_check
 from stages.engine.locking import take
-from stages.engine.system import missing_libraries
+from stages.engine.system import SYSTEM_LIBRARIES, missing_libraries
+from stages.engine.workspace import storage_errors
+from stages.errors import WorkspaceError
 
 REPOSITORY = Path(__file__).parents[1]
-FULL = OSError(28, "No space left on device")
+FULL = OSError(errno.ENOSPC, "No space left on device")
 
 
 @pytest.fixture
@@ -54,6 +57,17 @@ def test_without_a_cache_it_goes_to_a_folder_of_this_user_alone(no_cache: Path) 
     assert stat.S_IMODE(folder.stat().st_mode) == 0o700
     assert remark is not None
     assert "cannot be written" in remark
+
+
+def test_a_user_without_a_home_has_a_cache(no_cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse() -> Path:
+        raise RuntimeError("could not determine the home directory for '~/.cache'")
+
+    monkeypatch.setattr(caches, "_user_cache", refuse)
+    folder, remark = caches.cache_folder()
+    assert folder.parent == no_cache
+    assert remark is not None
+    assert "home directory" in remark
 
 
 @pytest.mark.parametrize("trap", ["others may write", "link", "file", "of another user"])
@@ -148,6 +162,24 @@ def test_temporary_files_stay_where_they_are_otherwise(tmp_path: Path, monkeypat
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     with caches.temporary_files(tmp_path / ".work"):
         assert tempfile.gettempdir() == str(tmp_path)
+
+
+# ---------------------------------------------------------------- disks
+def test_doctor_says_where_nothing_can_be_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert machine_check._disk(tmp_path / "not" / "yet").state == "ok"
+    monkeypatch.setattr(os, "access", lambda path, mode: False)
+    assert "which cannot be written" in machine_check._disk(tmp_path).found
+
+
+def test_a_quota_is_told_from_a_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with (
+        pytest.raises(WorkspaceError, match="Your quota is used up while writing"),
+        storage_errors(tmp_path, "writing", needed=10),
+    ):
+        raise OSError(errno.EDQUOT, "Disk quota exceeded")
+    monkeypatch.setattr(caches.shutil, "disk_usage", lambda path: SimpleNamespace(free=9))
+    with pytest.raises(WorkspaceError, match="The disk is full"), storage_errors(tmp_path, "writing", needed=10):
+        raise OSError(errno.ENOSPC, "No space left on device")
 
 
 # ---------------------------------------------------------------- containers' limits
@@ -321,3 +353,11 @@ def test_doctor_looks_at_every_dependency() -> None:
     project = tomllib.loads((REPOSITORY / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     names = {requirement.split(">")[0] for requirement in project["dependencies"]}
     assert names == set(machine_check.REQUIRED.values())
+    extras = project["optional-dependencies"]
+    for_users = {
+        each.split(">")[0] for name in extras for each in extras[name] if name not in ("dev", "bench", "triton")
+    }
+    assert for_users == {distribution for distribution, _ in machine_check.OPTIONAL.values()}
+    container = (REPOSITORY / "Dockerfile").read_text(encoding="utf-8")
+    assert f"ARG EXTRAS={','.join(name for name in extras if name not in ('dev', 'bench', 'triton'))}\n" in container
+    assert all(package in container for package in SYSTEM_LIBRARIES.values())

@@ -17,6 +17,7 @@ from configs.load import load_config
 from hineus_cli.app import app
 from stages import preflight as module
 from stages import reconstruct
+from stages.capture.colour import ADOBE_RGB, matrix_profile
 from stages.capture.inspection import Inspection, Video, inspect
 from stages.capture.photo_reading import read_head
 from stages.errors import InputError
@@ -57,7 +58,7 @@ def check(*arguments: str) -> Result:
 
 
 def look(folder: Path) -> Inspection:
-    return inspect(folder, None, video_frames=80, workers=2, decode=True)
+    return inspect(folder, None, video_frames=80, max_side=3200, workers=2, decode=True)
 
 
 # ---------------------------------------------------------------- what is noticed
@@ -90,11 +91,11 @@ def test_exif_and_size_are_those_of_the_upright_photo(photos: Path):
     exif.get_ifd(0x8769)[0xA405] = 28
     large = picture(40).resize((2400, 1800))  # large enough to be decoded smaller
     large.save(photos / "z.jpg", exif=exif)
-    seen = read_head(photos / "z.jpg", "z.jpg")
+    seen = read_head(photos / "z.jpg", "z.jpg", 3200)
     assert (seen.width, seen.height) == (1800, 2400)
     assert seen.camera == "Phone | 28 mm equivalent | 1800 x 2400"
     assert seen.has_focal
-    assert not read_head(photos / "00.jpg", "00.jpg").has_focal
+    assert not read_head(photos / "00.jpg", "00.jpg", 3200).has_focal
 
 
 def test_damaged_files_are_told_with_the_reason_and_other_files_are_no_warning(photos: Path, capfd):
@@ -106,9 +107,10 @@ def test_damaged_files_are_told_with_the_reason_and_other_files_are_no_warning(p
     data = json.loads(result.stdout)
     assert data["verdict"] == "go with warnings"
     assert {item["source"] for item in data["left_out"]} == {"bad.jpg", "empty.png", "torn.mp4", "notes.txt"}
-    assert len(data["warnings"]) == 2
-    assert data["warnings"][0].startswith("Left out bad.jpg, empty.png: no image")
-    assert data["warnings"][1].startswith("Left out torn.mp4: cannot be read as a video")
+    assert len(data["warnings"]) == 3
+    assert data["warnings"][0].startswith("Left out bad.jpg: no image")
+    assert data["warnings"][1] == "Left out empty.png: no image, whatever its name says (empty)."
+    assert data["warnings"][2].startswith("Left out torn.mp4: cannot be read as a video")
     assert "VIDEOIO" not in capfd.readouterr().err
 
 
@@ -128,6 +130,22 @@ def test_a_plain_background_is_noticed(tmp_path: Path):
         cloth.paste(picture(i).resize((120, 120)), (100, 60))
         cloth.save(tmp_path / f"{i}.png")
     assert look(tmp_path).plain
+
+
+def test_what_is_done_to_files_is_said_beforehand(photos: Path):
+    wide = matrix_profile("Adobe RGB", ADOBE_RGB, lambda values: values**2.2)
+    picture(50).save(photos / "wide.jpg", icc_profile=wide)
+    picture(51).save(photos / "broken.jpg", icc_profile=b"nothing")
+    picture(52).resize((4000, 3000)).save(photos / "large.jpg")
+    picture(53).save(photos / "IMG_1.THM", format="JPEG")
+    said = dict(module.facts(preflight(photos, None, photos.parent, load_config("cpu"), "cpu", 2, decode=False)))
+    assert said["reduced"] == "1 of 27 to 3200 pixels, by `ingest.max_side`"
+    assert said["colours"] == "Adobe RGB (1 photos), converted to sRGB"
+    assert said["set aside"] == "IMG_1.THM: the preview of a video"
+    data = json.loads(check(str(photos), "--json").stdout)
+    assert (data["photos"], data["reduced"], data["colour_profiles"]) == (27, 1, {"Adobe RGB": 1})
+    assert "broken.jpg: its colour profile is broken: taken for sRGB." in data["warnings"]
+    assert not any("THM" in warning for warning in data["warnings"])
 
 
 # ---------------------------------------------------------------- verdicts

@@ -4,7 +4,7 @@ Nobody else spells a path. A stage declares the artifacts (upper case) that it r
 finished workspace loads them from the folder of the stage that owns them: `artifacts.SCENE.load(folder)`.
 """
 
-from stages.artifacts.artifact import WORKSPACE_RECORD, Artifact, is_workspace
+from stages.artifacts.artifact import Artifact
 from stages.artifacts.atlas import ATLAS_MESH, AtlasMesh
 from stages.artifacts.bake import BASE_COLOR, NORMAL_MAP, OCCLUSION, PROVENANCE, QUALITY, VertexQuality
 from stages.artifacts.export import (
@@ -39,3 +39,4 @@ from stages.artifacts.sfm import (
 )
 from stages.artifacts.train import CAMERAS, FIELD, HELD_OUT, METRICS, PREVIEWS, SCENE, checkpoint_path, preview_path
 from stages.artifacts.undistort import FIRST_SCENE, PINHOLE_PHOTOS, SILHOUETTES
+from stages.inputs.folders import WORKSPACE_RECORD, is_workspace

@@ -12,13 +12,6 @@ import numpy as np
 
 T = TypeVar("T")
 
-WORKSPACE_RECORD = "workspace.json"
-
-
-def is_workspace(folder: Path) -> bool:
-    """Whether the folder is a workspace, whose pictures are nobody's photos."""
-    return (folder / WORKSPACE_RECORD).is_file()
-
 
 @dataclass(frozen=True, eq=False)
 class Artifact(Generic[T]):

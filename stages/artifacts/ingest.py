@@ -49,10 +49,15 @@ class ImageRecord:
 
 @dataclass(frozen=True)
 class SkippedImage:
-    """A file that was left out, and why, in words."""
+    """A file that was left out, and why, in words.
+
+    Attributes:
+        expected: whether that is no news: it is what cameras and programs leave beside photos.
+    """
 
     source: str
     reason: str
+    expected: bool = False
 
 
 @dataclass(frozen=True)

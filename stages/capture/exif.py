@@ -10,7 +10,8 @@ from typing import Any
 DIAGONAL_35MM = math.hypot(36.0, 24.0)  # CIPA defines the 35 mm equivalent by the frame's diagonal
 
 ORIENTATION, MAKE, MODEL, EXIF_IFD = 0x0112, 0x010F, 0x0110, 0x8769
-FOCAL_LENGTH, FOCAL_LENGTH_35MM, LENS_MODEL, EXIF_WIDTH = 0x920A, 0xA405, 0xA434, 0xA002
+FOCAL_LENGTH, FOCAL_LENGTH_35MM, LENS_MODEL = 0x920A, 0xA405, 0xA434
+EXIF_WIDTH, EXIF_HEIGHT = 0xA002, 0xA003
 FOCAL_PLANE_X_RESOLUTION, FOCAL_PLANE_UNIT = 0xA20E, 0xA210
 GPS_IFD = 0x8825
 LATITUDE_REF, LATITUDE, LONGITUDE_REF, LONGITUDE, ALTITUDE_REF, ALTITUDE = range(1, 7)
@@ -45,9 +46,10 @@ def focal_px(exif: Any, size: tuple[int, int]) -> float | None:
     focal_mm, pitch = _number(tags.get(FOCAL_LENGTH)), _number(tags.get(FOCAL_PLANE_X_RESOLUTION))
     unit_mm = FOCAL_PLANE_UNIT_MM.get(tags.get(FOCAL_PLANE_UNIT, 2))
     if focal_mm and pitch and unit_mm:
-        # the pitch belongs to the picture as it was taken; it may have been reduced since
-        taken_width = _number(tags.get(EXIF_WIDTH)) or size[0]
-        from_pitch = focal_mm * pitch / unit_mm * size[0] / taken_width
+        # the pitch belongs to the picture as it was taken; it may have been reduced since, and turned (HEIF)
+        width, height = (_number(tags.get(tag)) for tag in (EXIF_WIDTH, EXIF_HEIGHT))
+        part = size[0] / (width or size[0]) if height is None or width is None else max(size) / max(width, height)
+        from_pitch = focal_mm * pitch / unit_mm * part
         if from_35mm is None or abs(from_pitch / from_35mm - 1) < 0.05:
             candidates.append(from_pitch)
     if from_35mm is not None:

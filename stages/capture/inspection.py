@@ -27,17 +27,11 @@ from stages.capture.masks import (
     unused_folder,
     unused_masks,
 )
-from stages.capture.photo_reading import (
-    PhotoFile,
-    UnusableError,
-    read_alpha,
-    read_head,
-    read_preview,
-    register_formats,
-)
+from stages.capture.photo_reading import PhotoFile, UnusableError, read_alpha, read_head, read_preview
 from stages.capture.quality import Appearance, Oddities, appearance, find_oddities
 from stages.capture.video import video_size
 from stages.errors import InputError
+from stages.inputs.folders import readable
 
 
 @dataclass(frozen=True)
@@ -128,13 +122,17 @@ def inspect(
     source: Path,
     masks_folder: Path | None,
     video_frames: int,
+    max_side: int,
     workers: int,
     decode: bool,
     masks: MasksWanted | None = None,
 ) -> Inspection:
-    """Look at all photos of `source` (see `list_captures`); `video_frames`: how many a video gives at most.
+    """Look at all photos of `source` (see `list_captures`).
 
-    `decode`: also at their pixels, of reduced copies, and at their masks. Damage behind a sound head shows only then.
+    Args:
+        video_frames: how many a video gives at most. max_side: what photos are reduced to, pixels.
+        decode: also look at their pixels, of reduced copies, and at their masks. Damage behind a sound head shows only
+            then.
 
     Raises:
         InputError: see `list_captures`, and `MasksWanted.pair`.
@@ -142,18 +140,16 @@ def inspect(
     wanted = masks or MasksWanted(masks_folder)
     photos, videos, skipped = list_captures(source, masks_folder)
     photos, own, aside = set_masks_aside(photos)
-    folder = source if source.is_dir() else source.parent
-    files = choose_masks({path: folder / path for path in photos}, own, folder, masks_folder, wanted.own, wanted.pair)
-    skipped += unused_masks(aside, folder, files.values(), wanted.own, masks_folder)
-    register_formats()
+    files = choose_masks(photos, own, masks_folder, wanted.own, wanted.pair)
+    skipped += unused_masks(aside, files.values(), wanted.own, masks_folder)
 
     def look(path: str) -> _Seen | Video | SkippedImage:
         try:
             if path in videos:
-                frames, width, height = video_size(folder / path)
+                frames, width, height = video_size(videos[path])
                 return Video(path, min(frames, video_frames), width, height)
-            head = read_head(folder / path, path)
-            return _look_closer(head, folder / path, files.get(path), wanted) if decode else _Seen(head)
+            head = read_head(photos[path], path, max_side)
+            return _look_closer(head, photos[path], files.get(path), wanted) if decode else _Seen(head)
         except UnusableError as reason:
             return SkippedImage(path, str(reason))
 
@@ -164,14 +160,14 @@ def inspect(
         photos=tuple(item.head for item in seen),
         videos=tuple(item for item in outcomes if isinstance(item, Video)),
         skipped=tuple([*skipped, *(item for item in outcomes if isinstance(item, SkippedImage))]),
-        num_bytes=sum((folder / path).stat().st_size for path in [*photos, *videos]),
+        num_bytes=sum(file.stat().st_size for file in [*photos.values(), *videos.values()]),
         oddities=find_oddities([item.appearance for item in seen if item.appearance is not None]),
         plain_share=sum(item.is_plain for item in seen) / max(len(seen), 1),
         masks=MasksSeen(
             files,
             tuple(item.mask for item in seen if isinstance(item.mask, MaskLook)),
             tuple(item.mask for item in seen if isinstance(item.mask, InputError)),
-            None if files or not source.is_dir() else unused_folder(source, photos),
+            None if files or not source.is_dir() else unused_folder(source, list(photos)),
         ),
     )
 
@@ -204,7 +200,7 @@ def _look_at_mask(
             )
         except InputError as error:
             return error
-        return look_at_mask(head.source, mask_file.name, mask, pixels)
+        return look_at_mask(head.source, readable(mask_file.name), mask, pixels)
     alpha = read_alpha(file) if wanted.own and wanted.folder is None else None
     if alpha is None:
         return None

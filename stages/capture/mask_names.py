@@ -16,10 +16,10 @@ from __future__ import annotations
 import re
 import unicodedata
 from collections import Counter
-from collections.abc import Iterable, Sequence
-from pathlib import PurePosixPath
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path, PurePosixPath
 
-from stages.capture.photo_reading import PHOTO_SUFFIXES
+from stages.inputs.formats import PHOTO_SUFFIXES
 
 _WORD = r"(?:masks?|masq|matte|silhouette|alpha)"
 _AFTER = re.compile(rf"(?P<photo>.+?)[ ._-]*[(\[]?{_WORD}[)\]]?")
@@ -86,21 +86,21 @@ def pair_by_ending(photos: Sequence[str], masks: Sequence[str]) -> dict[str, str
     return {photo: mask for photo, mask in found.items() if photo is not None}
 
 
-def set_masks_aside(photos: Sequence[str]) -> tuple[list[str], dict[str, str], list[str]]:
-    """What lies in the photos' own folder: the photos, the mask of each photo that has one, and all masks.
+def set_masks_aside(files: Mapping[str, Path]) -> tuple[dict[str, Path], dict[str, Path], dict[str, Path]]:
+    """Of what lies in the photos' own folder: the photos, the mask of each photo that has one, and all masks.
 
     A file is a mask where its name says so and names a photo: `IMG_1_mask.png` beside `IMG_1.jpg`,
     `masks/IMG_1.png` with `IMG_1.jpg` in another folder.
     """
-    in_folder = [path for path in photos if any(map(is_mask_folder, _parents(path)))]
-    bare = [path for path in photos if path not in set(in_folder) and not _says_mask(path)]
+    in_folder = [path for path in files if any(map(is_mask_folder, _parents(path)))]
+    bare = [path for path in files if path not in set(in_folder) and not _says_mask(path)]
     by_folder: dict[tuple[str, ...], set[str]] = {}
     for path in bare:
         name = _folded(PurePosixPath(path).name)
         by_folder.setdefault(_parents(path), set()).update((name, PurePosixPath(name).stem))
     aside = [
         path
-        for path in photos
+        for path in files
         if _says_mask(path)
         and (_is_for_all(path) or by_folder.get(_parents(path), set()) & set(_photo_names(path)))
         and _parents(path) in by_folder
@@ -109,9 +109,10 @@ def set_masks_aside(photos: Sequence[str]) -> tuple[list[str], dict[str, str], l
         within = [path for path in in_folder if _parents(path) == folder]
         if pair(bare, within):
             aside += within
-    masks = set(aside)
-    kept = [path for path in photos if path not in masks]
-    return kept, pair(kept, [path for path in aside if not _is_for_all(path)]), sorted(masks)
+    masks = {path: files[path] for path in sorted(set(aside))}
+    kept = {path: file for path, file in files.items() if path not in masks}
+    own = pair(list(kept), [path for path in aside if not _is_for_all(path)])
+    return kept, {photo: files[mask] for photo, mask in own.items()}, masks
 
 
 def _photo_names(mask: str) -> list[str]:

@@ -15,8 +15,10 @@ from stages.capture.listing import name_some
 from stages.capture.mask_doubts import MaskLook, look
 from stages.capture.mask_fit import outline_fit
 from stages.capture.mask_names import is_mask_folder, pair
-from stages.capture.photo_reading import PHOTO_SUFFIXES, UnusableError
+from stages.capture.photo_reading import UnusableError
 from stages.errors import InputError
+from stages.inputs.folders import named_files
+from stages.inputs.formats import PHOTO_SUFFIXES, open_image
 
 # A mask's edges may be soft: this much of its range from black or white counts as neither, and as many such pixels as
 # are black (or white) are a photo, a depth map or labels. Masks of the development sets have 0 to 0.02 of them.
@@ -44,13 +46,14 @@ class Mask:
 def match_masks(photos: list[str], folder: Path, not_masks: Collection[Path] = ()) -> dict[str, Path]:
     """Photo -> its mask file in `folder`, see `mask_names`; `not_masks`: files that are photos, which may lie there."""
     taken = {path.resolve() for path in not_masks}
-    files = {path.relative_to(folder).as_posix(): path for path in sorted(folder.rglob("*")) if _is_picture(path)}
+    files = _pictures(folder)
     names = [name for name, path in files.items() if path.resolve() not in taken]
     return {photo: files[name] for photo, name in pair(photos, names).items()}
 
 
-def _is_picture(path: Path) -> bool:
-    return path.suffix.lower() in PHOTO_SUFFIXES and not path.name.startswith(".") and path.is_file()
+def _pictures(folder: Path) -> dict[str, Path]:
+    """By readable path, see `named_files`."""
+    return {name: path for name, path in named_files(folder)[0].items() if path.suffix.lower() in PHOTO_SUFFIXES}
 
 
 PairMasks = Callable[[list[str], Path, list[Path]], Mapping[str, Path]]
@@ -67,24 +70,23 @@ def unused_folder(source: Path, photos: list[str]) -> Path | None:
 
 def choose_masks(
     photos: Mapping[str, Path],
-    own: Mapping[str, str],
-    folder: Path,
+    own: Mapping[str, Path],
     masks_folder: Path | None,
     use_own: bool,
     pair: PairMasks = match_masks,
 ) -> dict[str, Path]:
-    """Photo -> its mask file: of `masks_folder` if that is given, else of those among the photos in `folder`.
+    """Photo -> its mask file: of `masks_folder` if that is given, else of those among the photos.
 
     Args:
-        photos: photo -> its file. own: photo -> its mask, as `set_masks_aside` found them.
+        photos: photo -> its file. own: photo -> the file of its mask, as `set_masks_aside` found them.
     """
     if masks_folder is not None:
         return dict(pair(list(photos), masks_folder, list(photos.values())))
-    return {photo: folder / mask for photo, mask in own.items() if use_own and photo in photos}
+    return {photo: mask for photo, mask in own.items() if use_own and photo in photos}
 
 
 def unused_masks(
-    aside: Iterable[str], folder: Path, used: Iterable[Path], use_own: bool, masks_folder: Path | None
+    aside: Mapping[str, Path], used: Iterable[Path], use_own: bool, masks_folder: Path | None
 ) -> list[SkippedImage]:
     """Those of the masks among the photos that are not used, and why."""
     taken = {file.resolve() for file in used}
@@ -93,7 +95,7 @@ def unused_masks(
         reason = f"{ASIDE}, while --masks names others"
     elif not use_own:
         reason = f"{ASIDE}, not used (`--no-masks`; `--set ingest.own_masks=true` uses them)"
-    return [SkippedImage(mask, reason) for mask in aside if (folder / mask).resolve() not in taken]
+    return [SkippedImage(mask, reason, expected=True) for mask, file in aside.items() if file.resolve() not in taken]
 
 
 def missing_masks(photos: Sequence[str], files: Mapping[str, Path], folder: Path | None) -> InputError | None:
@@ -103,7 +105,7 @@ def missing_masks(photos: Sequence[str], files: Mapping[str, Path], folder: Path
         return None
     message = f"{len(missing)} of {len(photos)} photos have no mask in {folder}: {name_some(missing)}."
     if not files:
-        names = [path.relative_to(folder).as_posix() for path in sorted(folder.rglob("*")) if _is_picture(path)]
+        names = list(_pictures(folder))
         others = [name for name in names if name not in photos]
         holds = f"{len(others)} pictures, e.g. {others[0]}" if others else "no pictures"
         message += " It holds the photos only." if names and not others else f" It holds {holds}."
@@ -174,7 +176,7 @@ def load_mask(
     from PIL import Image
 
     try:
-        with Image.open(file) as stored:
+        with open_image(file) as stored:
             stored.load()
             image = stored.copy() if stored.mode != "P" else stored.convert("RGBA" if _sees_through(stored) else "RGB")
             noisy = stored.format == "JPEG"

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from configs.dotted import flatten
-from stages.artifacts.artifact import is_workspace
 from stages.errors import InputError
+from stages.inputs.folders import named_files, readable
 
 CHUNK_BYTES = 1 << 20
 
@@ -26,7 +25,7 @@ MAX_NAMED = 3  # changed files named one by one; past it they are counted
 RUN_KEY = "run"  # what the run was started with: photos, preset, settings
 
 FileDigests = dict[str, str]
-"""Relative posix path -> sha256 of the contents."""
+"""Relative posix path, as `readable` gives it -> sha256 of the contents."""
 
 
 @dataclass(frozen=True)
@@ -146,16 +145,6 @@ def file_sha256(path: Path) -> str:
     return sha.hexdigest()
 
 
-def walk_files(folder: Path) -> Iterator[Path]:
-    """All files below `folder` in sorted order, hidden ones (".DS_Store"), hidden folders and workspaces left out."""
-    for parent, folders, files in os.walk(folder):
-        shown = (name for name in folders if not name.startswith(".") and not is_workspace(Path(parent) / name))
-        folders[:] = sorted(shown)
-        for name in sorted(files):
-            if not name.startswith("."):
-                yield Path(parent) / name
-
-
 class SourceDigests:
     """Content digests of the outside paths, quick the second time.
 
@@ -194,8 +183,8 @@ class SourceDigests:
 
     def _digest_tree(self, path: Path) -> FileDigests:
         if path.is_dir():
-            return {file.relative_to(path).as_posix(): self._digest_file(file) for file in walk_files(path)}
-        return {path.name: self._digest_file(path)}
+            return {name: self._digest_file(file) for name, file in named_files(path)[0].items()}
+        return {readable(path.name): self._digest_file(path)}
 
     def _digest_file(self, path: Path) -> str:
         stat = path.stat()

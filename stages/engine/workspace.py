@@ -27,7 +27,6 @@ from typing import Any
 
 import psutil
 
-from stages.artifacts.artifact import WORKSPACE_RECORD, is_workspace
 from stages.engine.locking import take
 from stages.engine.manifest import (
     MANIFEST,
@@ -40,6 +39,7 @@ from stages.engine.manifest import (
 )
 from stages.engine.system import installed_version
 from stages.errors import WorkspaceError
+from stages.inputs.folders import WORKSPACE_RECORD, is_workspace, readable
 
 FORMAT = 1
 WORKSPACE_SUFFIX = "_hineus"  # of the folder that is made beside photos
@@ -90,6 +90,7 @@ class Workspace:
                 holds something else, which stages would overwrite.
         """
         root = Path(root).absolute()
+        _check_name(root)
         path = root / WORKSPACE_RECORD
         try:
             text = path.read_text(encoding="utf-8")
@@ -265,7 +266,7 @@ def storage_errors(root: Path, doing: str, needed: int | None = None) -> Iterato
         yield
     except OSError as error:
         if error.errno in DISK_FULL:
-            raise disk_full_error(root, doing, needed) from error
+            raise disk_full_error(root, doing, error, needed) from error
         if error.errno in NOT_WRITABLE:
             raise WorkspaceError(
                 f"The workspace {root} cannot be written while {doing}: {error.strerror} ({error.filename}).",
@@ -274,10 +275,16 @@ def storage_errors(root: Path, doing: str, needed: int | None = None) -> Iterato
         raise
 
 
-def disk_full_error(root: Path, doing: str, needed: int | None = None) -> WorkspaceError:
+def disk_full_error(root: Path, doing: str, error: BaseException, needed: int | None = None) -> WorkspaceError:
+    free = free_bytes(root)
+    if isinstance(error, OSError) and error.errno == errno.EDQUOT:
+        return WorkspaceError(
+            f"Your quota is used up while {doing}, though the disk at {root} has {show_bytes(free)} free.",
+            "Nothing published is lost: free some of yours (`quota -s`) and run the same command again to go on.",
+        )
     least = f"at least {show_bytes(needed)} more needed" if needed else "more is needed"
     return WorkspaceError(
-        f"The disk is full while {doing}: {show_bytes(free_bytes(root))} free at {root}, {least}.",
+        f"The disk is full while {doing}: {show_bytes(free)} free at {root}, {least}.",
         "Nothing published is lost: free some space and run the same command again to go on.",
     )
 
@@ -325,6 +332,17 @@ def _busy_error(root: Path, holder: bytes) -> WorkspaceError:
 
 
 # ---------------------------------------------------------------- opening
+def _check_name(root: Path) -> None:
+    """Raises WorkspaceError where libraries that read and write in the workspace cannot take its path."""
+    try:
+        str(root).encode()
+    except UnicodeEncodeError as error:
+        raise WorkspaceError(
+            f"The workspace {readable(str(root))} has a name that is not UTF-8, which OpenCV cannot read.",
+            "Choose another folder with `--workspace DIR`, or rename what is in its way with `mv`.",
+        ) from error
+
+
 def _new_workspace(root: Path, create: bool) -> Workspace:
     if root.exists() and not root.is_dir():
         raise WorkspaceError(f"{root} is a file, not a workspace folder.", "Choose another one with `--workspace DIR`.")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -49,7 +50,7 @@ def still_fits(frame: Similarity, found: Similarity) -> bool:
     """
     frame_from_found = frame.inverse().compose(found)
     reach = float(np.linalg.norm(frame_from_found.translation)) + frame_from_found.scale
-    upright = float(frame_from_found.rotation[2, 2]) > np.cos(np.radians(MAX_TILT_DEG))
+    upright = float(frame_from_found.rotation[2, 2]) > math.cos(math.radians(MAX_TILT_DEG))
     return reach < MAX_REACH and frame_from_found.scale > MIN_FILLED and upright
 
 

@@ -153,8 +153,10 @@ def known_model(known: KnownPhotos, database: Path, min_num_matches: int) -> Any
     for image in sorted(model.images.values(), key=lambda image: image.image_id):
         if image.name in known.poses:
             earlier = known.poses[image.name]
-            model.frames[image.frame_id].rig_from_world = earlier.cam_from_world()
-            model.register_frame(image.frame_id)
+            frame = model.frames[image.frame_id]
+            if not frame.has_pose():
+                frame.set_cam_from_world(image.camera_id, earlier.cam_from_world())
+                model.register_frame(image.frame_id)
             new_id[earlier.image_id] = image.image_id
     for _, point in sorted(known.model.points3D.items()):
         elements = [

@@ -20,8 +20,11 @@ if TYPE_CHECKING:
 MIN_FOR_SCALE, MIN_FOR_PLACE = 2, 3
 # Two photos tell a point's depth from this angle between their rays on, degrees.
 MIN_PARALLAX_DEG = 1.0
-# A sighting is wrong that misses its point by more than this part of the photo's longest side, and this many pixels.
-MAX_MISS, MIN_MISS_PX = 0.003, 4.0
+# A sighting is wrong that misses its point by more than this part of the photo's longest side, and this many pixels; or
+# by this many times the median, where that is less.
+MAX_MISS, MAX_MISS_PX = 0.005, 12.0
+MISS_TIMES, MIN_MISS_PX = 5.0, 3.0
+MIN_AGREEING = 0.5  # part of the sightings: with fewer, none is known to be right
 # Points within this narrow a strip (part of its length) leave the turn about it open.
 MIN_STRIP = 0.05
 # A point's coordinates are wrong that lie further from where the others put it than this many times the others' median,
@@ -36,7 +39,7 @@ class PlacedPoint:
     """A point where the photos see it.
 
     Attributes:
-        position: in the frame of the poses; None where fewer than two photos agree on it, seen from apart.
+        position: in the frame of the poses; None where fewer than two photos, or fewer than half, agree on it.
         errors: pixels by which each sighting misses it; NaN where it has no position.
         agrees: whether each sighting took part.
     """
@@ -56,7 +59,7 @@ def place_point(photos: Sequence[Any], lenses: Mapping[int, Any], pixels: Float[
         return none
     cameras = [lenses[photo.camera_id] for photo in photos]
     poses = [photo.cam_from_world() for photo in photos]
-    limit = max(MIN_MISS_PX, MAX_MISS * max(max(camera.width, camera.height) for camera in cameras))
+    limit = max(MAX_MISS_PX, MAX_MISS * max(max(camera.width, camera.height) for camera in cameras))
     options = pycolmap.EstimateTriangulationOptions()
     options.min_tri_angle = float(np.radians(MIN_PARALLAX_DEG))
     options.residual_type = pycolmap.TriangulationResidualType.REPROJECTION_ERROR
@@ -70,10 +73,17 @@ def place_point(photos: Sequence[Any], lenses: Mapping[int, Any], pixels: Float[
         seen = [cameras[i].img_from_cam((poses[i] * position)[None])[0] - pixels[i] for i in which]
         return np.nan_to_num(np.ravel(seen), nan=1e6)
 
-    agreeing = np.flatnonzero(found["inliers"])
-    position = least_squares(misses, found["xyz"], args=(agreeing,), method="lm").x
-    errors = np.linalg.norm(misses(position, range(len(pixels))).reshape(-1, 2), axis=1)
-    return PlacedPoint(position, errors, errors <= limit)
+    def refined(agrees: Bool[np.ndarray, " m"]) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " m"]]:
+        position = least_squares(misses, found["xyz"], args=(np.flatnonzero(agrees),), method="lm").x
+        return position, np.linalg.norm(misses(position, range(len(pixels))).reshape(-1, 2), axis=1)
+
+    agrees = np.array(found["inliers"], dtype=bool)
+    _, errors = refined(agrees)
+    agrees = errors <= np.clip(MISS_TIMES * np.median(errors[agrees]), MIN_MISS_PX, limit)
+    if agrees.sum() < max(2, MIN_AGREEING * len(pixels)):
+        return none
+    position, errors = refined(agrees)
+    return PlacedPoint(position, errors, agrees)
 
 
 @dataclass(frozen=True)

@@ -15,9 +15,12 @@ import numpy as np
 
 from stages.artifacts import KnownSphere
 from stages.errors import InputError
+from stages.inputs.folders import readable, short_name
+from stages.inputs.formats import open_image
 
 # An image's suffix; "frame.0001" has none.
 SUFFIX = re.compile(r"\.[A-Za-z]{3,5}$")
+SEPARATORS = re.compile(r"[/\\]")
 # Width and height may be scaled by factors that differ by this much: both were rounded.
 MAX_STRETCH = 0.01
 # A rotation written with a few digits only is taken for the nearest true one, within this.
@@ -73,8 +76,8 @@ class KnownPoses:
 def match_photos(poses: KnownPoses, photos: Iterable[str]) -> dict[str, KnownCamera]:
     """The camera of each photo that has one.
 
-    Names agree when their last part does, suffix aside; where several do, the one with more of the path in common
-    is meant, then the one with the same suffix.
+    Names agree when their last part does, suffix aside, however their letters are encoded; where several do, the one
+    with more of the path in common is meant, then the one with the same suffix.
 
     Args:
         photos: relative posix paths.
@@ -128,7 +131,12 @@ def stem(name: str) -> str:
 
 
 def _parts(name: str) -> tuple[str, ...]:
-    return PurePosixPath(SUFFIX.sub("", name)).parts
+    """Of a path with "/", or with "\\" as Windows has it; photos' names with that in them are cut alike.
+
+    Blanks around a name are lost in texts, long names are those of our own exports.
+    """
+    parts = SEPARATORS.split(SUFFIX.sub("", short_name(readable(name))))
+    return tuple(part.strip() for part in parts if part not in ("", "."))
 
 
 def _likeness(first: str, second: str) -> tuple[int, bool]:
@@ -208,13 +216,12 @@ def image_size(file: Path, origin: Path) -> tuple[int, int]:
     Raises:
         InputError: it cannot be read.
     """
-    from PIL import Image
-
     try:
-        with Image.open(file) as image:
-            return image.size
+        with open_image(file) as image:
+            width, height = image.size
     except OSError as error:
         raise InputError(
             f"{origin} does not say how large its images are, and {file} cannot be read.",
             "Keep the file of poses beside its images.",
         ) from error
+    return width, height

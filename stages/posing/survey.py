@@ -71,7 +71,7 @@ class _SeenPoint:
         if count < MIN_PHOTOS:
             photos = f"{count} photo{'' if count == 1 else 's'} with a pose"
             return f"{self.point.name} (marked in {photos}, {MIN_PHOTOS} are needed)"
-        return f"{self.point.name} (its marks in {count} photos do not meet, or are seen from one side)"
+        return f"{self.point.name} (most of its marks in {count} photos do not meet, or are seen from one side)"
 
 
 def survey(
@@ -156,13 +156,7 @@ def _told(each: _SeenPoint, used: bool, miss: Float[np.ndarray, " 3"], left_out:
 
 
 def _warnings(seen: Sequence[_SeenPoint], points: Sequence[ControlPoint], fit: ControlFit) -> list[str]:
-    sentences = [
-        f"Control point {point.name} in {mark.photo} is marked {mark.error_px:.0f} px from where the other photos see "
-        "it; that mark is not used."
-        for point in points
-        for mark in point.marks
-        if not mark.used and mark.error_px is not None
-    ]
+    sentences = [text for point in points if (text := _wrong_marks(point))]
     if trouble := _troubles(seen):
         count = sum(each.placed.position is None for each in seen)
         sentences.append(f"{count} of {len(seen)} control points could not be placed: {trouble}.")
@@ -182,6 +176,19 @@ def _warnings(seen: Sequence[_SeenPoint], points: Sequence[ControlPoint], fit: C
     return sentences
 
 
+def _wrong_marks(point: ControlPoint) -> str:
+    """A sentence on the marks that do not fit the others, the worst first; empty where all do."""
+    wrong = sorted((-mark.error_px, mark.photo) for mark in point.marks if not mark.used and mark.error_px is not None)
+    if not wrong:
+        return ""
+    named = ", ".join(f"{-error:.0f} px in {photo}" for error, photo in wrong[:NAMED])
+    more = f" and {len(wrong) - NAMED} more" if len(wrong) > NAMED else ""
+    return (
+        f"{len(wrong)} of {len(point.marks)} marks of control point {point.name} are not used, because they miss where "
+        f"the other photos see it: by {named}{more}."
+    )
+
+
 def _too_few(control: GroundControl, seen: Sequence[_SeenPoint], reason: str) -> InputError:
     fitted = [each for each in seen if not each.point.check]
     checks = f" ({len(seen) - len(fitted)} more only check)" if len(fitted) < len(seen) else ""
@@ -190,7 +197,8 @@ def _too_few(control: GroundControl, seen: Sequence[_SeenPoint], reason: str) ->
         f"The {len(fitted)} control points in {control.origin}{checks} do not tell the scale: {reason}"
         f"{': ' + trouble if trouble else ''}.",
         f"Mark at least {MIN_FOR_SCALE} points ({MIN_FOR_PLACE} for place and direction) in {MIN_PHOTOS} photos or "
-        "more each, from apart, or leave them out: `--no-control`.",
+        "more each, from apart; pixels count from the upper left corner of the upright photo in full size. "
+        "`--no-control` leaves control points out.",
     )
 
 

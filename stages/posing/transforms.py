@@ -17,6 +17,7 @@ import numpy as np
 
 from stages.artifacts import KnownSphere
 from stages.errors import InputError
+from stages.inputs.texts import read_text
 from stages.posing.known import SUFFIX, KnownCamera, KnownPoses, check_masks, image_size, nearest_rotation, reading
 
 FILES = ("transforms.json", "transforms_train.json")
@@ -85,7 +86,7 @@ def _name(frame: Mapping[str, Any]) -> str:
 
 def _load(file: Path) -> dict[str, Any]:
     with reading(str(file), "the JSON of nerfstudio or Blender"):
-        data = json.loads(file.read_text(encoding="utf-8"))
+        data = json.loads(read_text(file))
     frames = data.get("frames") if isinstance(data, dict) else None
     if not isinstance(frames, list) or not frames:
         raise InputError(f"{file} has no `frames`.", "It needs the JSON of nerfstudio or Blender.")
