@@ -87,6 +87,12 @@ def agreement(photos: Path, name: str, truth: np.ndarray) -> float:
     return float(((mask > 127) & truth).sum() / ((mask > 127) | truth).sum())
 
 
+def aside(photos: list[str]) -> tuple[list[str], dict[str, str], list[str]]:
+    """`set_masks_aside` of names alone."""
+    kept, masks, others = set_masks_aside({name: Path(name) for name in photos})
+    return list(kept), {photo: Path(mask).as_posix() for photo, mask in masks.items()}, sorted(map(str, others))
+
+
 def check(*arguments: str | Path) -> Result:
     return CliRunner().invoke(app, ["check", *map(str, arguments)])
 
@@ -113,7 +119,7 @@ def said(result: Result) -> str:
     ],
 )
 def test_a_mask_beside_its_photo_is_told_by_its_name(photo: str, mask: str):
-    assert set_masks_aside([photo, mask, "other.jpg"]) == ([photo, "other.jpg"], {photo: mask}, [mask])
+    assert aside([photo, mask, "other.jpg"]) == ([photo, "other.jpg"], {photo: mask}, [mask])
     assert pair([photo, "other.jpg"], [mask]) == {photo: mask}
 
 
@@ -129,7 +135,7 @@ def test_a_mask_beside_its_photo_is_told_by_its_name(photo: str, mask: str):
 )
 def test_folders_of_masks_among_the_photos(masks: dict[str, str]):
     photos = list(masks)
-    assert set_masks_aside([*photos, *masks.values()]) == (photos, masks, sorted(masks.values()))
+    assert aside([*photos, *masks.values()]) == (photos, masks, sorted(masks.values()))
 
 
 def test_photos_are_not_taken_for_masks():
@@ -140,17 +146,17 @@ def test_photos_are_not_taken_for_masks():
         ["1_mask.jpg", "2_mask.jpg"],
         ["img.v2.jpg", "img.jpg"],
     ):
-        assert set_masks_aside(photos) == (photos, {}, [])
+        assert aside(photos) == (photos, {}, [])
 
 
 def test_one_mask_for_a_whole_folder_is_no_photo():
-    assert set_masks_aside(["1.jpg", "2.jpg", "mask.tif"]) == (["1.jpg", "2.jpg"], {}, ["mask.tif"])
+    assert aside(["1.jpg", "2.jpg", "mask.tif"]) == (["1.jpg", "2.jpg"], {}, ["mask.tif"])
 
 
 def test_reduced_copies_of_masks_are_not_preferred():
-    photos, masks, aside = set_masks_aside(["images/1.png", "masks/1.png", "masks_2/1.png"])
+    photos, masks, others = aside(["images/1.png", "masks/1.png", "masks_2/1.png"])
     assert (photos, masks) == (["images/1.png"], {"images/1.png": "masks/1.png"})
-    assert aside == ["masks/1.png", "masks_2/1.png"]
+    assert others == ["masks/1.png", "masks_2/1.png"]
 
 
 def test_accents_are_the_same_however_they_are_composed():
