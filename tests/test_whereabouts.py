@@ -37,7 +37,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def make_photos(folder: Path, scene: str, count: int = 4) -> None:
     folder.mkdir(parents=True)
     for index in range(count):
-        (folder / f"{index}.jpg").write_bytes(b"\xff\xd8\xff" + f"{index} of {scene}".encode())  # begins as a JPEG
+        (folder / f"{index}.jpg").write_text(f"II*\0{index} of {scene}")  # a TIFF, by its beginning
 
 
 def hineus(*arguments: str) -> Result:
