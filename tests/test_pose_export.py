@@ -17,7 +17,7 @@ from stages import artifacts
 from stages.engine.workspace import Workspace
 from stages.posing.exporting import write_colmap, write_transforms
 from stages.posing.known import KnownPoses
-from stages.posing.reading import read_poses
+from stages.posing.reading import masks_beside, read_poses
 
 
 def captured(tmp_path: Path, masks: bool = False) -> tuple[Path, Path]:
@@ -88,6 +88,24 @@ def test_transforms_export_reads_back(tmp_path: Path):
     nearest = np.linalg.norm(points[:, None] - DOTS[None], axis=2)
     assert points.shape == DOTS.shape
     assert nearest.min(0).max() < 1e-5
+
+
+def test_masks_of_some_photos_only_are_not_named_for_nerfstudio(tmp_path: Path, caplog: pytest.LogCaptureFixture):
+    folder, sfm = captured(tmp_path, masks=True)
+    next((folder / "masks").iterdir()).unlink()
+    write_transforms(folder, sfm, tmp_path / "place", tmp_path / "exported")
+    data = json.loads((tmp_path / "exported" / "transforms.json").read_text())
+    assert not any("mask_path" in frame for frame in data["frames"])
+    assert f"only {NUM_CAMERAS - 1} of {NUM_CAMERAS} photos have one" in caplog.text
+
+
+def test_masks_of_an_export_are_read_back(tmp_path: Path):
+    folder, sfm = captured(tmp_path, masks=True)
+    out = tmp_path / "exported"
+    write_transforms(folder, sfm, tmp_path / "place", out)
+    masks = read_poses(out).masks
+    assert masks == {f"images/{name.stem}": name for name in (out / "masks").iterdir()}
+    assert masks_beside(out / "transforms.json") == out / "masks"
 
 
 def test_both_exports_say_the_same_and_that_of_the_scene(tmp_path: Path):

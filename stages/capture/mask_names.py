@@ -71,8 +71,7 @@ def pair_by_name(photos: Sequence[str], masks: Iterable[str]) -> dict[str, str]:
 
 def pair_by_ending(photos: Sequence[str], masks: Sequence[str]) -> dict[str, str]:
     """As `pair_by_name`, where all masks are called like their photos but for the same ending or beginning."""
-    called = [_folded(PurePosixPath(photo).stem) for photo in photos]
-    stems = {stem: photo for stem, photo in zip(called, photos, strict=True) if called.count(stem) == 1}
+    stems = _single(photos)
     parts: Counter[tuple[str, str]] = Counter()
     for name in (_folded(PurePosixPath(mask).stem) for mask in masks):
         parts.update((before, after) for stem in stems for before, found, after in [name.partition(stem)] if found)
@@ -81,9 +80,15 @@ def pair_by_ending(photos: Sequence[str], masks: Sequence[str]) -> dict[str, str
     count, (before, after) = max(regular, default=(0, ("", "")))
     if count < max(2, REGULAR * len(photos)):
         return {}
-    names = {f"{before}{stem}{after}": photo for stem, photo in stems.items()}
-    found = {names.get(_folded(PurePosixPath(mask).stem)): mask for mask in masks}
-    return {photo: mask for photo, mask in found.items() if photo is not None}
+    called = _single(masks)
+    names = {photo: f"{before}{stem}{after}" for stem, photo in stems.items()}
+    return {photo: called[name] for photo, name in names.items() if name in called}
+
+
+def _single(paths: Sequence[str]) -> dict[str, str]:
+    """Name without suffix -> path, of those that no other has."""
+    called = Counter(_folded(PurePosixPath(path).stem) for path in paths)
+    return {stem: path for path in paths if called[stem := _folded(PurePosixPath(path).stem)] == 1}
 
 
 def set_masks_aside(files: Mapping[str, Path]) -> tuple[dict[str, Path], dict[str, Path], dict[str, Path]]:

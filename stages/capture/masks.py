@@ -109,11 +109,8 @@ def missing_masks(photos: Sequence[str], files: Mapping[str, Path], folder: Path
         others = [name for name in names if name not in photos]
         holds = f"{len(others)} pictures, e.g. {others[0]}" if others else "no pictures"
         message += " It holds the photos only." if names and not others else f" It holds {holds}."
-    return InputError(
-        message,
-        f"Add {Path(missing[0]).with_suffix('.png').as_posix()} and the like, move those photos away, or run with "
-        "`--no-masks`.",
-    )
+    wanted = Path(missing[0]).with_suffix(".png").as_posix()
+    return InputError(message, f"Add {wanted} and the like, move those photos away, or run with `--no-masks`.")
 
 
 def tell_masks(looks: Sequence[MaskLook]) -> str:
