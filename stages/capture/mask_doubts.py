@@ -176,8 +176,8 @@ def _not_of_these(seen: Sequence[MaskLook]) -> Doubt | None:
         return Doubt(message + f" They would fit {turn}.", "Make them again from these photos, or `--no-masks`.")
     return Doubt(
         message,
-        "Look at one beside its photo (are they drawn far around the object?); name the right folder with `--masks`, or "
-        "use `--no-masks`.",
+        "Look at one beside its photo (are they drawn far around the object?); name the right folder with `--masks`, "
+        "or use `--no-masks`.",
     )
 
 
