@@ -64,6 +64,18 @@ def _redraws(console: Console) -> bool:
     return console.file.isatty() and not console.is_dumb_terminal
 
 
+@contextlib.contextmanager
+def terminal_may_go() -> Iterator[None]:
+    """What is said inside to a terminal that was closed is said to nobody; a run that was disowned goes on."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno != errno.EIO:
+            raise
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
+
+
+@terminal_may_go()
 def say(text: str, style: str = "", console: Console | None = None) -> None:
     """One line for people, which only the terminal wraps, so that a command in it can be copied."""
     (console or people()).print(Text(plain(text), style=style), soft_wrap=True)
@@ -144,6 +156,7 @@ def stdout_kept_clean() -> Iterator[None]:
 
 
 # ---------------------------------------------------------------- errors
+@terminal_may_go()
 def show_error(message: str, hint: str = "") -> None:
     """What happened; then, as the last line, what to do."""
     console = people()
@@ -181,6 +194,7 @@ class ProgressDisplay(Listener):
         self._bars.start()
         return self
 
+    @terminal_may_go()
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
@@ -197,18 +211,21 @@ class ProgressDisplay(Listener):
 
         return show
 
+    @terminal_may_go()
     def stage_started(self, stage: Stage, reason: str) -> None:
         self.running = stage.name
         self._printed_at = time.monotonic()
         self._line(f"{stage.name}: {stage.summary or 'running'} ({reason})")
         self._task = self._bars.add_task(stage.name, total=None, note="")
 
+    @terminal_may_go()
     def stage_progress(self, stage: Stage, done: float, total: float, note: str) -> None:
         self._bars.update(self._task, completed=done, total=total, note=plain(note))
         if self._bars.disable and time.monotonic() - self._printed_at > PLAIN_EVERY_S:
             self._printed_at = time.monotonic()
             self._line(f"{stage.name}: {100 * done / max(total, 1e-9):.0f} % {note}".rstrip())
 
+    @terminal_may_go()
     def stage_finished(self, stage: Stage, outcome: StageOutcome) -> None:
         self.running = None
         if outcome.action == "ran":

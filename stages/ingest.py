@@ -406,15 +406,15 @@ def _given_mask(
     Raises:
         UnusableError: the mask keeps nothing, or the photo is a mask itself.
     """
-    size, black_keeps = photo.size, params.masks_keep == "black"
+    black_keeps = params.masks_keep == "black"
     scale = min(1.0, LOOK_SIDE / max(photo.rgb.size))
     preview = np.asarray(photo.rgb.resize([max(1, round(side * scale)) for side in photo.rgb.size], resample=NEAREST))
     if is_black_and_white(preview):
         raise UnusableError(MASK_NOT_PHOTO)
     if mask_file is not None:
-        mask = read_mask_file(mask_file, source, size, photo.stored_size, photo.orientation, black_keeps, preview)
+        mask = read_mask_file(mask_file, source, photo.size, photo.stored_size, photo.orientation, black_keeps, preview)
     elif photo.alpha is not None and params.own_masks:
-        mask = Mask(photo.alpha ^ black_keeps, size)
+        mask = Mask(photo.alpha ^ black_keeps, photo.size)
     else:
         return None, None
     return mask.kept, look_at_mask(source, readable(mask_file.name) if mask_file else alpha_of(source), mask, preview)

@@ -33,14 +33,15 @@ def what_is_kept(workspace: Workspace, config: Config, now: FileDigests, forced:
     except ManifestDamaged:
         return ""
     before = made.identity.sources.get("photos") if made else None
-    if not before:
+    if not before or not now:  # photos that are nowhere to be found are not removed
         return ""
     since = compare_photos(before, now, same_folder=True)
-    new = [path for path in since.added if _is_capture(path)]
-    gone = [path for path in since.removed if _is_capture(path)]
-    if not new and not gone:
-        return ""
     known = [path for path in since.kept if _is_capture(path)]
+    contents_then, contents_now = set(before.values()), set(now.values())  # a copy is no other photo
+    new = [path for path in since.added if _is_capture(path) and now[path] not in contents_then]
+    gone = [path for path in since.removed if _is_capture(path) and before[path] not in contents_now]
+    if not known or not (new or gone):
+        return ""
     counts = f"{len(known)} photos known, {len(new)} new, {len(gone)} gone"
     return f"{counts}: {_of_poses_and_training(workspace, config, set(since.kept), len(new), len(gone), forced)}"
 

@@ -140,7 +140,10 @@ def _gpu() -> Finding:
         return Finding("GPU", "note", f"unknown: {error}")
     name = found.stdout.strip() or "unknown: torch does not import"
     if name.startswith(("none", "unknown")):
-        return Finding("GPU", "note", name, "everything runs on the CPU, with smaller settings")
+        advice = "everything runs on the CPU, with smaller settings"
+        if "without CUDA" in name and shutil.which("nvidia-smi"):
+            advice += "; for the GPU: `pip install --force-reinstall torch`, without the index of CPU builds"
+        return Finding("GPU", "note", name, advice)
     return Finding("GPU", "ok", name)
 
 

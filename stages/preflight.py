@@ -45,6 +45,7 @@ OTHER_CPU_S = 50.0  # everything after training: 37 to 47
 # bring was not measured; by Amdahl's law it is at most five times one core.
 PARALLEL_SHARE = 0.8
 DISK_BASE_GB = 0.3  # checkpoint, meshes, textures, report: an allowance
+FEATURE_BYTES_PER_PIXEL = 1.2  # looked at: features and matches are kept for photos that are added later
 DISK_BYTES_PER_PIXEL = 2.0  # undistorted images are PNG: 1.4 to 2 bytes a pixel
 
 
@@ -185,7 +186,8 @@ def estimate(seen: Inspection, config: Config, device: str, workers: int) -> Nee
     later_gib = MEMORY_BASE_GIB + MEMORY_OF_PHOTOS * 3 * trained_on / GIB
     return Needs(
         memory_gib=max(read_gib, sfm_gib, later_gib),
-        disk_gb=DISK_BASE_GB + (seen.num_bytes + DISK_BYTES_PER_PIXEL * trained_on) / 1e9,
+        disk_gb=DISK_BASE_GB
+        + (seen.num_bytes + DISK_BYTES_PER_PIXEL * trained_on + FEATURE_BYTES_PER_PIXEL * sum(looked_at)) / 1e9,
         minutes=_minutes(looked_at, config, workers) if device == "cpu" else None,
     )
 

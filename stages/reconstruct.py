@@ -20,7 +20,7 @@ from stages.capture.listing import is_video
 from stages.engine.fingerprint import SourceDigests
 from stages.engine.photos_since import READS_PHOTOS, PhotosSince, photos_since
 from stages.engine.run_log import log_to_file
-from stages.engine.runner import Listener, StageOutcome, naming_command, run_pipeline
+from stages.engine.runner import Listener, StageOutcome, naming_command, run_pipeline, source_option
 from stages.engine.stage import Stage
 from stages.engine.workspace import Workspace
 from stages.errors import ConfigError, InputError, SystemRequirementError, WorkspaceError
@@ -88,11 +88,9 @@ def reconstruct(request: Request, pipeline: Sequence[Stage], listener: Listener 
         photos = sources["photos"]
         if photos is not None and not workspace.stage_folder("ingest").exists():
             _tell_preflight(_preflight(sources, workspace.root, config, device, workers, decode=False))
-        elif photos is not None and photos.exists():
-            digests = SourceDigests({"photos": photos}, workspace.digest_cache)
-            if kept := what_is_kept(workspace, config, digests.files("photos") or {}, _forced(request, pipeline)):
-                log.info("%s", kept)
-            digests.save()
+        now = digests.files("photos") if digests.available("photos") else None
+        if kept := what_is_kept(workspace, config, now or {}, _forced(request, pipeline)):
+            log.info("%s", kept)
         log.debug("preset %s, device %s, %d workers, %s", preset, device, workers, sources)
         outcomes = run_pipeline(
             pipeline,
@@ -276,10 +274,10 @@ def _tell_sources(request: Request, workspace: Workspace, sources: Mapping[str, 
         if now is None:
             log.warning(
                 "the %s of the last run, %s, are not used: they were given for other photos. To use them for these, "
-                "too: `--%s %s`",
+                "too: `%s %s`",
                 name,
                 before,
-                name,
+                source_option(name),
                 shlex.quote(before),
             )
         elif not now.exists() or (name == "photos" and not holds_files(now)):

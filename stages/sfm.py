@@ -36,13 +36,14 @@ from stages.artifacts import (
 )
 from stages.capture.salient import INSTALL, find_weights
 from stages.engine.fingerprint import digest, file_sha256
+from stages.engine.photos_since import compare_photos
 from stages.engine.stage import Stage, StageContext
 from stages.errors import InputError, ReconstructionError
-from stages.posing.adding import STAYED, KnownPhotos, known_lenses, put_back, same_contents
+from stages.posing.adding import STAYED, KnownPhotos, known_lenses, put_back
 from stages.posing.adjustment import LastAdjustment, adjust_last
 from stages.posing.evidence import MIN_VERIFIED, Evidence
 from stages.posing.known import match_photos
-from stages.posing.ladder import Solution, Step, better, climb, describe, photos_wanted
+from stages.posing.ladder import Solution, Step, climb, describe, photos_wanted
 from stages.posing.reading import read_poses
 from stages.posing.triangulation import triangulate
 from stages.posing.turning import from_one_place, parallaxes
@@ -52,6 +53,7 @@ log = logging.getLogger(__name__)
 
 FEW_POINTS = 10  # fewer points than this a photo are worth a warning where the poses are known
 DOUBTFUL_ERROR_PX = 2.0  # COLMAP's own models are below one
+MIN_CONNECTED = 0.5  # of new photos must be placed beside the known ones, or poses are found anew from all
 FEATURES_EXTRA = "pip install 'hineus[features]'"
 
 
@@ -136,6 +138,11 @@ def _contents(photos: Pictures, names: Iterable[str]) -> dict[str, str]:
     return {name: digest([file_sha256(path) for path in paths if path.exists()]) for name, paths in files.items()}
 
 
+def _names_then(before: dict[str, str], now: dict[str, str]) -> dict[str, str]:
+    """Photo now -> the photo before with the same contents (name -> digest)."""
+    return {name: then for then, name in compare_photos(before, now, same_folder=True).kept.items()}
+
+
 def _known_photos(
     context: StageContext[SfmParams], contents: dict[str, str], image_set: ImageSet
 ) -> KnownPhotos | None:
@@ -145,7 +152,7 @@ def _known_photos(
     before, folder = context.read_previous(PHOTO_CONTENTS), context.read_previous(FEATURES)
     if before is None or folder is None or not folder.exists():
         return None
-    names = same_contents(before.contents, contents)
+    names = _names_then(before.contents, contents)
     registration = context.read_previous(REGISTRATION)
     known = KnownPhotos(
         names=names,
@@ -161,7 +168,7 @@ def _known_photos(
     if not known.enough:
         log.info("%s, %d placed before: too few, poses are found anew", known.describe(), len(known.poses))
         return None
-    log.info("%s: poses of the known stay, and the new are placed beside them", known.describe())
+    log.info("%s: poses of the known stay%s", known.describe(), ", the new go beside them" if known.new else "")
     return known
 
 
@@ -170,21 +177,26 @@ def _solve(bench: Workbench, wanted: int, enough: int, params: SfmParams) -> tup
     known = bench.known
     if known is None:
         return climb(bench.rungs(), wanted, enough)
-    connected = len(known.poses) + photos_wanted(len(known.new), params.wanted)
+    share = max(params.wanted, MIN_CONNECTED)
+    of_new = max(
+        min(photos_wanted(len(known.new), share), photos_wanted(len(bench.names), share) - len(known.poses)),
+        photos_wanted(len(known.new), MIN_CONNECTED),
+    )
+    needed = len(known.poses) + of_new
     beside, steps = None, list[Step]()
     try:
         beside, steps = climb([bench.adding()], wanted, enough)
     except (RuntimeError, ValueError) as error:  # COLMAP's checks
         log.warning("the known poses are no start: %s", " ".join(str(error).split()))
     placed = 0 if beside is None else len(beside.registered)
-    if beside is not None and (placed >= min(connected, wanted) or not known.changed):
+    if beside is not None and (placed >= needed or not known.changed):
         return beside, steps
     log.warning(
         "beside the known photos %d of %d photos could be placed (%d wanted): poses are found anew from all",
-        placed, len(bench.names), min(connected, wanted),
+        placed, len(bench.names), needed,
     )  # fmt: skip
     anew, more = climb(bench.rungs(), wanted, enough)
-    if better(anew, beside):
+    if anew is not None and len(anew.registered) > placed:
         return anew, steps + more
     log.info("poses of the known photos stay, since no more photos were placed")
     return beside, [replace(step, kept=False) for step in more] + steps
@@ -199,7 +211,7 @@ def _since(
         return None, {}
     moved = put_back(known, model) if known.changed else 0.0
     stayed = moved is not None and moved <= STAYED
-    if moved is not None:
+    if moved is not None and known.changed:
         log.info(
             "known photos are %s: %.3g %% of the distance to what they see (median)",
             "where they were" if stayed else "elsewhere",
@@ -366,7 +378,7 @@ def _lineage_of_given(context: StageContext[SfmParams], model: Any, contents: di
         return None
     then = pycolmap.Reconstruction(str(context.read_previous(MODEL)))
     poses = {image.name: image.cam_from_world().matrix() for image in then.images.values()}
-    names = same_contents(before.contents, contents)
+    names = _names_then(before.contents, contents)
     images = [image for image in model.images.values() if names.get(image.name) in poses]
     same = all(np.allclose(image.cam_from_world().matrix(), poses[names[image.name]]) for image in images)
     return before.lineage if images and same else None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import os
 from collections.abc import Iterator
 from contextlib import suppress
@@ -13,8 +12,6 @@ from stages.engine.photos_since import PhotosSince
 from stages.engine.workspace import WORKSPACE_SUFFIX, Workspace
 from stages.errors import WorkspaceError
 from stages.inputs.folders import named_files, readable
-
-log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -29,7 +26,7 @@ def default_workspace(photos: Path) -> DefaultWorkspace:
     """`PHOTOS_hineus` beside the folder of photos, or beside the video; with a telling name here where that cannot be.
 
     A workspace of these photos that is there already comes first: beside the folder that a link stands for, or in the
-    current folder, where it was made by default up to 0.2.
+    current folder, which was the default before.
     """
     named, real = _named(photos), photos.resolve()
     beside, beside_real = _beside(named), _beside(real)

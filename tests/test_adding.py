@@ -18,7 +18,7 @@ from stages import artifacts
 from stages.artifacts import ImageRecord, ImageSet, SkippedImage
 from stages.engine.stage import StageContext
 from stages.geometry.similarity import align_points
-from stages.posing.adding import KnownPhotos, copy_features, known_model, put_back, same_contents
+from stages.posing.adding import KnownPhotos, copy_features, known_model, put_back
 from stages.posing.workbench import ADDED, Base
 from stages.sfm import SFM
 
@@ -227,11 +227,6 @@ def test_known_poses_and_features_survive_a_change_of_ids(eight: Path, tmp_path:
     model.transform(shift)
     assert put_back(known, model) == pytest.approx(0, abs=1e-9)
     assert model.compute_mean_reprojection_error() == pytest.approx(earlier.compute_mean_reprojection_error(), rel=1e-6)
-
-
-def test_photos_are_known_by_contents_and_by_name_among_the_same() -> None:
-    before = {"a": "1", "b": "2", "c": "2", "d": "3"}
-    assert same_contents(before, {"c": "2", "x": "1", "y": "9", "z": "2"}) == {"c": "c", "x": "a", "z": "b"}
 
 
 @pytest.mark.parametrize("base", [Base(), Base(affine=True), Base(masked=True, focal_priors=False), Base(corners=True)])

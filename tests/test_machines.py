@@ -18,7 +18,7 @@ import pytest
 from hineus_cli.__main__ import shadowed
 from stages import caches, limits, machine_check
 from stages.engine.locking import take
-from stages.engine.system import missing_libraries
+from stages.engine.system import SYSTEM_LIBRARIES, missing_libraries
 from stages.engine.workspace import storage_errors
 from stages.errors import WorkspaceError
 
@@ -348,8 +348,16 @@ def test_doctor_names_packages_that_share_our_modules_names(monkeypatch: pytest.
 
 
 def test_doctor_looks_at_every_dependency() -> None:
-    import tomllib
+    tomllib = pytest.importorskip("tomllib")  # Python 3.11
 
     project = tomllib.loads((REPOSITORY / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     names = {requirement.split(">")[0] for requirement in project["dependencies"]}
     assert names == set(machine_check.REQUIRED.values())
+    extras = project["optional-dependencies"]
+    for_users = {
+        each.split(">")[0] for name in extras for each in extras[name] if name not in ("dev", "bench", "triton")
+    }
+    assert for_users == {distribution for distribution, _ in machine_check.OPTIONAL.values()}
+    container = (REPOSITORY / "Dockerfile").read_text(encoding="utf-8")
+    assert f"ARG EXTRAS={','.join(name for name in extras if name not in ('dev', 'bench', 'triton'))}\n" in container
+    assert all(package in container for package in SYSTEM_LIBRARIES.values())

@@ -10,6 +10,7 @@ import struct
 import subprocess
 import sys
 import termios
+import time
 from pathlib import Path
 
 import pytest
@@ -191,6 +192,26 @@ def test_closed_streams_stop_nothing(folder: Path, closed: str) -> None:
         done = in_shell(folder, f"HINEUS run photos --until ingest {options} {closed}")
         assert done.returncode == 0, done.stderr
     assert (folder / "photos_hineus/ingest/letters.txt").is_file()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("before", "code"), [("", 129), ("trap '' HUP;", 0)], ids=["stopped", "disowned"])
+def test_a_terminal_that_is_closed(folder: Path, before: str, code: int) -> None:
+    (folder / "program.py").write_text(PROGRAM)
+    given = environment({"TOY_SLEEP": "2"})  # in sfm
+    line = f"cd {folder}; {before} exec {sys.executable} program.py run photos"
+    process, terminal = pty.fork()
+    if process == 0:
+        os.execvpe("bash", ["bash", "-c", line], given)
+    came = b""
+    while b"sfm" not in came:
+        came += os.read(terminal, 1 << 16)
+    time.sleep(0.5)
+    os.close(terminal)
+    assert os.waitstatus_to_exitcode(os.waitpid(process, 0)[1]) == code
+    workspace = folder / "photos_hineus"
+    assert (workspace / "export/model.glb").exists() == (code == 0)
+    assert ("stopped by SIGHUP" in (workspace / "hineus.log").read_text()) == (code != 0)
 
 
 # ---------------------------------------------------------------- the last line

@@ -106,7 +106,8 @@ def test_where_there_is_nothing_to_see_it_says_what_to_do(workspace, tmp_path):
 
 
 @pytest.mark.slow
-def test_the_command_prints_its_address_and_ends_with_ctrl_c(workspace):
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 0), (signal.SIGTERM, 143)])
+def test_the_command_prints_its_address_and_ends_with_ctrl_c(workspace, number, code):
     write_report(workspace)
     command = [sys.executable, "-m", "hineus_cli", "view", str(workspace.root), "--no-browser"]
 
@@ -119,8 +120,8 @@ def test_the_command_prints_its_address_and_ends_with_ctrl_c(workspace):
         try:
             assert process.stdout is not None
             assert get(process.stdout.readline().strip()) == "<p>the report</p>"
-            process.send_signal(signal.SIGINT)
-            assert process.wait(timeout=20) == 0
+            process.send_signal(number)
+            assert process.wait(timeout=20) == code
         finally:
             process.kill()
 

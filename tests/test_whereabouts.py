@@ -17,7 +17,9 @@ from stages import reconstruct, whereabouts
 from stages.artifacts import SkippedImage
 from stages.capture.listing import list_captures
 from stages.engine.fingerprint import SourceDigests
+from stages.engine.runner import naming_command
 from stages.engine.workspace import Workspace
+from stages.posing.control_files import CONTROL
 
 POSED = with_stage("sfm", sources=("poses",))  # a pipeline that reads poses, too
 
@@ -35,7 +37,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def make_photos(folder: Path, scene: str, count: int = 4) -> None:
     folder.mkdir(parents=True)
     for index in range(count):
-        (folder / f"{index}.jpg").write_bytes(b"\xff\xd8\xff" + f"{index} of {scene}".encode())  # begins as a JPEG
+        (folder / f"{index}.jpg").write_text(f"II*\0{index} of {scene}")  # a TIFF, by its beginning
 
 
 def hineus(*arguments: str) -> Result:
@@ -199,6 +201,7 @@ def sources(workspace: Path) -> dict[str, str | None]:
 
 
 def test_photos_moved_with_the_same_workspace_keep_masks_and_poses(masked: Path) -> None:
+    """Case 21."""
     before = sources(masked / "a/ws")
     shutil.copytree(masked / "a/images", masked / "copy")
     answer = run("copy", "-w", "a/ws")
@@ -221,7 +224,8 @@ def test_everything_moved_together(masked: Path) -> None:
     (masked / "a").rename(masked / "elsewhere")
     answer = run("-w", "elsewhere/ws")
     assert {stage["action"] for stage in answer["stages"]} == {"skipped"}
-    assert sources(masked / "elsewhere/ws") == {
+    given = {name: path for name, path in sources(masked / "elsewhere/ws").items() if path}
+    assert given == {
         "photos": f"{masked}/elsewhere/images",
         "masks": f"{masked}/elsewhere/masks",
         "poses": f"{masked}/elsewhere/poses/transforms.json",
@@ -245,10 +249,10 @@ def test_masks_that_stayed_behind_and_are_gone_are_told(masked: Path) -> None:
     answer = run("-w", "a/ws")
     assert actions(answer) == {"skipped"}
     assert f"The masks are no longer at {masked}/a/masks." in answer["said"]
-    assert f"`hineus run --masks MASKS --workspace {masked}/a/ws`" in answer["said"]
+    assert f"`hineus run --masks PATH --workspace {masked}/a/ws`" in answer["said"]
     refused = hineus("run", "-w", "a/ws", "--force", "ingest")
     assert refused.exit_code == 3
-    assert "`hineus run --masks MASKS --workspace" in refused.stderr
+    assert "`hineus run --masks PATH --workspace" in refused.stderr
 
 
 @pytest.mark.parametrize("emptied", [False, True], ids=["gone", "unmounted"])
@@ -273,3 +277,10 @@ def test_records_of_older_versions_have_no_place(masked: Path) -> None:
     record.write_text(json.dumps(data))
     assert actions(run("-w", "a/ws")) == {"skipped"}
     assert json.loads(record.read_text())["root"] == f"{masked}/a/ws"
+
+
+def test_the_option_of_every_source() -> None:
+    root = Path("/my ws")
+    assert naming_command("photos", root) == "hineus run PHOTOS --workspace '/my ws'"
+    assert naming_command(CONTROL, root) == "hineus run --control PATH --workspace '/my ws'"
+    assert naming_command("poses", root) == "hineus run --poses PATH --workspace '/my ws'"

@@ -44,6 +44,7 @@ def status(
                 for key in ("size", "wall_s", "cpu_s", "peak_rss", "created")
             },
             "numbers": dict(each.manifest.numbers) if each.manifest else None,
+            "previous": each.manifest.identity.previous if each.manifest else None,
         }
         for each in statuses
     ]

@@ -23,7 +23,6 @@ from stages.capture.masks import (
     load_mask,
     look_at_mask,
     match_masks,
-    turned_pixels,
     unused_folder,
     unused_masks,
 )
@@ -180,7 +179,7 @@ def _look_closer(head: PhotoFile, file: Path, mask_file: Path | None, wanted: Ma
     pixels = read_preview(file)
     if is_black_and_white(pixels):
         raise UnusableError(MASK_NOT_PHOTO)
-    mask = _look_at_mask(head, file, mask_file, turned_pixels(pixels, head.orientation), wanted)
+    mask = _look_at_mask(head, file, mask_file, pixels, wanted)
     return _Seen(head, appearance(head.source, pixels), find_background(pixels).is_plain, mask)
 
 

@@ -88,7 +88,7 @@ def choose_masks(
 def unused_masks(
     aside: Mapping[str, Path], used: Iterable[Path], use_own: bool, masks_folder: Path | None
 ) -> list[SkippedImage]:
-    """Those of the masks among the photos that are not used, and why."""
+    """Those of the masks among the photos that are not used, and why; `files`: path -> file."""
     taken = {file.resolve() for file in used}
     reason = f"{ASIDE} that are of none of them, or one for all, which is no object's outline"
     if masks_folder is not None:
@@ -204,13 +204,6 @@ def turned(image: Any, orientation: int | None) -> Any:
     tagged.info = {"exif": exif.tobytes()}
     tagged._exif = None
     return ImageOps.exif_transpose(tagged)
-
-
-def turned_pixels(pixels: np.ndarray, orientation: int | None) -> np.ndarray:
-    """As `turned`, of [H, W, 3] uint8."""
-    from PIL import Image
-
-    return pixels if orientation in (None, 0, 1) else np.asarray(turned(Image.fromarray(pixels), orientation))
 
 
 def _sees_through(image: Any) -> bool:

@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 
 from stages.capture.colour import Colours, colours_of, in_srgb
-from stages.capture.exif import EXIF_IFD, GPS_IFD, NO_GPS, ORIENTATION, Gps, camera_key, focal_px, read_gps
+from stages.capture.exif import EXIF_IFD, NO_GPS, ORIENTATION, Gps, camera_key, focal_px, read_gps
 from stages.inputs.formats import TIFF, Kind, kind_of_head, open_image, read_head_bytes
+from stages.limits import available_memory
 
 # What COLMAP's reader takes as it is, with the suffixes that it knows; the rest is re-encoded.
 COLMAP_SUFFIXES = {
@@ -159,19 +160,22 @@ def read_head(file: Path, source: str, max_side: int) -> PhotoFile:
 
 
 def read_preview(file: Path) -> np.ndarray:
-    """Pixels [H, W, 3] uint8 of the photo, not turned, and reduced where that makes decoding quick.
+    """Pixels [H, W, 3] uint8 of the upright photo, reduced.
 
     Raises:
         UnusableError: it cannot be decoded, or is a raw file without rawpy.
     """
+    from PIL import ImageOps
+
     with _telling_damage():
         if _is_raw(file):  # half a second each; the previews in raw files have any size, or are not there
             return np.asarray(_develop(file, PREVIEW_SIDE).rgb)
         with open_image(file) as stored, _memory_for(stored, PREVIEW_SIDE):
             stored.draft(None, (PREVIEW_SIDE, PREVIEW_SIDE))
             image, _ = _flat_and_alpha(stored)
-            image = image.reduce(max(1, min(image.size) // PREVIEW_SIDE))
-            return np.asarray(in_srgb(image, Colours()))
+            image = in_srgb(image.reduce(max(1, min(image.size) // PREVIEW_SIDE)), Colours())
+            # Pillow has turned TIFF already
+            return np.asarray(image if stored.format == "TIFF" else ImageOps.exif_transpose(image))
 
 
 def read_alpha(file: Path) -> np.ndarray | None:
@@ -258,8 +262,7 @@ def _exif_of(read: Callable[[], Any]) -> Any:
 
     try:
         exif = read()
-        for ifd in (EXIF_IFD, GPS_IFD):
-            exif.get_ifd(ifd)
+        exif.get_ifd(EXIF_IFD)
     except Exception:  # Pillow raises nearly anything
         return Image.Exif()
     return exif
@@ -339,9 +342,7 @@ def _bytes_of(size: tuple[int, int]) -> int:
 
 def _check_memory(size: tuple[int, int], needed: int) -> None:
     """Raises UnusableError where reading a picture of `size` takes more memory than is free."""
-    import psutil
-
-    if needed >= LARGE_BYTES and needed > (free := psutil.virtual_memory().available):
+    if needed >= LARGE_BYTES and needed > (free := available_memory()):
         raise UnusableError(
             f"{size[0]} x {size[1]} pixels take {needed / GIB:.1f} GiB of memory to read, {free / GIB:.1f} are free"
         )

@@ -122,8 +122,13 @@ def run_pipeline(
 
 def naming_command(source: str, root: Path) -> str:
     """The command that names the place of an outside path ("photos", "masks") to the workspace at `root`."""
-    option = "" if source == "photos" else f"--{source} "
-    return f"hineus run {option}{source.upper()} --workspace {shlex.quote(str(root))}"
+    named = "PHOTOS" if source == "photos" else f"{source_option(source)} PATH"
+    return f"hineus run {named} --workspace {shlex.quote(str(root))}"
+
+
+def source_option(source: str) -> str:
+    """The option that names an outside path: `--control` for "control points"."""
+    return f"--{source.partition(' ')[0]}"
 
 
 def _select(

@@ -62,7 +62,7 @@ class Record:
         hineus: version of the program that wrote it.
         created: UTC time, ISO 8601.
         root: the workspace's own absolute path when this was written, so that what was moved with it is found again;
-            empty in those of 0.2 and before.
+            empty in older records.
     """
 
     format: int = FORMAT

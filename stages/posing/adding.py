@@ -81,14 +81,6 @@ def enough_placed(placed: int, total: int) -> bool:
     return placed >= MIN_PLACED and placed > MIN_SHARE * total
 
 
-def same_contents(before: Mapping[str, str], now: Mapping[str, str]) -> dict[str, str]:
-    """Photo now -> photo before with the same contents (name -> digest): of the same name where it is there."""
-    first = {digest: name for name, digest in sorted(before.items(), reverse=True)}
-    return {
-        name: name if before.get(name) == digest else first[digest] for name, digest in now.items() if digest in first
-    }
-
-
 # ---------------------------------------------------------------- features and matches
 def copy_features(before: Path, database: Path, names: Mapping[str, str]) -> None:
     """Features, matches and their verification of known photos (name now -> name then) from one database to another.
