@@ -9,7 +9,6 @@ from configs.params import Config
 from stages import artifacts
 from stages.engine.fingerprint import FileDigests
 from stages.engine.manifest import ManifestDamaged
-from stages.engine.photos_since import compare_photos
 from stages.engine.status import previous_to_continue
 from stages.engine.workspace import Workspace
 from stages.ingest import INGEST
@@ -35,28 +34,27 @@ def what_is_kept(workspace: Workspace, config: Config, now: FileDigests, forced:
     before = made.identity.sources.get("photos") if made else None
     if not before or not now:  # photos that are nowhere to be found are not removed
         return ""
-    since = compare_photos(before, now, same_folder=True)
-    known = [path for path in since.kept if _is_capture(path)]
-    contents_then, contents_now = set(before.values()), set(now.values())  # a copy is no other photo
-    new = [path for path in since.added if _is_capture(path) and now[path] not in contents_then]
-    gone = [path for path in since.removed if _is_capture(path) and before[path] not in contents_now]
+    then, today = _captures(before), _captures(now)
+    known, new, gone = then & today, today - then, then - today
     if not known or not (new or gone):
         return ""
-    counts = f"{len(known)} photos known, {len(new)} new, {len(gone)} gone"
-    return f"{counts}: {_of_poses_and_training(workspace, config, set(since.kept), len(new), len(gone), forced)}"
+    left = {path for path, digest in before.items() if digest in known}
+    kept = _of_poses_and_training(workspace, config, left, len(new), len(gone), forced)
+    return f"{len(known)} photos known, {len(new)} new, {len(gone)} gone: {kept}"
 
 
 def _of_poses_and_training(
-    workspace: Workspace, config: Config, known: set[str], new: int, gone: int, forced: Collection[str]
+    workspace: Workspace, config: Config, left: set[str], new: int, gone: int, forced: Collection[str]
 ) -> str:
+    """What is kept where the contents of these photos and videos are `left`, by their names then."""
+    posed = workspace.stage_folder(SFM.name)
     if SFM.name in forced or previous_to_continue(SFM, workspace, config) is None:
         return "poses are found anew from all"
     records = artifacts.IMAGE_SET.load(workspace.stage_folder(INGEST.name)).images
-    placed = set(artifacts.REGISTRATION.load(workspace.stage_folder(SFM.name)).registered)
-    kept = sum(record.name in placed and record.source in known for record in records)
-    if not artifacts.FEATURES.load(workspace.stage_folder(SFM.name)).exists() or not enough_placed(
-        kept, len(known) + new
-    ):
+    placed = set(artifacts.REGISTRATION.load(posed).registered)
+    still = [record for record in records if {record.source, str(PurePosixPath(record.source).parent)} & left]
+    kept = sum(record.name in placed for record in still)
+    if not (artifacts.FEATURES.load(posed).exists() and enough_placed(kept, len(still) + new)):
         return f"poses are found anew from all, since {kept} of them have one"
     poses = f"the poses of {kept} stay"
     if TRAIN.name in forced or previous_to_continue(TRAIN, workspace, config) is None:
@@ -66,5 +64,7 @@ def _of_poses_and_training(
     return f"{poses}, training {'goes on from what it has learned' if goes_on else 'starts anew'}"
 
 
-def _is_capture(path: str) -> bool:
-    return PurePosixPath(path).suffix.lower() in PHOTO_SUFFIXES | RAW_SUFFIXES | VIDEO_SUFFIXES
+def _captures(files: FileDigests) -> set[str]:
+    """Contents of the photos and videos."""
+    suffixes = PHOTO_SUFFIXES | RAW_SUFFIXES | VIDEO_SUFFIXES
+    return {digest for path, digest in files.items() if PurePosixPath(path).suffix.lower() in suffixes}
