@@ -29,6 +29,12 @@ class IngestParams(Section):
         "key), an error where it is not plain; salient: what a network takes for the subject, used where the photos "
         "agree on it to cut the mesh and find the region; needs `pip install 'hineus[masks]'`",
     )
+    panoramas: Literal["auto", "split", "off"] = Field(
+        "auto",
+        description="360-degree pictures (equirectangular) are split into pinhole views: eight around, one up. auto: "
+        "by their metadata, or where the left and right borders of pictures twice as wide as high meet; split: all "
+        "pictures twice as wide as high, too",
+    )
     leave_out: tuple[str, ...] = Field(
         (), description="photos that no stage sees, as names or patterns (test_*.jpg) relative to the photo folder"
     )

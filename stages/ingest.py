@@ -13,6 +13,7 @@ import shutil
 from collections import Counter
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from fnmatch import fnmatchcase
 from pathlib import Path, PurePosixPath
 from typing import Any, TypeVar
@@ -22,9 +23,11 @@ import numpy as np
 from configs.params import IngestParams
 from stages.artifacts import IMAGE_SET, PHOTOS, ImageRecord, ImageSet, SkippedImage
 from stages.capture.background import PLAIN_PHOTOS, plain_mask
-from stages.capture.exif import ORIENTATION, camera_key, focal_px, gps_position
+from stages.capture.exif import GPS_IFD, ORIENTATION, camera_key, focal_px, gps_position
 from stages.capture.listing import NAMED, by_reason, list_captures, name_some
 from stages.capture.masks import check_size, match_masks, read_mask, write_mask
+from stages.capture.panoramas import Sphere, View, find_spheres, split
+from stages.capture.panoramas import focal_px as view_focal_px
 from stages.capture.photo_reading import UnusableError, read_photo, register_formats
 from stages.capture.quality import Appearance, appearance, find_oddities
 from stages.capture.salient import SalientNetwork
@@ -56,7 +59,8 @@ def run(context: StageContext[IngestParams]) -> dict[str, Any]:
     files = {path: folder / path for path in photos}
     frames, damaged = _frames_of(videos, folder, context)
     files |= frames
-    skipped += damaged
+    files, views, unsplit = _split_panoramas(files, context)
+    skipped += damaged + unsplit
     paths = sorted(files)
     poses = read_poses(context.sources["poses"]) if "poses" in context.sources else None
     if poses is not None:
@@ -64,7 +68,7 @@ def run(context: StageContext[IngestParams]) -> dict[str, Any]:
         skipped += [SkippedImage(path, f"has no pose in {poses.origin.name}") for path in paths if path not in cameras]
         paths = list(cameras)
         _tell_unused(poses, {camera.name for camera in cameras.values()})
-    unseen = {path for path in paths if any(fnmatchcase(path, pattern) for pattern in params.leave_out)}
+    unseen = {path for path in paths if _left_out(path, params)}
     skipped += [SkippedImage(path, "named in ingest.leave_out") for path in paths if path in unseen]
     paths = [path for path in paths if path not in unseen]
 
@@ -78,7 +82,9 @@ def run(context: StageContext[IngestParams]) -> dict[str, Any]:
     def take(path: str) -> tuple[ImageRecord, Appearance] | SkippedImage:
         nonlocal done
         try:
-            return _take_photo(files[path], path, unique[path], mask_files.get(path), make_mask, names, context)
+            mask_file = mask_files.get(path)
+            record, seen = _take_photo(files[path], path, unique[path], mask_file, make_mask, names, context)
+            return _as_view(record, *views[path]) if path in views else record, seen
         except UnusableError as reason:
             return SkippedImage(path, str(reason))
         finally:
@@ -94,8 +100,9 @@ def run(context: StageContext[IngestParams]) -> dict[str, Any]:
         skipped += without
     skipped.sort(key=lambda item: item.source)
 
-    if len(images) < params.min_images:
-        raise _too_few(source, len(images), params.min_images, skipped)
+    places = len({record.frame or record.name for record in images})
+    if places < params.min_images:
+        raise _too_few(source, places, params.min_images, skipped)
     missing = [record.source for record in images if masks_folder and record.source not in mask_files]
     if missing:
         raise InputError(
@@ -104,8 +111,8 @@ def run(context: StageContext[IngestParams]) -> dict[str, Any]:
         )
     for reason, sources in by_reason(skipped).items():
         log.warning("left out %s: %s", name_some(sources), reason)
-    # a video's frames are the sharpest of their stretch and near each other by choice
-    odd = find_oddities([seen for _, seen in taken if seen.source not in frames])
+    # a video's frames are the sharpest of their stretch and near each other by choice, views may show the sky
+    odd = find_oddities([seen for _, seen in taken if seen.source not in frames.keys() | views.keys()])
     for warning in odd.warnings:
         log.warning("%s", warning)
     masked = sum(record.has_mask for record in images)
@@ -117,6 +124,7 @@ def run(context: StageContext[IngestParams]) -> dict[str, Any]:
         "images": len(images),
         "skipped": len(skipped),
         **({"videos": len(videos) - len(damaged)} if videos else {}),
+        **({"panoramas": len({path for path, _ in views.values()})} if views else {}),
         "masks": masked,
         "cameras": len({record.camera for record in images}),
         "with_focal": sum(record.focal_px is not None for record in images),
@@ -151,6 +159,79 @@ def _frames_of(
         log.info("%s: %d frames", video, len(frames))
         found |= {f"{video}/{frame.name}": frame for frame in frames}
     return found, damaged
+
+
+def _split_panoramas(
+    files: dict[str, Path], context: StageContext[IngestParams]
+) -> tuple[dict[str, Path], dict[str, tuple[str, View]], list[SkippedImage]]:
+    """The files with views in place of 360-degree pictures; each view's panorama; and panoramas of other kinds.
+
+    Views are named as frames of a video are: `pano.jpg/045.jpg`.
+    """
+    spheres, others = find_spheres(
+        {path: file for path, file in files.items() if not _left_out(path, context.params)}, context.params.panoramas
+    )
+    folder = context.scratch / "views"
+    shutil.rmtree(folder, ignore_errors=True)
+    done = 0
+
+    def split_one(path: str) -> dict[str, tuple[Path, View]] | SkippedImage:
+        nonlocal done
+        try:
+            found = _write_views(files[path], spheres[path], folder / path, context.params.max_side)
+        except UnusableError as reason:
+            return SkippedImage(path, str(reason))
+        done += 1
+        context.progress(done, len(spheres), f"views of {path}")
+        return {f"{path}/{file.name}": (file, view) for file, view in found}
+
+    kept = {path: file for path, file in files.items() if path not in spheres.keys() | others.keys()}
+    views: dict[str, tuple[str, View]] = {}
+    skipped = [SkippedImage(path, reason) for path, reason in others.items()]
+    for path, found in zip(spheres, _in_threads(split_one, spheres, context.workers), strict=True):
+        if isinstance(found, SkippedImage):
+            skipped.append(found)
+            continue
+        kept |= {name: file for name, (file, _) in found.items()}
+        views |= {name: (path, view) for name, (_, view) in found.items()}
+    if views:
+        log.info("%d 360-degree pictures were split into %d views", len(spheres), len(views))
+    return kept, views, skipped
+
+
+def _write_views(file: Path, sphere: Sphere, folder: Path, max_side: int) -> list[tuple[Path, View]]:
+    """Write the views of a panorama, with its GPS position.
+
+    Raises:
+        UnusableError: it cannot be read.
+    """
+    from PIL import Image
+
+    photo = read_photo(file)
+    metadata = Image.Exif()
+    metadata[GPS_IFD] = photo.exif.get_ifd(GPS_IFD)
+    folder.mkdir(parents=True)
+    written = []
+    for view, pixels in split(np.asarray(photo.rgb), sphere, min(sphere.side, max_side)):
+        target = folder / f"{view.name}{'.jpg' if photo.lossy else '.png'}"
+        _encode(Image.fromarray(pixels), target, photo.lossy, metadata)
+        written.append((target, view))
+    return written
+
+
+def _as_view(record: ImageRecord, panorama: str, view: View) -> ImageRecord:
+    """The record of a view: its intrinsics are known, and how it is turned against the others of its panorama."""
+    return replace(
+        record,
+        focal_px=view_focal_px(record.width),
+        camera=f"view {view.name} of 360-degree pictures | {record.width} x {record.height}",
+        frame=panorama,
+        cam_from_frame=tuple(map(tuple, view.cam_from_panorama.tolist())),
+    )
+
+
+def _left_out(path: str, params: IngestParams) -> bool:
+    return any(fnmatchcase(path, pattern) for pattern in params.leave_out)
 
 
 def _without_copies(
@@ -356,7 +437,7 @@ def _encode(rgb: Any, target: Path, lossy: bool, exif: Any) -> None:
 
 INGEST: Stage[IngestParams] = Stage(
     name="ingest",
-    version=4,
+    version=5,
     settings=lambda config: config.ingest,
     run=run,
     writes=(PHOTOS, IMAGE_SET),

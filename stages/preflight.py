@@ -11,6 +11,7 @@ from typing import Any, Literal
 from configs.params import Config
 from stages.capture.inspection import Inspection, inspect
 from stages.capture.listing import NAMED, by_reason, name_some
+from stages.capture.panoramas import split_size
 from stages.capture.salient import INSTALL, find_weights
 
 Verdict = Literal["go", "go with warnings", "no-go"]
@@ -77,6 +78,7 @@ class Preflight:
         return {
             "verdict": self.verdict,
             "photos": len(seen.photos),
+            "panoramas": sorted(seen.spheres),
             "videos": [asdict(video) for video in seen.videos],
             "left_out": [asdict(item) for item in seen.skipped],
             "sizes": [[*size, count] for size, count in Counter(seen.sizes).most_common()],
@@ -103,14 +105,14 @@ def preflight(
     """
     import psutil
 
-    seen = inspect(source, masks, config.ingest.video_frames, workers, decode)
+    seen = inspect(source, masks, config.ingest.video_frames, workers, decode, config.ingest.panoramas)
     needs = estimate(seen, config, device, workers)
     while not folder.exists():
         folder = folder.parent
     memory, disk = psutil.virtual_memory().available / GIB, shutil.disk_usage(folder).free / 1e9
     refusals, shortages = [], []
-    if len(seen.sizes) < config.ingest.min_images:
-        refusals.append(f"{len(seen.sizes)} usable photos, {config.ingest.min_images} are needed.")
+    if seen.places < config.ingest.min_images:
+        refusals.append(f"{seen.places} usable photos, {config.ingest.min_images} are needed.")
     if needs.memory_gib > memory:
         shortages.append(
             f"It may take {needs.memory_gib:.1f} GiB of memory, {memory:.1f} are free: close other programs, or try "
@@ -166,6 +168,9 @@ def facts(done: Preflight) -> list[tuple[str, str]]:
     """What was found, line by line: a word and a text."""
     seen, needs = done.inspection, done.needs
     lines = [("photos", str(len(seen.photos)))]
+    if seen.spheres:
+        views = sum(split_size(sphere)[0] for sphere in seen.spheres.values())
+        lines.append(("360 degrees", f"{len(seen.spheres)} of them, which are split into {views} pinhole views"))
     lines += [("video", f"{clip.source}: up to {clip.frames} frames") for clip in seen.videos]
     sizes = Counter(seen.sizes).most_common()
     lines.append(("sizes", "; ".join(f"{count} x {width} x {height}" for (width, height), count in sizes[:NAMED])))

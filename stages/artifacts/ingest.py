@@ -28,6 +28,9 @@ class ImageRecord:
         gps: latitude and longitude in degrees (WGS 84) and altitude in metres, where EXIF has all three.
         made_mask: the way of `ingest.auto_mask` in which its mask was made; empty where it came with the photo or
             there is none. What "salient" made is a guess, see `SILHOUETTES`.
+        frame: views that were taken at once from one place, as those of a 360-degree picture, have the same; empty
+            for photos. Their intrinsics are known: no distortion, the principal point in the middle.
+        cam_from_frame: [3][3] rotation from what the views of a frame share into this one.
     """
 
     name: str
@@ -41,6 +44,8 @@ class ImageRecord:
     sha256: str
     gps: tuple[float, float, float] | None = None
     made_mask: str = ""
+    frame: str = ""
+    cam_from_frame: tuple[tuple[float, ...], ...] | None = None
 
 
 @dataclass(frozen=True)

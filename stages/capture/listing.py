@@ -6,6 +6,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from stages.artifacts import SkippedImage
+from stages.capture.panoramas import STITCH, UNSTITCHED
 from stages.capture.photo_reading import PHOTO_SUFFIXES, RAW_SUFFIXES
 from stages.errors import InputError
 
@@ -47,7 +48,8 @@ def list_captures(source: Path, masks_folder: Path | None = None) -> tuple[list[
         elif suffix in VIDEO_SUFFIXES:
             videos.append(name)
         else:
-            skipped.append(SkippedImage(name, f"not an image ({suffix or 'no file extension'})"))
+            kind = f"{UNSTITCHED[suffix]}: {STITCH}" if suffix in UNSTITCHED else "not an image"
+            skipped.append(SkippedImage(name, f"{kind} ({suffix or 'no file extension'})"))
     return _without_companions(photos, videos, skipped)
 
 

@@ -85,7 +85,7 @@ def read_photo(file: Path) -> Photo:
     Raises:
         UnusableError: it is damaged, an animation, too small, or a raw file without rawpy.
     """
-    with _telling_damage():
+    with telling_damage():
         photo = _develop(file) if _is_raw(file) else _decode(file)
     _check_side(photo.rgb.size)
     return photo
@@ -99,7 +99,7 @@ def read_head(file: Path, source: str) -> PhotoFile:
     """
     from PIL import Image
 
-    with _telling_damage():
+    with telling_damage():
         if _is_raw(file):
             with import_rawpy().imread(str(file)) as raw:
                 exif, size = _raw_exif(file, raw), (raw.sizes.width, raw.sizes.height)
@@ -122,7 +122,7 @@ def read_preview(file: Path) -> np.ndarray:
     """
     from PIL import Image
 
-    with _telling_damage():
+    with telling_damage():
         if _is_raw(file):  # half a second each; the previews in raw files have any size, or are not there
             return np.asarray(_develop(file).rgb)
         with Image.open(file) as stored:
@@ -140,7 +140,7 @@ def _check_side(size: tuple[int, int]) -> None:
 
 
 @contextmanager
-def _telling_damage() -> Iterator[None]:
+def telling_damage() -> Iterator[None]:
     """What a decoder says of a file, without the file's name: that is told beside it."""
     from PIL import UnidentifiedImageError
 
