@@ -35,7 +35,7 @@ from stages.posing.settings import (
     match_options,
     verification_options,
 )
-from stages.posing.turning import check_parallax
+from stages.posing.turning import judge_depth, refuse_one_place
 
 log = logging.getLogger(__name__)
 
@@ -135,6 +135,11 @@ class Workbench:
         """The file of one base; of the latest one without."""
         return self.work / (base or self._latest).file
 
+    @property
+    def stands_still(self) -> bool:
+        """Whether most of what matched did so at the same place of the frame, and is left out."""
+        return self._stationary
+
     def rungs(self) -> list[Rung]:
         """All attempts, the cheap and likely ones first."""
         records = self.image_set.images
@@ -179,7 +184,8 @@ class Workbench:
     def first(self, best: Solution | None) -> Solution | None:
         """The chosen matcher and mapper."""
         self._features_and_matches(self._latest, best)
-        self.parallaxes = check_parallax(self.database())
+        self.depth = judge_depth(self.database())
+        refuse_one_place(self.depth)
         return self._solve(self._latest, self.params.mapper)
 
     def all_pairs(self, best: Solution | None) -> Solution | None:
