@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from fnmatch import fnmatchcase
+from functools import cache
 from pathlib import Path, PurePosixPath
 from typing import Any, TypeVar
 
@@ -95,8 +96,8 @@ def run(context: StageContext[IngestParams]) -> dict[str, Any]:
     taken = [o for o in outcomes if not isinstance(o, SkippedImage)]
     images = sorted((record for record, _ in taken), key=lambda record: record.name)
     skipped += [o for o in outcomes if isinstance(o, SkippedImage)]
-    if params.auto_mask == "plain":
-        images, without = _before_plain_backgrounds(images, context)
+    if params.auto_mask in ("plain", "object"):
+        images, without = _with_masks(images, context)
         skipped += without
     skipped.sort(key=lambda item: item.source)
 
@@ -325,25 +326,26 @@ def _in_threads(function: Callable[[Item], Result], items: Iterable[Item], worke
 def _mask_maker(params: IngestParams) -> MaskMaker | None:
     """What makes the masks of photos that come without; None where nothing is to.
 
-    Raises:
-        SystemRequirementError: the network is wanted and not installed.
+    It raises SystemRequirementError where the network is wanted and not installed.
     """
-    if params.auto_mask == "salient":
-        return SalientNetwork().mask
+    if params.auto_mask in ("salient", "object"):
+        network = cache(SalientNetwork)  # not needed where all photos bring their masks
+        return lambda rgb: network().mask(rgb)
     return plain_mask if params.auto_mask == "plain" else None
 
 
-def _before_plain_backgrounds(
+def _with_masks(
     images: list[ImageRecord], context: StageContext[IngestParams]
 ) -> tuple[list[ImageRecord], list[SkippedImage]]:
-    """The photos with a mask; the few whose background is not plain, so that none could be made, are left out.
+    """The photos with a mask; the few of which none could be made are left out.
 
     Raises:
-        InputError: those are not few.
+        InputError: they should have a plain background, and those that have not are not few.
     """
     bare = [record for record in images if record.made_mask or not record.has_mask]
     left_out = [record for record in bare if not record.has_mask]
-    if len(left_out) > (1 - PLAIN_PHOTOS) * len(bare):
+    plain = context.params.auto_mask == "plain"
+    if plain and len(left_out) > (1 - PLAIN_PHOTOS) * len(bare):
         raise InputError(
             f"The background is plain in {len(bare) - len(left_out)} of {len(bare)} photos (need "
             f"{math.ceil(PLAIN_PHOTOS * len(bare))}), for example not in {left_out[0].source}.",
@@ -352,7 +354,8 @@ def _before_plain_backgrounds(
     for record in left_out:
         context.to_write(PHOTOS).path(record.name).unlink()
     kept = [record for record in images if record.has_mask]
-    return kept, [SkippedImage(record.source, "its background is not plain") for record in left_out]
+    reason = "its background is not plain" if plain else "nothing stands out in it, so it has no mask"
+    return kept, [SkippedImage(record.source, reason) for record in left_out]
 
 
 # ---------------------------------------------------------------- one photo

@@ -120,7 +120,14 @@ def preflight(
         )
     if needs.disk_gb > disk:
         shortages.append(f"It may take {needs.disk_gb:.1f} GB of disk, {disk:.1f} are free: try `--workspace DIR`.")
+    if config.ingest.auto_mask in ("salient", "object") and find_weights() is None:
+        shortages.append(f"`ingest.auto_mask={config.ingest.auto_mask}` needs a network that is missing: `{INSTALL}`.")
     warnings = _warnings(seen, config)
+    if config.sfm.masks == "always" and masks is None and config.ingest.auto_mask == "off":
+        warnings.append(
+            "Only what masks show is to be matched, and there are none, unless all photos have an alpha channel: give "
+            "`--masks FOLDER`, or have them made with `--set ingest.auto_mask=object`."
+        )
     if memory / MEMORY_MARGIN < needs.memory_gib <= memory:
         warnings.append(f"It may take {needs.memory_gib:.1f} of the {memory:.1f} GiB of memory that are free.")
     return Preflight(seen, needs, tuple(warnings), tuple(refusals), tuple(shortages))

@@ -45,6 +45,7 @@ log = logging.getLogger(__name__)
 FEW_POINTS = 10  # fewer points than this a photo are worth a warning where the poses are known
 DOUBTFUL_ERROR_PX = 2.0  # COLMAP's own models are below one
 MIN_PLACES, TWO_PLACES = 5, 0.8  # part of more photos than so many that were taken from two places: no walk is
+SECOND_PASS = 0.25  # part of the photos: a model of so many beside the largest is no accident
 # Points this far off one plane, in the distance they are seen from, are no flat thing, whatever pairs of photos show.
 FLAT_RELIEF = 0.01
 # Of the focal length. Of flat things it was 0.02 % seen at many angles, 4 % and more (and wrong by 21 %) straight on.
@@ -108,6 +109,12 @@ def run(context: StageContext[SfmParams]) -> dict[str, Any]:
         )
     for item in unregistered:
         log.warning("not registered: %s: %s", item.name, item.reason)
+    if params.masks != "always" and max(map(len, best.others), default=0) >= SECOND_PASS * len(names):
+        log.warning(
+            "%d photos make a model of their own. If the object was moved in between, as turned over for a second "
+            "pass, try `hineus run PHOTOS --moving-object`, with `--masks FOLDER` or without",
+            max(map(len, best.others)),
+        )
     for prior, found in bench.contradicted(best):
         log.warning("the EXIF focal length, %.0f px, is wrong: the poses say %.0f px", prior, found)
     if steps[-1].kept and steps[-1].rung == RELAXED:
@@ -291,7 +298,8 @@ def _check_masks(image_set: ImageSet, params: SfmParams) -> None:
     if params.masks == "always" and bare:
         raise InputError(
             f"{len(bare)} of {len(image_set.images)} photos have no mask, e.g. {bare[0]}; sfm.masks=always needs all.",
-            "Try `--set sfm.masks=auto`, or give `--masks FOLDER` with one mask a photo.",
+            "Give `--masks FOLDER` with one mask a photo, or have them made: `--set ingest.auto_mask=object`. "
+            "If the object was not moved, try `--set sfm.masks=auto`.",
         )
 
 

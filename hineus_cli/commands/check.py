@@ -12,6 +12,7 @@ from hineus_cli.options import (
     Device,
     Json,
     Masks,
+    MovingObject,
     Preset,
     Sets,
     Time,
@@ -35,6 +36,7 @@ def check(
     device: Device = "auto",
     workers: Workers = None,
     time: Time = None,
+    moving_object: MovingObject = False,
     as_json: Json = False,
 ) -> None:
     """A quick look before a run: are these photos good, and what will they take? Exits with 0 unless it is no-go."""
@@ -46,7 +48,7 @@ def check(
         masks=masks,
         preset=preset,
         config=config,
-        sets=settings(sets, time),
+        sets=settings(sets, time, moving_object=moving_object, masks=masks),
         device=device,
         workers=workers,
     )
