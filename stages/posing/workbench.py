@@ -427,6 +427,7 @@ class Workbench:
         if self._at_once > 1 and self.matcher == "sequential":
             options["pairing_options"] = pairing = pycolmap.SequentialPairingOptions()
             pairing.overlap *= self._at_once
+            pairing.quadratic_overlap = False  # 2 to the power of so many would be too much
         if self._at_once > 1 and self.matcher == "spatial":
             options["pairing_options"] = near = pycolmap.SpatialPairingOptions()
             near.max_num_neighbors *= self._at_once
@@ -513,6 +514,11 @@ class Workbench:
             pycolmap.calibrate_view_graph(path)
         options = pycolmap.GlobalPipelineOptions()
         options.num_threads, options.random_seed = self.threads, self.params.seed
+        if self._known:
+            mapper = options.mapper
+            for part in (mapper, mapper.rotation_averaging, mapper.global_positioning, mapper.bundle_adjustment):
+                part.refine_sensor_from_rig = False
+            mapper.bundle_adjustment.refine_focal_length = False  # of all cameras or of none
         return list(pycolmap.global_mapping(path, self.images_folder, out, options).values())
 
     def _mapping(self) -> Any:
