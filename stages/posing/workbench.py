@@ -227,8 +227,8 @@ class Workbench:
         for _ in range(CORNER_ROUNDS):
             if found is None:
                 break
-            again = self._matched_by_poses(base, found.model, descriptors)
-            if again is None or len(again.registered) < len(found.registered):
+            again, wrong = self._matched_by_poses(base, found.model, descriptors)
+            if again is None or len(again.registered) < len(found.registered) - wrong:
                 break
             found = again
         return found
@@ -287,8 +287,11 @@ class Workbench:
             self._match_pairs(base, self._pairs_to_try(base, best))
         self._tell(PART_MATCHES, "poses")
 
-    def _matched_by_poses(self, base: Base, model: Any, descriptors: Any) -> Solution | None:
-        """Match again where the poses found allow it, and go on from them."""
+    def _matched_by_poses(self, base: Base, model: Any, descriptors: Any) -> tuple[Solution | None, int]:
+        """Match again where the poses found allow it, and go on from them; how many photos then match nothing.
+
+        The poses of these were wrong: a mirrored photo finds a place by corners, and no more corners from there.
+        """
         import pycolmap
 
         from stages.posing.learned import write_guided_matches
@@ -305,7 +308,11 @@ class Workbench:
             options=self._mapping(),
             refine_intrinsics=False,
         )
-        return self._solution_of(base, self._map_incremental(base, start))
+        placed = start.num_reg_images()
+        drop_unsupported(start, 1)
+        wrong = placed - start.num_reg_images()
+        start.tear_down()  # the mapper, to whom they are unknown, would break
+        return self._solution_of(base, self._map_incremental(base, start)), wrong
 
     def _corners_and_matches(self, base: Base) -> Any:
         from stages.posing.learned import likely_pairs, write_corners, write_matches
