@@ -3,6 +3,7 @@
 # make test   all tests, shapes checked
 # make bench-smoke   a small scene through the whole pipeline, its figures against committed ones
 # make lint   formatting, lint, types, who-may-import-whom
+# make image  the container of the Dockerfile, built and tried out
 # make vendor the report's copy of three.js, from npm
 # Each makes .venv first where needed.
 
@@ -10,7 +11,7 @@ PYTHON ?=
 export PYTHON
 BIN := .venv/bin
 
-.PHONY: help venv demo check quick test bench-smoke lint format docs vendor clean
+.PHONY: help venv demo check quick test bench-smoke lint format docs image vendor clean
 
 help:
 	@sed -n 's/^# //p' Makefile
@@ -48,6 +49,9 @@ docs: venv
 	$(BIN)/python docs/make_reference.py
 	$(BIN)/python -m docs.make_architecture
 	$(BIN)/python -m benchmarks.pages
+
+image:
+	.ci/image.sh
 
 # Bundled in a temporary folder: nothing of npm stays in the tree.
 VENDOR := stages/templates/vendor

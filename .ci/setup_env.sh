@@ -38,17 +38,17 @@ system_libraries() {
     fi
 }
 
-# open3d has wheels for CPython 3.10 to 3.12.
+# xatlas has wheels for CPython 3.10 to 3.13.
 find_python() {
     local candidate
-    for candidate in ${PYTHON:-python3 python3.12 python3.11 python3.10}; do
+    for candidate in ${PYTHON:-python3 python3.13 python3.12 python3.11 python3.10}; do
         if command -v "$candidate" >/dev/null &&
-            "$candidate" -c 'import sys; sys.exit(not (3, 10) <= sys.version_info[:2] <= (3, 12))' 2>/dev/null; then
+            "$candidate" -c 'import sys; sys.exit(not (3, 10) <= sys.version_info[:2] <= (3, 13))' 2>/dev/null; then
             echo "$candidate"
             return 0
         fi
     done
-    fail "no Python 3.10, 3.11 or 3.12 was found; install one, or name it: make ${1:-venv} PYTHON=/path/to/python3.12"
+    fail "no Python from 3.10 to 3.13 was found; install one, or name it: make ${1:-venv} PYTHON=/path/to/python3.13"
 }
 
 make_venv() {

@@ -525,7 +525,8 @@ def tables() -> dict[str, str]:
 # ---------------------------------------------------------------- command
 def main(argv: Sequence[str] | None = None) -> int:
     from stages.evaluation.protocols.known_object import has_truth
-    from stages.reconstruct import available_cores, default_preset, has_cuda
+    from stages.limits import available_cores
+    from stages.reconstruct import default_preset, has_cuda
 
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("data", type=Path, nargs="?", help="folder of sets")

@@ -162,11 +162,18 @@ def print_kernels(device: str) -> None:
     found = encoders(device, grid)
     encoding = alternate(*(encoding_pass(encoder.encode, grid, device) for encoder in found))
     steps = alternate(*(training_step(noise_trainer(params, device), encoder) for encoder in found))
-    rows = []
-    for name, count, seconds in (
+    timed = [
         ("encoding, forward and backward", POINTS[device], encoding),
         ("training step", points_of_step(params), steps),
-    ):
+    ]
+    if device == "cuda":
+        apart = [noise_trainer(params, device) for _ in found]
+        for trainer in apart:
+            trainer.replay = None
+        seconds = alternate(*(training_step(*pair) for pair in zip(apart, found, strict=True)))
+        timed.append(("training step, kernel by kernel", points_of_step(params), seconds))
+    rows = []
+    for name, count, seconds in timed:
         rates = [count / each / cores_of(device) / 1000 for each in seconds]
         rows.append([name, *(f"{rate:.0f}" for rate in rates), f"{seconds[-1] / seconds[0]:.1f}"])
     print(markdown_table(["what", *(f"{encoder.name}, kpt/s/core" for encoder in found), "ratio"], rows))

@@ -36,6 +36,16 @@ class IngestParams(Section):
         "by their metadata, or where the left and right borders of pictures twice as wide as high meet; split: all "
         "pictures twice as wide as high, too",
     )
+    masks_keep: Literal["auto", "white", "black"] = Field(
+        "auto",
+        description="colour of the object in masks (opaque is white); auto: white, and masks that seem inverted are an "
+        "error",
+    )
+    own_masks: bool = Field(
+        True,
+        description="use the masks that lie among the photos (IMG_1_mask.png, masks/IMG_1.png, ...) and alpha "
+        "channels, where no `--masks` is given",
+    )
     leave_out: tuple[str, ...] = Field(
         (), description="photos that no stage sees, as names or patterns (test_*.jpg) relative to the photo folder"
     )
@@ -90,10 +100,24 @@ class PlaceParams(Section):
         "a box also crops the mesh",
     )
     up: Literal["auto", "+x", "-x", "+y", "-y", "+z", "-z"] = Field(
-        "auto", description="up axis in the world frame; auto: from GPS, the ground or the cameras"
+        "auto", description="up axis in the world frame; auto: from control points, GPS, the ground or the cameras"
     )
     gps: bool = Field(
         True, description="where the photos' GPS positions agree with the cameras, the world is metric, x east, y north"
+    )
+    control_epsg: int | None = Field(
+        None,
+        ge=1024,
+        le=999999,
+        description="EPSG code of the coordinates in `--control FILE`, over the one that the file names; needs "
+        "`pip install 'hineus[geo]'`",
+    )
+    epsg: int | None = Field(
+        None,
+        ge=1024,
+        le=999999,
+        description="EPSG code of a map's grid in metres (32632: UTM zone 32 north) for the results, less an "
+        "offset; null: metres east, north and up of an origin",
     )
     marker_size: float | None = Field(
         None, gt=0, description="side of printed ArUco markers in the scene, metres; their size gives the scale"

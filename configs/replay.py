@@ -10,14 +10,14 @@ from configs.dotted import flatten
 from configs.load import load_config, preset_names
 from configs.params import Config
 
-OPTIONS = ("masks", "poses")
+OPTIONS = {"masks": "--masks", "poses": "--poses", "control points": "--control"}
 
 
 def replay_command(sources: Mapping[str, str | None], preset: str | None, config: Config, workspace: str) -> str:
     """`hineus run ...`, quoted for a shell, into a new workspace.
 
     Args:
-        sources: "photos", "masks" and "poses" -> path, None where not given.
+        sources: "photos", "masks", "poses" and "control points" -> path, None where not given.
         preset: the settings started from it; one that is not known (any more) is replaced by `cpu`.
         config: all settings; those that the preset does not give are spelled out.
         workspace: folder of the new run.
@@ -25,9 +25,9 @@ def replay_command(sources: Mapping[str, str | None], preset: str | None, config
     base = preset if preset in preset_names() else "cpu"
     assert base is not None
     words = ["hineus", "run", sources.get("photos") or "PHOTOS", "--preset", base, "--workspace", workspace]
-    for name in OPTIONS:
+    for name, option in OPTIONS.items():
         if path := sources.get(name):
-            words += [f"--{name}", path]
+            words += [option, path]
     for setting in settings_beyond(base, config):
         words += ["--set", setting]
     return shlex.join(words)

@@ -137,7 +137,7 @@ def _exit_codes() -> Iterator[str]:
     for kind in sorted(kinds, key=lambda kind: kind.exit_code):
         meaning = "An error that nobody foresaw." if kind is HineusError else inspect.cleandoc(kind.__doc__ or "")
         yield _row(str(kind.exit_code), meaning)
-    yield _row("130", "Stopped by Ctrl-C.")
+    yield _row("130, 143, 129", "Stopped by Ctrl-C, SIGTERM or SIGHUP.")
 
 
 def _row(*cells: str) -> str:

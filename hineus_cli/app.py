@@ -5,8 +5,11 @@ Modules that are slow to import are imported inside the commands, so that `hineu
 
 from __future__ import annotations
 
+import errno
+import signal
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import Annotated, Any
 
 import typer
@@ -23,11 +26,10 @@ from hineus_cli.commands.settings import presets, show_config
 from hineus_cli.commands.status import status
 from hineus_cli.commands.view import view
 from hineus_cli.session import Session, print_json
+from hineus_cli.stopping import GOES_ON, Stopped, stopped_by_signals
 from stages.engine.stage import Stage
 from stages.errors import HineusError
 from stages.pipeline import PIPELINE
-
-INTERRUPTED = 130
 
 
 class HineusGroup(TyperGroup):
@@ -38,12 +40,16 @@ class HineusGroup(TyperGroup):
     def main(self, *args: Any, **extra: Any) -> Any:
         session = Session(self.pipeline)
         try:
-            return super().main(*args, obj=session, **extra)
+            with stopped_by_signals():
+                return super().main(*args, obj=session, **extra)
         except HineusError as error:
             _tell(session, type(error).__name__, error.message, error.hint, error.exit_code)
             sys.exit(error.exit_code)
         except Exception as error:
-            _tell(session, type(error).__name__, *_unexpected(session, error), HineusError.exit_code)
+            from hineus_cli.console import is_output_error
+
+            told = _no_output(error) if is_output_error(error) else _unexpected(session, error)
+            _tell(session, type(error).__name__, *told, HineusError.exit_code)
             sys.exit(HineusError.exit_code)
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
@@ -54,11 +60,11 @@ class HineusGroup(TyperGroup):
     def invoke(self, ctx: Any) -> Any:
         try:
             return super().invoke(ctx)
-        except KeyboardInterrupt:
-            from hineus_cli.console import show_error
-
-            show_error("Stopped.", "What was finished is kept: run the same command to go on from there.")
-            raise typer.Exit(INTERRUPTED) from None
+        except KeyboardInterrupt as interruption:
+            stop = interruption if isinstance(interruption, Stopped) else Stopped(signal.SIGINT)
+            with suppress(OSError):  # the terminal may be gone
+                _tell(ctx.obj, "Stopped", stop.message, GOES_ON, stop.exit_code)
+            raise typer.Exit(stop.exit_code) from None
 
 
 def _unexpected(session: Session, error: Exception) -> tuple[str, str]:
@@ -82,7 +88,8 @@ def _tell(session: Session, kind: str, message: str, hint: str, exit_code: int) 
     show_error(message, hint)
     if session.json:
         error = {"type": kind, "message": message, "hint": hint, "exit_code": exit_code}
-        print_json({"error": error}, ok=False)
+        with suppress(OSError):  # which may be what is to be told
+            print_json({"error": error}, ok=False)
 
 
 # ---------------------------------------------------------------- the table of commands
@@ -104,7 +111,6 @@ def build_app(pipeline: Sequence[Stage] = PIPELINE) -> typer.Typer:
     app = typer.Typer(
         cls=Group,
         no_args_is_help=True,
-        add_completion=False,
         pretty_exceptions_enable=False,
         rich_markup_mode="rich",
     )
@@ -133,4 +139,18 @@ app = build_app()
 
 def main() -> None:
     """The `hineus` command."""
-    app(prog_name="hineus")
+    from hineus_cli.console import flush_output, mend_streams, show_error
+
+    mend_streams()
+    try:
+        app(prog_name="hineus")
+    finally:
+        failed = flush_output()
+        if failed is not None:
+            if failed.errno != errno.EPIPE:  # as with `| head`, where all that was wanted was read
+                show_error(*_no_output(failed))
+            sys.exit(HineusError.exit_code)
+
+
+def _no_output(error: Exception) -> tuple[str, str]:
+    return f"The output cannot be written: {error}.", "Free some space, or send it elsewhere."

@@ -6,6 +6,8 @@ Only this module configures logging. It is imported inside the commands, since r
 from __future__ import annotations
 
 import contextlib
+import errno
+import io
 import logging
 import os
 import sys
@@ -15,17 +17,15 @@ from types import TracebackType
 from typing import Any
 
 from rich.console import Console
-from rich.logging import RichHandler
-from rich.panel import Panel
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 from rich.text import Text
 
-from stages.engine.run_log import TRACEBACKS
+from stages.engine.run_log import TRACEBACKS, plain
 from stages.engine.runner import Listener, StageOutcome
 from stages.engine.stage import Stage
 from stages.engine.status import StageStatus
-from stages.engine.workspace import show_bytes
+from stages.engine.workspace import DISK_FULL, show_bytes
 
 OURS = ("hineus_cli", "stages", "configs")
 CONSOLE_HANDLER = "hineus-console"
@@ -34,9 +34,11 @@ PLAIN_WIDTH = 160  # columns where the output is a pipe or a file
 PLAIN_EVERY_S = 30.0  # seconds between progress lines there
 MAX_NUMBERS = 4  # numbers of a stage in the summary table
 WIDE = 110  # columns from which tables show everything; narrower ones keep what explains the result
+NARROW = 70  # columns below which they show names and reasons only, and progress has no bar
 
 GIB = 1 << 30
 
+_LEVEL_COLOURS = {"WARNING": "yellow", "ERROR": "red", "CRITICAL": "red"}
 _STATE_COLOURS = {"fresh": "green", "stale": "yellow", "missing": "red"}
 
 
@@ -53,19 +55,68 @@ def product() -> Console:
 def _console(stderr: bool) -> Console:
     stream = sys.stderr if stderr else sys.stdout
     width = None if stream.isatty() else PLAIN_WIDTH
-    return Console(stderr=stderr, width=width, highlight=False, soft_wrap=False)
+    # Texts are printed as they are: `[red]` and `:key:` may be names of files.
+    return Console(stderr=stderr, width=width, highlight=False, soft_wrap=False, markup=False, emoji=False)
+
+
+def _redraws(console: Console) -> bool:
+    """Whether lines that were printed can be drawn again: not in a pipe, even where FORCE_COLOR wants colours there."""
+    return console.file.isatty() and not console.is_dumb_terminal
+
+
+def say(text: str, style: str = "", console: Console | None = None) -> None:
+    """One line for people, which only the terminal wraps, so that a command in it can be copied."""
+    (console or people()).print(Text(plain(text), style=style), soft_wrap=True)
+
+
+# ---------------------------------------------------------------- streams
+def mend_streams() -> None:
+    """Standard streams that are there and take every text, whatever they were started as.
+
+    One that is closed (`>&-`) becomes the null device; what an encoding does not have (LANG=C, or a file's name that
+    is no UTF-8) is printed as an escape.
+    """
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # takes the lowest free number: this one
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(number, "r" if name == "stdin" else "w", closefd=False))  # noqa: SIM115
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
+
+
+def is_output_error(error: BaseException) -> bool:
+    """Whether it says that stdout takes no more: its disk is full, or nobody reads it any more."""
+    return isinstance(error, OSError) and error.filename is None and error.errno in (*DISK_FULL, errno.EPIPE)
+
+
+def flush_output() -> OSError | None:
+    """Write what is left for stdout; the error, if that fails, and then what is left is forgotten."""
+    try:
+        sys.stdout.flush()
+    except OSError as error:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or Python tries again at its end
+        return error
+    return None
 
 
 # ---------------------------------------------------------------- logging
+class _PeopleHandler(logging.Handler):
+    """Each record as one line on stderr."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        try:
+            say(f"{record.levelname}: {record.getMessage()}", _LEVEL_COLOURS.get(record.levelname, ""))
+        except Exception:  # as logging's own handlers do: what cannot be told is no reason to stop
+            self.handleError(record)
+
+
 def set_up_logging(verbose: bool = False) -> None:
     """Warnings of everybody and what our stages say go to stderr; `verbose` adds our debug lines."""
-    console = people()
-    handler: logging.Handler
-    if console.is_terminal:
-        handler = RichHandler(console=console, show_time=False, show_path=False, markup=False)
-    else:
-        handler = logging.StreamHandler(sys.stderr)
-        handler.setFormatter(logging.Formatter("%(levelname)s: %(message)s"))
+    handler = _PeopleHandler()
     handler.name = CONSOLE_HANDLER
     handler.setLevel(logging.DEBUG if verbose else logging.INFO)
     handler.addFilter(lambda record: record.name != TRACEBACKS)
@@ -94,31 +145,25 @@ def stdout_kept_clean() -> Iterator[None]:
 
 # ---------------------------------------------------------------- errors
 def show_error(message: str, hint: str = "") -> None:
-    """A panel where a person looks on; plain lines in a pipe, where they can be searched for."""
+    """What happened; then, as the last line, what to do."""
     console = people()
-    if not console.is_terminal:
-        print(f"Error: {message}", file=sys.stderr)
-        if hint:
-            print(hint, file=sys.stderr)
-        return
-    text = Text(message)
+    console.print(Text.assemble(("Error: ", "bold red"), plain(message)), soft_wrap=True)
     if hint:
-        text.append(f"\n\n{hint}", style="cyan")
-    console.print(Panel(text, title="Error", title_align="left", border_style="red"))
+        say(hint, "cyan", console)
 
 
 # ---------------------------------------------------------------- progress
 def _bars(console: Console) -> Progress:
+    roomy = console.width >= NARROW
+    times = (TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn())
     return Progress(
-        TextColumn("{task.description:<10}"),
-        BarColumn(bar_width=30),
+        TextColumn("{task.description:<10}", markup=False),
+        *((BarColumn(bar_width=30),) if roomy else ()),
         TaskProgressColumn(),
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
-        TextColumn("{task.fields[note]}"),
+        *(times if roomy else ()),
+        TextColumn("{task.fields[note]}", markup=False),
         console=console,
-        disable=not console.is_terminal,
+        disable=not _redraws(console),
     )
 
 
@@ -159,8 +204,8 @@ class ProgressDisplay(Listener):
         self._task = self._bars.add_task(stage.name, total=None, note="")
 
     def stage_progress(self, stage: Stage, done: float, total: float, note: str) -> None:
-        self._bars.update(self._task, completed=done, total=total, note=note)
-        if not self._console.is_terminal and time.monotonic() - self._printed_at > PLAIN_EVERY_S:
+        self._bars.update(self._task, completed=done, total=total, note=plain(note))
+        if self._bars.disable and time.monotonic() - self._printed_at > PLAIN_EVERY_S:
             self._printed_at = time.monotonic()
             self._line(f"{stage.name}: {100 * done / max(total, 1e-9):.0f} % {note}".rstrip())
 
@@ -173,7 +218,7 @@ class ProgressDisplay(Listener):
             self._line(f"{stage.name}: skipped ({outcome.reason})")
 
     def _line(self, text: str) -> None:
-        self._console.print(text, style="dim", markup=False)
+        say(text, "dim", self._console)
 
 
 # ---------------------------------------------------------------- tables
@@ -186,20 +231,20 @@ def table_of(first: str, *numbers: str) -> Table:
     return table
 
 
-def _stage_table(state: str, *numbers: str) -> Table:
-    """An empty table of stages: name, state, why, and columns of numbers."""
+def _stage_table(state: str, width: int, *numbers: str) -> Table:
+    """An empty table of stages: name, state, why, and where there is room columns of numbers."""
     table = Table(header_style="bold")
     for heading in ("stage", state):
         table.add_column(heading, no_wrap=True)
     table.add_column("why", overflow="fold")
-    for heading in numbers:
+    for heading in numbers if width >= NARROW else ():
         table.add_column(heading, justify="right", no_wrap=True)
     return table
 
 
 def outcome_table(outcomes: Sequence[StageOutcome], width: int) -> Table:
     """Stage, what became of it and why, its cost, where there is room its key numbers. The total is of what ran now."""
-    table = _stage_table("what", "wall s", "CPU s", "peak GiB")
+    table = _stage_table("what", width, "wall s", "CPU s", "peak GiB")
     if width >= WIDE:
         table.add_column("numbers", overflow="fold")
 
@@ -210,11 +255,11 @@ def outcome_table(outcomes: Sequence[StageOutcome], width: int) -> Table:
         add(
             outcome.name,
             outcome.action,
-            Text(outcome.reason),
+            Text(plain(outcome.reason)),
             f"{outcome.wall_s:.1f}",
             f"{outcome.cpu_s:.1f}",
             f"{outcome.peak_rss / GIB:.2f}",
-            Text(key_numbers(outcome.numbers)),
+            Text(plain(key_numbers(outcome.numbers))),
             style="dim" if outcome.action == "skipped" else None,
         )
     ran = [outcome for outcome in outcomes if outcome.action == "ran"]
@@ -232,13 +277,15 @@ def outcome_table(outcomes: Sequence[StageOutcome], width: int) -> Table:
 
 def status_table(statuses: Sequence[StageStatus], width: int) -> Table:
     """Stage, how it stands and why, its size and time, where there is room what else it cost and its date."""
-    table = _stage_table("state", "size", "wall s", *(("CPU s", "peak GiB", "made (UTC)") if width >= WIDE else ()))
+    table = _stage_table(
+        "state", width, "size", "wall s", *(("CPU s", "peak GiB", "made (UTC)") if width >= WIDE else ())
+    )
     for status in statuses:
         made = status.manifest
         cells: list[str | Text] = [
             status.name,
             Text(status.state, style=_STATE_COLOURS[status.state]),
-            Text(status.reason),
+            Text(plain(status.reason)),
         ]
         if made:
             cells += [show_bytes(made.size), f"{made.wall_s:.1f}", f"{made.cpu_s:.1f}", f"{made.peak_rss / GIB:.2f}"]

@@ -11,6 +11,7 @@ from typing import Annotated, Any
 
 import typer
 
+from hineus_cli.completing import devices, preset_names, setting_keys, stage_names
 from stages.errors import ConfigError
 from stages.request import HOLD_OUT, Request
 
@@ -62,7 +63,18 @@ Photos = Annotated[
 OfWorkspace = Annotated[Path, typer.Argument(help="The workspace's folder.")]
 WorkspaceOption = Annotated[
     Path | None,
-    typer.Option("--workspace", "-w", help="Folder for all results; default: PHOTOS_hineus here.", show_default=False),
+    typer.Option(
+        "--workspace",
+        "-w",
+        help="Folder for all results; default: PHOTOS_hineus beside the photos.",
+        show_default=False,
+    ),
+]
+OtherPhotos = Annotated[
+    bool,
+    typer.Option(
+        "--other-photos", help="Use a workspace that was made of other photos, too: its results are replaced."
+    ),
 ]
 Masks = Annotated[
     Path | None, typer.Option(help="Folder of masks, named like the photos, white on the object.", show_default=False)
@@ -75,20 +87,53 @@ Poses = Annotated[
     ),
 ]
 NoPoses = Annotated[bool, typer.Option("--no-poses", help="Forget the poses of the last run and find them.")]
-NoMasks = Annotated[bool, typer.Option("--no-masks", help="Forget the masks of the last run.")]
+NoMasks = Annotated[
+    bool,
+    typer.Option(
+        "--no-masks", help="Use no masks: forget those of the last run, and leave out those among the photos."
+    ),
+]
+BlackKeeps = Annotated[
+    bool | None,
+    typer.Option(
+        "--masks-black-keeps/--masks-white-keeps",
+        help="Whether black or white is the object in masks: sets ingest.masks_keep.",
+        show_default=False,
+    ),
+]
+Control = Annotated[
+    Path | None,
+    typer.Option(
+        help="Ground control: a CSV of name, x, y, z, photo, px, py, OpenDroneMap's gcp_list.txt, or a folder "
+        "of two tables, of points and of marks.",
+        show_default=False,
+    ),
+]
+NoControl = Annotated[bool, typer.Option("--no-control", help="Forget the ground control points of the last run.")]
 Preset = Annotated[
     str | None,
-    typer.Option(help="See `hineus presets`; default: gpu with a CUDA device, else cpu.", show_default=False),
+    typer.Option(
+        help="See `hineus presets`; default: gpu with a CUDA device, else cpu.",
+        show_default=False,
+        autocompletion=preset_names,
+    ),
 ]
 ConfigFile = Annotated[
     Path | None, typer.Option("--config", help="YAML file of settings, over the preset.", show_default=False)
 ]
 Sets = Annotated[
     list[str] | None,
-    typer.Option("--set", help="One setting, over all else: section.key=value. Repeatable.", show_default=False),
+    typer.Option(
+        "--set",
+        help="One setting, over all else: section.key=value. Repeatable.",
+        show_default=False,
+        autocompletion=setting_keys,
+    ),
 ]
-Until = Annotated[str | None, typer.Option(help="Stop after this stage.", show_default=False)]
-Device = Annotated[str, typer.Option(help="auto, cpu or cuda.")]
+Until = Annotated[
+    str | None, typer.Option(help="Stop after this stage.", show_default=False, autocompletion=stage_names)
+]
+Device = Annotated[str, typer.Option(help="auto, cpu or cuda.", autocompletion=devices)]
 Workers = Annotated[int | None, typer.Option(min=1, help="CPU threads; default: all.", show_default=False)]
 Time = Annotated[
     float | None,
@@ -137,6 +182,8 @@ def settings(
     no_ground: bool = False,
     watertight: bool = False,
     deterministic: bool = False,
+    no_masks: bool = False,
+    black_keeps: bool | None = None,
     moving_object: bool = False,
     masks: Path | None = None,
 ) -> tuple[str, ...]:
@@ -151,6 +198,8 @@ def settings(
         "sfm.masks": "always" if moving_object else None,
         "place.gps": False if moving_object else None,  # the cameras' places against the object are others
         "ingest.auto_mask": "object" if moving_object and not chosen else None,
+        "ingest.own_masks": False if no_masks else None,
+        "ingest.masks_keep": None if black_keeps is None else "black" if black_keeps else "white",
     }
     given = (f"{key}={json.dumps(value)}" for key, value in stood_for.items() if value is not None)
     return (*(sets or ()), *given)
@@ -159,10 +208,14 @@ def settings(
 def of_a_run(
     photos: Photos = None,
     workspace: WorkspaceOption = None,
+    other_photos: OtherPhotos = False,
     masks: Masks = None,
     no_masks: NoMasks = False,
+    black_keeps: BlackKeeps = None,
     poses: Poses = None,
     no_poses: NoPoses = False,
+    control: Control = None,
+    no_control: NoControl = False,
     preset: Preset = None,
     config: ConfigFile = None,
     sets: Sets = None,
@@ -179,13 +232,18 @@ def of_a_run(
     return Request(
         photos=photos,
         workspace=workspace,
+        other_photos=other_photos,
         masks=masks,
         no_masks=no_masks,
         poses=poses,
         no_poses=no_poses,
+        control=control,
+        no_control=no_control,
         preset=preset,
         config=config,
-        sets=settings(sets, time, hold_out, no_ground, watertight, deterministic, moving_object, masks),
+        sets=settings(
+            sets, time, hold_out, no_ground, watertight, deterministic, no_masks, black_keeps, moving_object, masks
+        ),
         device=device,
         workers=workers,
     )

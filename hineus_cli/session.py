@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
@@ -11,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
+from hineus_cli.stopping import end_children
 from stages.engine.stage import Stage
 
 if TYPE_CHECKING:
@@ -45,7 +47,16 @@ class Session:
         from hineus_cli.console import ProgressDisplay
 
         with self.working(verbose), ProgressDisplay() as self.progress:
-            yield self.progress
+            try:
+                yield self.progress
+            except KeyboardInterrupt:
+                end_children()
+                raise
+
+
+def as_argument(path: Path) -> str:
+    """A path as a command takes it: short from the current folder, and quoted where the shell needs it."""
+    return shlex.quote(str(path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path))
 
 
 def print_json(answer: Mapping[str, Any], ok: bool = True) -> None:

@@ -165,9 +165,11 @@ def _cut_warnings(vertices: np.ndarray, faces: np.ndarray, scene: PosedScene) ->
     if cut is None:
         return []
     larger = regrown(scene, *region_without_cut(cut))
-    sentence = f"The region of interest cuts what {cut.photos} photos have in their middle."
+    sentence = (
+        f"The region of interest cuts what {cut.photos} photos have in their middle. A larger one can be set by a "
+        "command, or in the report's 3D view."
+    )
     command = f"hineus run --workspace WORKSPACE --set undistort.roi_scale={larger.roi_scale:.2f}"
-    logger.warning("%s A larger one: `%s`, or set it in the report's 3D view.", sentence, command)
     return [{"sentence": sentence, "command": command}]
 
 

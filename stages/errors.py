@@ -36,7 +36,7 @@ class ReconstructionError(HineusError):
 
 
 class WorkspaceError(HineusError):
-    """The workspace is busy, damaged, read-only, full or from another version. Mend the workspace."""
+    """The workspace is busy, damaged, read-only, full, of other photos or from another version. Mend the workspace."""
 
     exit_code = 5
 

@@ -58,7 +58,7 @@ class Asset:
 
 
 def run(context: StageContext[ExportParams]) -> dict[str, Any]:
-    """Write what the settings ask for. Returns counts, extents in world units, and bytes of each file."""
+    """Write what the settings ask for, and where on Earth it lies. Returns counts, extents, and bytes of each file."""
     params = context.params
     scene, place = context.read(SCENE), context.read(WORLD_PLACE)
     world_from_scene = scene.world_from_scene(place)
@@ -80,6 +80,7 @@ def run(context: StageContext[ExportParams]) -> dict[str, Any]:
         "units": place.units,
     }
     writers = {"glb": _write_glb, "usdz": _write_usdz, "obj": _write_obj, "ply": _write_ply, "stl": _write_stl}
+    _write_georeference(asset, place)
     try:
         extent = np.ptp(asset.in_world(asset.mesh).vertices, axis=0)
         numbers["extent"] = [round(float(side), 6) for side in extent]
@@ -182,6 +183,16 @@ def _write_stl(asset: Asset) -> int:
     return artifacts.asset_path(asset.out, "stl").write_bytes(stl_bytes(mesh.vertices, mesh.faces, asset.note))
 
 
+def _write_georeference(asset: Asset, place: Place) -> None:
+    """Where on Earth, or in the control points' frame, the files lie; nothing where that is not known."""
+    from stages.files.georeference import georeference, metadata_xml
+
+    if found := georeference(place, asset.gltf_from_world):
+        artifacts.write_json(asset.out / artifacts.GEOREFERENCE, found)
+    if text := metadata_xml(place):
+        (asset.out / artifacts.METADATA).write_text(text, encoding="utf-8")
+
+
 def load_textures(context: StageContext[ExportParams]) -> Textures:
     """The images that the bake stage left."""
     from stages.files.contents import Textures
@@ -243,12 +254,16 @@ def provenance(scene: PosedScene, place: Place, gltf_from_world: np.ndarray, run
         keys = ("latitude_deg", "longitude_deg", "altitude_m")
         extras["world_origin"] = dict(zip(keys, place.origin, strict=True))
         extras["gps_residual_m"] = place.gps_residual
+    if place.offset is not None:
+        extras |= {"world_crs": place.crs or None, "world_offset": place.offset}
+    if place.control:
+        extras["control_residual_m"] = place.control_residual
     return extras
 
 
 EXPORT: Stage[ExportParams] = Stage(
     name="export",
-    version=6,
+    version=7,
     settings=lambda config: config.export,
     run=run,
     reads=(SCENE, WORLD_PLACE, ATLAS_MESH, BASE_COLOR, NORMAL_MAP, OCCLUSION),

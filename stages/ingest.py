@@ -11,7 +11,7 @@ import logging
 import math
 import shutil
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from fnmatch import fnmatchcase
@@ -22,26 +22,46 @@ from typing import Any, TypeVar
 import numpy as np
 
 from configs.params import IngestParams
-from stages.artifacts import IMAGE_SET, PHOTOS, ImageRecord, ImageSet, SkippedImage
+from stages.artifacts import IMAGE_SET, LEFT_OUT, PHOTOS, ImageRecord, ImageSet, SkippedImage
 from stages.capture.background import PLAIN_PHOTOS, plain_mask
-from stages.capture.exif import GPS_IFD, ORIENTATION, camera_key, focal_px, gps_position
+from stages.capture.exif import GPS_IFD, ORIENTATION, camera_key, focal_px, read_gps
 from stages.capture.listing import NAMED, by_reason, list_captures, name_some
-from stages.capture.masks import check_size, match_masks, read_mask, write_mask
+from stages.capture.mask_doubts import MaskLook, find_doubts, is_black_and_white, nothing_kept
+from stages.capture.mask_names import set_masks_aside
+from stages.capture.masks import (
+    EMPTY,
+    MASK_NOT_PHOTO,
+    Mask,
+    PairMasks,
+    alpha_of,
+    check_size,
+    choose_masks,
+    load_mask,
+    look_at_mask,
+    match_masks,
+    missing_masks,
+    tell_masks,
+    unused_masks,
+    write_mask,
+)
 from stages.capture.panoramas import Sphere, View, find_spheres, split
 from stages.capture.panoramas import focal_px as view_focal_px
-from stages.capture.photo_reading import UnusableError, read_photo, register_formats
+from stages.capture.photo_reading import Photo, UnusableError, read_photo
 from stages.capture.quality import Appearance, appearance, find_oddities
 from stages.capture.salient import SalientNetwork
 from stages.capture.video import extract_frames
 from stages.engine.fingerprint import file_sha256
 from stages.engine.stage import Stage, StageContext
 from stages.errors import InputError
-from stages.posing.known import KnownPoses, match_photos
+from stages.inputs.folders import readable, short_name, unique_name
+from stages.inputs.formats import PHOTO_SUFFIXES, RAW_SUFFIXES
+from stages.posing.known import KnownPoses, check_masks, match_photos
 from stages.posing.nero import DEPTH, read_depth_mask
 from stages.posing.reading import read_poses
 
 log = logging.getLogger(__name__)
 
+LOOK_SIDE, NEAREST = 1024, 0  # a look at a photo and its mask: longest side in pixels, and Pillow's resampling
 JPEG_QUALITY = 97  # re-encoded lossy photos; visually lossless, about a third of PNG's size
 
 # Photo [H, W, 3] uint8 -> mask [H, W] bool, None where there is nothing to mask.
@@ -55,12 +75,9 @@ def run(context: StageContext[IngestParams]) -> dict[str, Any]:
     params, source = context.params, context.sources["photos"]
     masks_folder = context.sources.get("masks")
     photos, videos, skipped = list_captures(source, masks_folder)
-    register_formats()
-    folder = source if source.is_dir() else source.parent
-    files = {path: folder / path for path in photos}
-    frames, damaged = _frames_of(videos, folder, context)
-    files |= frames
-    files, views, unsplit = _split_panoramas(files, context)
+    photos, own_masks, aside = set_masks_aside(photos)
+    frames, damaged = _frames_of(videos, context)
+    files, views, unsplit = _split_panoramas(photos | frames, context)
     skipped += damaged + unsplit
     paths = sorted(files)
     poses = read_poses(context.sources["poses"]) if "poses" in context.sources else None
@@ -70,22 +87,27 @@ def run(context: StageContext[IngestParams]) -> dict[str, Any]:
         paths = list(cameras)
         _tell_unused(poses, {camera.name for camera in cameras.values()})
     unseen = {path for path in paths if _left_out(path, params)}
-    skipped += [SkippedImage(path, "named in ingest.leave_out") for path in paths if path in unseen]
+    skipped += [SkippedImage(path, LEFT_OUT) for path in paths if path in unseen]
     paths = [path for path in paths if path not in unseen]
 
     unique, copies = _without_copies(paths, files, context)
     skipped += copies
 
-    mask_files = find_masks(list(unique), masks_folder, poses) if masks_folder else {}
+    mask_files = choose_masks(
+        {path: files[path] for path in unique}, own_masks, masks_folder, params.own_masks, pairs_of(poses)
+    )
+    skipped += unused_masks(aside, mask_files.values(), params.own_masks, masks_folder)
+    if not mask_files and (none := missing_masks(list(unique), mask_files, masks_folder)):
+        raise none
     names, make_mask = _Names(unique), _mask_maker(params)
     done = 0
 
-    def take(path: str) -> tuple[ImageRecord, Appearance] | SkippedImage:
+    def take(path: str) -> tuple[ImageRecord, Appearance, MaskLook | None, str] | SkippedImage:
         nonlocal done
         try:
             mask_file = mask_files.get(path)
-            record, seen = _take_photo(files[path], path, unique[path], mask_file, make_mask, names, context)
-            return _as_view(record, *views[path]) if path in views else record, seen
+            taken = _take_photo(files[path], path, unique[path], mask_file, make_mask, names, context)
+            return (_as_view(taken[0], *views[path]), *taken[1:]) if path in views else taken
         except UnusableError as reason:
             return SkippedImage(path, str(reason))
         finally:
@@ -94,36 +116,40 @@ def run(context: StageContext[IngestParams]) -> dict[str, Any]:
 
     outcomes = _in_threads(take, unique, context.workers)
     taken = [o for o in outcomes if not isinstance(o, SkippedImage)]
-    images = sorted((record for record, _ in taken), key=lambda record: record.name)
+    images = sorted((record for record, *_ in taken), key=lambda record: record.name)
     skipped += [o for o in outcomes if isinstance(o, SkippedImage)]
     if params.auto_mask in ("plain", "object"):
         images, without = _with_masks(images, context)
         skipped += without
     skipped.sort(key=lambda item: item.source)
+    looks = [look for _, _, look, _ in taken if look is not None]
+    _judge_masks(looks, skipped, params)
 
     places = len({record.frame or record.name for record in images})
     if places < params.min_images:
         raise _too_few(source, places, params.min_images, skipped)
-    missing = [record.source for record in images if masks_folder and record.source not in mask_files]
-    if missing:
-        raise InputError(
-            f"{len(missing)} of {len(images)} photos have no mask in {masks_folder}: {name_some(missing)}.",
-            f"Add {Path(missing[0]).stem}.png and the like, move those photos away, or run with `--no-masks`.",
-        )
-    for reason, sources in by_reason(skipped).items():
-        log.warning("left out %s: %s", name_some(sources), reason)
+    if some := missing_masks([record.source for record in images], mask_files, masks_folder):
+        raise some
+    for expected, level in ((True, logging.INFO), (False, logging.WARNING)):
+        for reason, sources in by_reason(item for item in skipped if item.expected is expected).items():
+            log.log(level, "left out %s: %s", name_some(sources), reason)
+    doubtful = [SkippedImage(record.source, problem) for record, *_, problem in taken if problem]
+    for problem, sources in by_reason(doubtful).items():
+        log.warning("%s: %s", name_some(sources), problem)
     # a video's frames are the sharpest of their stretch and near each other by choice, views may show the sky
-    odd = find_oddities([seen for _, seen in taken if seen.source not in frames.keys() | views.keys()])
+    odd = find_oddities([seen for _, seen, *_ in taken if seen.source not in frames.keys() | views.keys()])
     for warning in odd.warnings:
         log.warning("%s", warning)
     masked = sum(record.has_mask for record in images)
     if 0 < masked < len(images):
-        origin = "nothing stands out in the others" if params.auto_mask == "salient" else "from their alpha channel"
+        origin = "found among them" if mask_files else "from their alpha channel"
+        origin = "nothing stands out in the others" if params.auto_mask == "salient" else origin
         log.warning("only %d of %d photos have a mask (%s)", masked, len(images), origin)
     context.write(IMAGE_SET, ImageSet(tuple(images), tuple(skipped)))
     return {
         "images": len(images),
-        "skipped": len(skipped),
+        "skipped": sum(not item.expected for item in skipped),
+        **({"companions": companions} if (companions := sum(item.expected for item in skipped)) else {}),
         **({"videos": len(videos) - len(damaged)} if videos else {}),
         **({"panoramas": len({path for path, _ in views.values()})} if views else {}),
         "masks": masked,
@@ -139,21 +165,20 @@ def run(context: StageContext[IngestParams]) -> dict[str, Any]:
 
 # ---------------------------------------------------------------- which files
 def _frames_of(
-    videos: list[str], folder: Path, context: StageContext[IngestParams]
+    videos: dict[str, Path], context: StageContext[IngestParams]
 ) -> tuple[dict[str, Path], list[SkippedImage]]:
     """Frames of each video, as `clip.mp4/000120.jpg` -> file, so that no photo can have that name; and bad videos."""
     found: dict[str, Path] = {}
     damaged = []
     shutil.rmtree(context.scratch / "frames", ignore_errors=True)
-    for done, video in enumerate(videos):
+    for done, (video, file) in enumerate(videos.items()):
 
         def tell(part: float, done: int = done, video: str = video) -> None:
             context.progress(done + part, len(videos), f"frames of {video}")
 
         try:
-            frames = extract_frames(
-                folder / video, context.scratch / "frames" / video, context.params.video_frames, tell
-            )
+            folder = context.scratch / "frames" / str(done)  # a video's name may be too long
+            frames = extract_frames(file, folder, context.params.video_frames, tell)
         except UnusableError as reason:
             damaged.append(SkippedImage(video, str(reason)))
             continue
@@ -176,10 +201,12 @@ def _split_panoramas(
     shutil.rmtree(folder, ignore_errors=True)
     done = 0
 
+    numbers = {path: str(number) for number, path in enumerate(spheres)}  # names may be too long
+
     def split_one(path: str) -> dict[str, tuple[Path, View]] | SkippedImage:
         nonlocal done
         try:
-            found = _write_views(files[path], spheres[path], folder / path, context.params.max_side)
+            found = _write_views(files[path], spheres[path], folder / numbers[path], context.params.max_side)
         except UnusableError as reason:
             return SkippedImage(path, str(reason))
         done += 1
@@ -208,7 +235,7 @@ def _write_views(file: Path, sphere: Sphere, folder: Path, max_side: int) -> lis
     """
     from PIL import Image
 
-    photo = read_photo(file)
+    photo = read_photo(file, max(sphere.size))
     metadata = Image.Exif()
     metadata[GPS_IFD] = photo.exif.get_ifd(GPS_IFD)
     folder.mkdir(parents=True)
@@ -272,50 +299,97 @@ def _tell_unused(poses: KnownPoses, used: set[str]) -> None:
         log.warning("%d of %d poses in %s have no photo: %s", len(unused), total, file, name_some(unused))
 
 
-def find_masks(photos: list[str], folder: Path, poses: KnownPoses | None) -> dict[str, Path]:
-    """Photo -> its mask file in `folder`; as the poses' format pairs them where it is that format's own folder."""
-    if poses is None or {file.parent.resolve() for file in poses.masks.values()} != {folder.resolve()}:
-        return match_masks(photos, folder)
+def pairs_of(poses: KnownPoses | None) -> PairMasks:
+    """`find_masks` with these poses."""
+    return lambda photos, folder, not_masks: find_masks(photos, folder, poses, not_masks)
+
+
+def find_masks(
+    photos: list[str], folder: Path, poses: KnownPoses | None, not_masks: Collection[Path] = ()
+) -> dict[str, Path]:
+    """Photo -> its mask file in `folder`; as the poses' file pairs them where it is the folder of that file's masks.
+
+    Raises:
+        InputError: the poses name masks that are not there.
+    """
+    own = poses.masks if poses is not None else {}
+    if poses is None or not own or not all(file.resolve().is_relative_to(folder.resolve()) for file in own.values()):
+        return match_masks(photos, folder, not_masks)
+    check_masks(own, poses.origin)
     cameras = match_photos(poses, photos)
-    named = {photo: poses.masks.get(camera.name) for photo, camera in cameras.items()}
-    return {photo: file for photo, file in named.items() if file is not None}
+    return {photo: own[camera.name] for photo, camera in cameras.items() if camera.name in own}
 
 
 def read_mask_file(
-    file: Path, photo: str, size: tuple[int, int], stored_size: tuple[int, int], orientation: int
-) -> np.ndarray:
-    """Mask [H, W] bool of the upright photo, of a picture or of a depth image.
+    file: Path,
+    photo: str,
+    size: tuple[int, int],
+    stored_size: tuple[int, int],
+    orientation: int,
+    black_keeps: bool = False,
+    pixels: np.ndarray | None = None,
+) -> Mask:
+    """Mask of the upright photo, of a picture (see `load_mask`) or of a depth image.
 
     Raises:
         InputError: it cannot be read, or is not of the upright photo's size (width, height).
     """
     if not file.name.endswith(DEPTH):
-        return read_mask(file, photo, size, stored_size, orientation)
+        return load_mask(file, photo, size, stored_size, orientation, black_keeps, pixels)
     mask = read_depth_mask(file)
-    check_size(file, photo, mask.shape[::-1], size)
-    return mask
+    check_size(file, photo, (mask.shape[1], mask.shape[0]), size)
+    return Mask(mask, size)
+
+
+def _judge_masks(looks: list[MaskLook], skipped: list[SkippedImage], params: IngestParams) -> None:
+    """Say which masks are used and what is doubtful about them.
+
+    Raises:
+        InputError: nothing good can come of these masks.
+    """
+    empty = [item.source for item in skipped if item.reason.startswith(EMPTY)]
+    if empty and not looks:
+        raise InputError(*nothing_kept(len(empty), empty[0]))
+    if looks:
+        log.info("masks: %s", tell_masks(looks))
+    for doubt in find_doubts(looks, params.masks_keep != "auto"):
+        if doubt.impossible:
+            raise InputError(doubt.message, doubt.hint)
+        log.warning("%s %s", doubt.message, doubt.hint)
 
 
 class _Names:
-    """Gives each photo one name under images/. Names depend on the folder, never on the order of work."""
+    """Gives each photo one name under images/. Names depend on the folder, never on the order of work.
+
+    They are unique whatever the case of letters, for file systems that do not tell it, and short enough for all.
+    """
 
     def __init__(self, paths: Iterable[str]) -> None:
-        own = set(paths)
-        # case-insensitive file systems must not merge two photos
-        self._lower = {path.lower() for path in own}
-        self._stems = Counter(str(PurePosixPath(path).with_suffix("")).lower() for path in own)
+        self._own: dict[str, str] = {}
+        lower: set[str] = set()
+        for path in sorted(paths):
+            self._own[path] = unique_name(short_name(path), lower, str.lower)
+            lower.add(self._own[path].lower())
+        self._lower = lower
+        self._stems = Counter(_stem(name).lower() for name in self._own.values())
 
-    def target(self, path: str, suffix: str | None) -> str:
-        """`path` itself (suffix None or unchanged), or its stem with `suffix`, unique in the folder."""
-        own = PurePosixPath(path)
-        if suffix is None or own.suffix.lower() == suffix:
-            return path
-        if self._stems[str(own.with_suffix("")).lower()] == 1:
-            return own.with_suffix(suffix).as_posix()
-        name = path + suffix
+    def target(self, path: str, suffixes: Sequence[str]) -> str:
+        """The photo's own name where it has one of these suffixes, else with the first of them in place of its own."""
+        name = self._own[path]
+        if PurePosixPath(name).suffix.lower() in suffixes:
+            return name
+        if self._stems[_stem(name).lower()] == 1:
+            return _stem(name) + suffixes[0]
+        name += suffixes[0]
         while name.lower() in self._lower:
-            name = name[: -len(suffix)] + "_" + suffix
+            name = name[: -len(suffixes[0])] + "_" + suffixes[0]
         return name
+
+
+def _stem(name: str) -> str:
+    """Without what is a photo's suffix: "frame.0001" has none."""
+    suffix = PurePosixPath(name).suffix
+    return name.removesuffix(suffix) if suffix.lower() in PHOTO_SUFFIXES | RAW_SUFFIXES else name
 
 
 def _in_threads(function: Callable[[Item], Result], items: Iterable[Item], workers: int) -> list[Result]:
@@ -367,31 +441,23 @@ def _take_photo(
     make_mask: MaskMaker | None,
     names: _Names,
     context: StageContext[IngestParams],
-) -> tuple[ImageRecord, Appearance]:
-    from PIL import Image
+) -> tuple[ImageRecord, Appearance, MaskLook | None, str]:
+    """Its record, its looks and its mask's, and what is wrong with its colours, in words."""
+    max_side = context.params.max_side
+    photo = read_photo(file, max_side)
+    rgb = photo.rgb
+    mask, look = _given_mask(photo, source, mask_file, context.params)
 
-    photo = read_photo(file)
-    rgb, mask = photo.rgb, photo.alpha
-    if mask_file is not None:
-        mask = read_mask_file(mask_file, source, rgb.size, photo.stored_size, photo.orientation)
-    if mask is not None and not mask.any():
-        raise UnusableError(f"its mask is empty ({mask_file.name if mask_file else 'alpha channel'})")
-
-    scale = min(1.0, context.params.max_side / max(rgb.size))
-    keep = photo.as_is and scale == 1
-    if scale < 1:
-        rgb = rgb.resize([max(1, round(side * scale)) for side in rgb.size], Image.Resampling.LANCZOS)
     made_mask = ""
     if mask is None and make_mask is not None:
         mask = make_mask(np.asarray(rgb))
         made_mask = "" if mask is None else context.params.auto_mask
-    suffix = None if keep else _encoded_suffix(file, photo.lossy)
-    name = names.target(source, suffix)
+    name = names.target(source, photo.as_is or _encoded_suffixes(photo))
 
     pictures = context.to_write(PHOTOS)
     target = pictures.path(name)
     target.parent.mkdir(parents=True, exist_ok=True)
-    if keep:
+    if photo.as_is:
         shutil.copyfile(file, target)
     else:
         _encode(rgb, target, photo.lossy, photo.exif)
@@ -405,23 +471,42 @@ def _take_photo(
         source=source,
         width=rgb.width,
         height=rgb.height,
-        focal_px=None if focal is None else focal * scale,
+        focal_px=None if focal is None else focal * min(1.0, max_side / max(photo.size)),
         camera=camera_key(photo.exif, rgb.size, source),
         blur=seen.sharpness,
         has_mask=mask is not None,
         sha256=digest,
-        gps=gps_position(photo.exif),
+        gps=read_gps(photo.exif).position,
         made_mask=made_mask,
+        taken=photo.size,
     )
-    return record, seen
+    return record, seen, look, photo.colours.problem
 
 
-def _encoded_suffix(file: Path, lossy: bool) -> str:
-    """A re-encoded photo keeps its own suffix where that suffix is true."""
-    own = file.suffix.lower()
-    if lossy:
-        return own if own in (".jpg", ".jpeg") else ".jpg"
-    return ".png"
+def _given_mask(
+    photo: Photo, source: str, mask_file: Path | None, params: IngestParams
+) -> tuple[np.ndarray | None, MaskLook | None]:
+    """The mask [H, W] bool that comes with a photo, as its file or its alpha channel, and a look at it.
+
+    Raises:
+        UnusableError: the mask keeps nothing, or the photo is a mask itself.
+    """
+    size, black_keeps = photo.size, params.masks_keep == "black"
+    scale = min(1.0, LOOK_SIDE / max(photo.rgb.size))
+    preview = np.asarray(photo.rgb.resize([max(1, round(side * scale)) for side in photo.rgb.size], resample=NEAREST))
+    if is_black_and_white(preview):
+        raise UnusableError(MASK_NOT_PHOTO)
+    if mask_file is not None:
+        mask = read_mask_file(mask_file, source, size, photo.stored_size, photo.orientation, black_keeps, preview)
+    elif photo.alpha is not None and params.own_masks:
+        mask = Mask(photo.alpha ^ black_keeps, size)
+    else:
+        return None, None
+    return mask.kept, look_at_mask(source, readable(mask_file.name) if mask_file else alpha_of(source), mask, preview)
+
+
+def _encoded_suffixes(photo: Photo) -> tuple[str, ...]:
+    return (".jpg", ".jpeg") if photo.lossy else (".png",)
 
 
 def _encode(rgb: Any, target: Path, lossy: bool, exif: Any) -> None:
@@ -431,7 +516,7 @@ def _encode(rgb: Any, target: Path, lossy: bool, exif: Any) -> None:
         metadata = exif.tobytes()
     except Exception:  # damaged maker notes; poses do without
         metadata = b""
-    extra = {"exif": metadata} if metadata else {}
+    extra: dict[str, Any] = {"icc_profile": None} | ({"exif": metadata} if metadata else {})
     if lossy:
         rgb.save(target, format="JPEG", quality=JPEG_QUALITY, subsampling=0, **extra)
     else:
@@ -440,7 +525,7 @@ def _encode(rgb: Any, target: Path, lossy: bool, exif: Any) -> None:
 
 INGEST: Stage[IngestParams] = Stage(
     name="ingest",
-    version=5,
+    version=6,
     settings=lambda config: config.ingest,
     run=run,
     writes=(PHOTOS, IMAGE_SET),

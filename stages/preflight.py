@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import re
+import shlex
 import shutil
 from collections import Counter
 from dataclasses import asdict, dataclass
@@ -9,16 +12,25 @@ from pathlib import Path
 from typing import Any, Literal
 
 from configs.params import Config
-from stages.capture.inspection import Inspection, inspect
+from stages.artifacts import SkippedImage
+from stages.capture.gps import gps_warnings
+from stages.capture.inspection import Inspection, MasksWanted, inspect
 from stages.capture.listing import NAMED, by_reason, name_some
+from stages.capture.mask_doubts import find_doubts, nothing_kept
+from stages.capture.masks import ASIDE, EMPTY, missing_masks, tell_masks
 from stages.capture.panoramas import split_size
 from stages.capture.salient import INSTALL, find_weights
+from stages.ingest import pairs_of, read_mask_file
+from stages.limits import available_memory, nearest_existing
+from stages.posing.control_files import read_control
+from stages.posing.marks import foresee
+from stages.posing.reading import read_poses
 
 Verdict = Literal["go", "go with warnings", "no-go"]
 
 MOSTLY_PLAIN = 0.5  # so many plain backgrounds are meant; too few for masks from the background's colour alone
 FEW_PHOTOS = 20  # a full turn in steps of less than 20 degrees; sets below it lose photos
-EXPECTED = ("not an image", "the raw file of", "the clip of")  # reasons to leave a file out that are no news
+CONTROL_NAME = re.compile(r"(gcp|ground.?control)[^/]*\.(txt|csv)$", re.IGNORECASE)
 
 # All measured with `benchmarks/run_sets.py` on two cores, see docs/benchmarks/results.md.
 GIB = 1 << 30
@@ -57,20 +69,29 @@ class Preflight:
     """What was seen, what it needs, and what to make of it.
 
     Attributes:
+        max_side: what photos are reduced to, longest side in pixels.
         refusals: reasons for "no-go" that lie in the photos; `shortages`: those that lie in the machine.
+        kept: what a run would keep of the workspace that is there, see `stages.kept`; empty where nothing has changed.
     """
 
     inspection: Inspection
+    max_side: int
     needs: Needs
     warnings: tuple[str, ...]
     refusals: tuple[str, ...]
     shortages: tuple[str, ...]
+    kept: str = ""
 
     @property
     def verdict(self) -> Verdict:
         if self.refusals or self.shortages:
             return "no-go"
         return "go with warnings" if self.warnings else "go"
+
+    @property
+    def reduced(self) -> int:
+        """How many photos are larger than `max_side`."""
+        return sum(max(size) > self.max_side for size in self.inspection.sizes)
 
     def as_dict(self) -> dict[str, Any]:
         """JSON-able."""
@@ -84,53 +105,82 @@ class Preflight:
             "sizes": [[*size, count] for size, count in Counter(seen.sizes).most_common()],
             "cameras": dict(Counter(photo.camera for photo in seen.photos)),
             "with_focal": sum(photo.has_focal for photo in seen.photos),
+            "with_gps": _located(seen),
+            "reduced": self.reduced,
+            "colour_profiles": dict(Counter(photo.colours.name for photo in seen.photos if photo.colours.name)),
             **asdict(seen.oddities),
             "plain_background": seen.plain,
+            "masks": len(seen.masks.looks or seen.masks.files),
             "needs": asdict(self.needs),
             "warnings": list(self.warnings),
             "refusals": list(self.refusals),
             "shortages": list(self.shortages),
+            "kept": self.kept,
         }
 
 
 def preflight(
-    source: Path, masks: Path | None, folder: Path, config: Config, device: str, workers: int, decode: bool
+    source: Path,
+    masks: Path | None,
+    folder: Path,
+    config: Config,
+    device: str,
+    workers: int,
+    decode: bool,
+    poses: Path | None = None,
+    control: Path | None = None,
 ) -> Preflight:
     """Look at the photos, and at the memory and the disk of `folder`, where the workspace will lie.
 
     `decode`: whether to judge the photos' pixels, too; before a run that is left to ingest, which decodes them anyway.
+    `poses`, `control`: files or folders of known poses and of ground control points.
 
     Raises:
-        InputError: there is no such folder or video.
+        InputError: there is no such folder or video, or the poses or control points cannot be used.
+        ConfigError, SystemRequirementError: the points' coordinates cannot be converted.
     """
-    import psutil
-
-    seen = inspect(source, masks, config.ingest.video_frames, workers, decode, config.ingest.panoramas)
+    params = config.ingest
+    pairs = pairs_of(read_poses(poses) if decode and poses is not None and masks is not None else None)
+    wanted = MasksWanted(masks, params.own_masks, params.masks_keep == "black", pairs, read_mask_file)
+    seen = inspect(
+        source, masks, params.video_frames, params.max_side, workers, decode, wanted, panoramas=params.panoramas
+    )
     needs = estimate(seen, config, device, workers)
-    while not folder.exists():
-        folder = folder.parent
-    memory, disk = psutil.virtual_memory().available / GIB, shutil.disk_usage(folder).free / 1e9
+    folder = nearest_existing(folder)
+    memory, disk = available_memory() / GIB, shutil.disk_usage(folder).free / 1e9
     refusals, shortages = [], []
     if seen.places < config.ingest.min_images:
         refusals.append(f"{seen.places} usable photos, {config.ingest.min_images} are needed.")
+    warnings = _warnings(seen, config)
+    if control is None:
+        warnings += _unused_control(seen, source)
+    if control is not None and not seen.videos:  # frames have no names yet
+        found = read_control(control)
+        sizes = {photo.source: (photo.width, photo.height) for photo in seen.photos}
+        more, doubts = foresee(found, found.system(config.place.control_epsg), sizes)
+        refusals, warnings = refusals + more, warnings + doubts
     if needs.memory_gib > memory:
         shortages.append(
             f"It may take {needs.memory_gib:.1f} GiB of memory, {memory:.1f} are free: close other programs, or try "
             "`--set undistort.max_side=800`, `--workers 1`."
         )
+    if not os.access(folder, os.W_OK):
+        shortages.append(f"{folder} cannot be written: try `--workspace DIR`.")
     if needs.disk_gb > disk:
         shortages.append(f"It may take {needs.disk_gb:.1f} GB of disk, {disk:.1f} are free: try `--workspace DIR`.")
     if config.ingest.auto_mask in ("salient", "object") and find_weights() is None:
         shortages.append(f"`ingest.auto_mask={config.ingest.auto_mask}` needs a network that is missing: `{INSTALL}`.")
-    warnings = _warnings(seen, config)
     if config.sfm.masks == "always" and masks is None and config.ingest.auto_mask == "off":
         warnings.append(
-            "Only what masks show is to be matched, and there are none, unless all photos have an alpha channel: give "
+            "Only what masks show is to be matched, and there are none, unless all photos bring theirs: give "
             "`--masks FOLDER`, or have them made with `--set ingest.auto_mask=object`."
         )
+    doubts, impossible = _of_masks(seen, config, masks if decode or poses is None else None)
+    warnings += doubts
+    refusals += impossible
     if memory / MEMORY_MARGIN < needs.memory_gib <= memory:
         warnings.append(f"It may take {needs.memory_gib:.1f} of the {memory:.1f} GiB of memory that are free.")
-    return Preflight(seen, needs, tuple(warnings), tuple(refusals), tuple(shortages))
+    return Preflight(seen, config.ingest.max_side, needs, tuple(warnings), tuple(refusals), tuple(shortages))
 
 
 def estimate(seen: Inspection, config: Config, device: str, workers: int) -> Needs:
@@ -142,9 +192,10 @@ def estimate(seen: Inspection, config: Config, device: str, workers: int) -> Nee
     looked_at = pixels(min(config.ingest.max_side, config.sfm.max_image_size))
     trained_on = sum(pixels(min(config.ingest.max_side, config.undistort.max_side)))
     sfm_gib = SFM_BASE_GIB + workers * SFM_GIB_PER_THREAD_MP * max(looked_at, default=0) / 1e6
+    read_gib = max((photo.bytes_to_read for photo in seen.photos), default=0) / GIB
     later_gib = MEMORY_BASE_GIB + MEMORY_OF_PHOTOS * 3 * trained_on / GIB
     return Needs(
-        memory_gib=max(sfm_gib, later_gib),
+        memory_gib=max(read_gib, sfm_gib, later_gib),
         disk_gb=DISK_BASE_GB + (seen.num_bytes + DISK_BYTES_PER_PIXEL * trained_on) / 1e9,
         minutes=_minutes(looked_at, config, workers) if device == "cpu" else None,
     )
@@ -167,8 +218,61 @@ def _warnings(seen: Inspection, config: Config) -> list[str]:
     if config.ingest.min_images <= len(seen.sizes) < FEW_PHOTOS:
         found.append(f"Only {len(seen.sizes)} photos; 30 to 100 that overlap by two thirds give a whole object.")
     found += seen.oddities.warnings
-    unusable = by_reason(item for item in seen.skipped if not item.reason.startswith(EXPECTED))
-    return found + [f"Left out {name_some(names)}: {reason}." for reason, names in unusable.items()]
+    if config.place.gps:
+        found += gps_warnings({photo.source: photo.gps for photo in seen.photos})
+    unusable = by_reason(item for item in seen.skipped if not item.expected)
+    found += [f"Left out {name_some(names)}: {reason}." for reason, names in unusable.items()]
+    doubtful = by_reason(SkippedImage(photo.source, photo.colours.problem) for photo in seen.photos)
+    return found + [f"{name_some(names)}: {problem}." for problem, names in doubtful.items() if problem]
+
+
+def _located(seen: Inspection) -> int:
+    """Photos that say where they were taken."""
+    return sum(photo.gps.position is not None for photo in seen.photos)
+
+
+def _unused_control(seen: Inspection, source: Path) -> list[str]:
+    """That a file of ground control points lies among the photos, where none is given."""
+    return [
+        f"{item.source} looks like ground control points, which are used with `--control {source / item.source}`."
+        for item in seen.skipped
+        if CONTROL_NAME.search(item.source)
+    ]
+
+
+def _of_masks(seen: Inspection, config: Config, folder: Path | None) -> tuple[list[str], list[str]]:
+    """Warnings and refusals."""
+    photos = [photo.source for photo in seen.photos]
+    doubts = find_doubts(seen.masks.looks, config.ingest.masks_keep != "auto")
+    refusals = [f"{doubt.message} {doubt.hint}" for doubt in doubts if doubt.impossible]
+    warnings = [f"{doubt.message} {doubt.hint}" for doubt in doubts if not doubt.impossible]
+    if error := missing_masks(photos, seen.masks.files, folder):
+        refusals.append(f"{error.message} {error.hint}")
+    if unusable := seen.masks.unusable:
+        more = f" {len(unusable) - 1} more masks cannot be used either." if len(unusable) > 1 else ""
+        refusals.append(f"{unusable[0].message}{more} {unusable[0].hint}")
+    empty = [item.source for item in seen.skipped if item.reason.startswith(EMPTY)]
+    if empty and not seen.masks.looks:
+        refusals.append(" ".join(nothing_kept(len(empty), empty[0])))
+    masked = len(seen.masks.looks or seen.masks.files)
+    if folder is None and 0 < masked < len(photos):
+        warnings.append(
+            f"Only {masked} of {len(photos)} photos have a mask, so that training goes without masks. Add the others', "
+            "or leave all out with `--no-masks`."
+        )
+    return warnings, refusals
+
+
+def masks_in_words(seen: Inspection) -> str:
+    """Which masks are used, and which could be."""
+    said = []
+    if seen.masks.looks:
+        said.append(tell_masks(seen.masks.looks))
+    elif seen.masks.unused is not None:
+        said.append(f"none are used; `--masks {shlex.quote(str(seen.masks.unused))}` would use those there")
+    aside = by_reason(item for item in seen.skipped if item.reason.startswith(ASIDE))
+    said += [f"Left out {name_some(files)}: {reason}" for reason, files in aside.items()]
+    return ". ".join(said)
 
 
 def facts(done: Preflight) -> list[tuple[str, str]]:
@@ -186,8 +290,18 @@ def facts(done: Preflight) -> list[tuple[str, str]]:
     if len(cameras) > NAMED:
         lines.append(("camera", f"and {len(cameras) - NAMED} more"))
     with_focal = sum(photo.has_focal for photo in seen.photos)
+    if done.reduced:
+        lines.append(
+            ("reduced", f"{done.reduced} of {len(seen.sizes)} to {done.max_side} pixels, by `ingest.max_side`")
+        )
+    profiles = Counter(photo.colours.name for photo in seen.photos if photo.colours.name).most_common()
+    lines += [("colours", f"{name} ({count} photos), converted to sRGB") for name, count in profiles[:NAMED]]
     estimated = "" if with_focal == len(seen.photos) else "; else it is estimated"
     lines.append(("focal length", f"in the EXIF of {with_focal} of {len(seen.photos)} photos{estimated}"))
+    if located := _located(seen):
+        lines.append(("GPS", f"a position in {located} of {len(seen.photos)} photos"))
+    companions = by_reason(item for item in seen.skipped if item.expected and not item.reason.startswith(ASIDE))
+    lines += [("set aside", f"{name_some(names)}: {reason}") for reason, names in companions.items()]
     if seen.plain:
         lines.append(("background", "plain: `--set ingest.auto_mask=plain` would cut the object out"))
     elif seen.plain_share >= MOSTLY_PLAIN:
@@ -199,6 +313,10 @@ def facts(done: Preflight) -> list[tuple[str, str]]:
                 "object out",
             )
         )
+    if said := masks_in_words(seen):
+        lines.append(("masks", said))
+    if done.kept:
+        lines.append(("workspace", done.kept))
     minutes = "not measured on a GPU" if needs.minutes is None else f"about {needs.minutes:.0f} min"
     lines.append(("needs", f"{minutes}, {needs.memory_gib:.1f} GiB of memory, {needs.disk_gb:.1f} GB of disk"))
     return lines

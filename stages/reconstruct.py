@@ -5,23 +5,32 @@ from __future__ import annotations
 import ctypes
 import logging
 import os
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+import shlex
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from configs.load import load_config
 from configs.params import Config
 from stages import artifacts
+from stages.caches import temporary_files
 from stages.capture.listing import is_video
+from stages.engine.fingerprint import SourceDigests
+from stages.engine.photos_since import READS_PHOTOS, PhotosSince, photos_since
 from stages.engine.run_log import log_to_file
-from stages.engine.runner import Listener, StageOutcome, run_pipeline
+from stages.engine.runner import Listener, StageOutcome, naming_command, run_pipeline
 from stages.engine.stage import Stage
 from stages.engine.workspace import Workspace
-from stages.errors import ConfigError, InputError, SystemRequirementError
+from stages.errors import ConfigError, InputError, SystemRequirementError, WorkspaceError
+from stages.kept import what_is_kept
+from stages.limits import available_cores
+from stages.posing.control_files import CONTROL
 from stages.posing.reading import locate_poses, masks_beside
-from stages.preflight import Preflight, in_short, preflight
+from stages.preflight import Preflight, in_short, masks_in_words, preflight
 from stages.request import Request
+from stages.whereabouts import default_workspace, find_source, holds_files, refuse_other_photos
 
 log = logging.getLogger(__name__)
 
@@ -64,18 +73,26 @@ def reconstruct(request: Request, pipeline: Sequence[Stage], listener: Listener 
     Raises:
         HineusError: a child by what the user can do.
     """
-    if request.workers is not None:
-        # Read when the heavy libraries load, which is inside the stages.
-        os.environ["OMP_NUM_THREADS"] = str(request.workers)
+    workers = request.workers or available_cores()
+    # Read when the heavy libraries load, which is inside the stages. They know nothing of a container's quota.
+    if request.workers is not None or workers < (os.cpu_count() or 1):
+        os.environ["OMP_NUM_THREADS"] = str(workers)
     workspace = Workspace.open(choose_folder(request), create=True)
-    sources = choose_sources(request, workspace)
+    digests = SourceDigests({"photos": choose_photos(request, workspace)}, workspace.digest_cache)
+    sources = choose_sources(request, workspace, digests)
     preset, config = choose_config(request, workspace)
     device = choose_device(request.device)
-    workers = request.workers or available_cores()
-    with workspace.lock(), log_to_file(workspace.log_path):
+    with workspace.lock(), log_to_file(workspace.log_path), temporary_files(workspace.root / ".work"):
+        digests.save()
+        _tell_sources(request, workspace, sources)
         photos = sources["photos"]
         if photos is not None and not workspace.stage_folder("ingest").exists():
-            _tell_preflight(preflight(photos, sources["masks"], workspace.root, config, device, workers, decode=False))
+            _tell_preflight(_preflight(sources, workspace.root, config, device, workers, decode=False))
+        elif photos is not None and photos.exists():
+            digests = SourceDigests({"photos": photos}, workspace.digest_cache)
+            if kept := what_is_kept(workspace, config, digests.files("photos") or {}, _forced(request, pipeline)):
+                log.info("%s", kept)
+            digests.save()
         log.debug("preset %s, device %s, %d workers, %s", preset, device, workers, sources)
         outcomes = run_pipeline(
             pipeline,
@@ -102,20 +119,59 @@ def check_photos(request: Request) -> Preflight:
     photos = request.photos
     assert photos is not None, "the command line demands it"
     config = load_config(request.preset or default_preset(), request.config, request.sets)
-    workers = request.workers or available_cores()
+    workers, folder = request.workers or available_cores(), choose_folder(request)
     device = choose_device(request.device)
-    return preflight(photos, request.masks, choose_folder(request), config, device, workers, decode=True)
+    poses = locate_poses(request.poses) if request.poses else None
+    masks = request.masks or _masks_of(poses, request.no_masks)
+    sources = {"photos": photos, "masks": masks, "poses": poses, CONTROL: request.control}
+    done = _preflight(sources, folder, config, device, workers, decode=True)
+    done = replace(done, refusals=(*done.refusals, *_workspace_refusals(request)))
+    if not (folder / "workspace.json").exists():
+        return done
+    workspace = Workspace.open(folder)
+    digests = SourceDigests({"photos": photos.resolve()}, workspace.digest_cache)
+    _, config = choose_config(request, workspace)
+    return replace(done, kept=what_is_kept(workspace, config, digests.files("photos") or {}))
+
+
+def _workspace_refusals(request: Request) -> list[str]:
+    """Why a run would not use the workspace."""
+    try:
+        workspace = Workspace.open(choose_folder(request), create=True)
+        digests = SourceDigests({"photos": choose_photos(request, workspace)}, workspace.digest_cache)
+        choose_sources(request, workspace, digests)
+    except WorkspaceError as error:
+        return [f"{error.message} {error.hint}"]
+    return []
+
+
+def _preflight(
+    sources: Mapping[str, Path | None], folder: Path, config: Config, device: str, workers: int, decode: bool
+) -> Preflight:
+    photos = sources["photos"]
+    assert photos is not None, "there is nothing to look at"
+    given = sources["poses"], sources[CONTROL]
+    return preflight(photos, sources["masks"], folder, config, device, workers, decode, *given)
 
 
 def _tell_preflight(done: Preflight) -> None:
     """In short. A no-go does not stop the run: estimates may be wrong, and the stages say what they need."""
     log.info("%s", in_short(done))
+    if done.inspection.masks.unused is not None:
+        log.info("masks: %s", masks_in_words(done.inspection))
     for line in (*done.refusals, *done.shortages, *done.warnings):
         log.warning("%s", line)
 
 
+def _forced(request: Request, pipeline: Sequence[Stage]) -> set[str]:
+    """Stages that run even if fresh."""
+    names = [stage.name for stage in pipeline]
+    first = names.index(request.from_stage) if request.from_stage in names else len(names)
+    return {*request.force, *names[first:]}
+
+
 def choose_folder(request: Request) -> Path:
-    """The workspace's folder: the one named, or one named after the photos, or here if here is one.
+    """The workspace's folder: the one named, or that of the photos, or here if here is one.
 
     Raises:
         ConfigError: nothing says which.
@@ -123,9 +179,8 @@ def choose_folder(request: Request) -> Path:
     if request.workspace is not None:
         return request.workspace
     if request.photos is not None:
-        photos = request.photos.resolve()
-        return Path.cwd() / f"{photos.stem if is_video(photos) else photos.name}_hineus"
-    if (Path.cwd() / "workspace.json").exists():
+        return default_workspace(request.photos).folder
+    if artifacts.is_workspace(Path.cwd()):
         return Path.cwd()
     raise ConfigError(
         "Neither a folder of photos nor a workspace is given.",
@@ -133,25 +188,22 @@ def choose_folder(request: Request) -> Path:
     )
 
 
-def choose_sources(request: Request, workspace: Workspace) -> dict[str, Path | None]:
-    """Photos, masks and poses: those given, else those the workspace was last run with.
-
-    Masks that the poses' format comes with are used, too.
+def choose_photos(request: Request, workspace: Workspace) -> Path:
+    """The photos given, else those the workspace was last run with, which may be gone: results stay without them.
 
     Raises:
-        InputError: there are none, a given one is no folder, or the workspace lies inside the photos.
+        InputError: there are none, those given are no folder, or the workspace lies inside the photos.
     """
-    known = workspace.record.sources
-    for name, given in (("photos", request.photos), ("masks", request.masks)):
-        if given is not None and not given.exists():
-            raise InputError(f"There is no {name} folder {given}.", "Check the path with `ls`.")
-        if given is not None and not given.is_dir() and not (name == "photos" and is_video(given)):
-            raise InputError(
-                f"{given} is a file; a folder of {name}{' or a video' if name == 'photos' else ''} is needed.",
-                f"Name the folder it is in: {given.absolute().parent}",
-            )
-    recorded = known.get("photos")
-    photos = request.photos.resolve() if request.photos else Path(recorded) if recorded else None
+    known = find_source(workspace, "photos")
+    given = request.photos.resolve() if request.photos else None
+    if given is not None and not (given.exists() or given == known):
+        raise InputError(f"There is no photos folder {request.photos}.", "Check the path with `ls`.")
+    if given is not None and given.is_file() and not is_video(given):
+        raise InputError(
+            f"{request.photos} is a file; a folder of photos or a video is needed.",
+            f"Name the folder it is in: {given.parent}",
+        )
+    photos = given or known
     if photos is None:
         raise InputError(
             f"The workspace {workspace.root} does not know its photos yet.",
@@ -162,24 +214,98 @@ def choose_sources(request: Request, workspace: Workspace) -> dict[str, Path | N
             f"The workspace {workspace.root} lies inside the photo folder {photos}, so it would be read as photos.",
             "Choose a folder outside with `--workspace DIR`.",
         )
+    return photos
+
+
+def choose_sources(request: Request, workspace: Workspace, digests: SourceDigests) -> dict[str, Path | None]:
+    """Photos (those of `digests`), masks, poses and control points: those given, else those of the last run.
+
+    Masks that the poses' format comes with are used, too.
+
+    Raises:
+        InputError: the masks, poses or control points that are given are not there.
+        WorkspaceError: the workspace was made of other photos.
+    """
+    photos = digests.sources["photos"]
+    assert photos is not None
+    if request.masks is not None and not request.masks.exists():
+        raise InputError(f"There is no masks folder {request.masks}.", "Check the path with `ls`.")
+    if request.masks is not None and not request.masks.is_dir():
+        raise InputError(
+            f"{request.masks} is a file; a folder of masks is needed.",
+            f"Name the folder it is in: {request.masks.absolute().parent}",
+        )
+    if request.control is not None and not request.control.exists():
+        raise InputError(f"There are no control points at {request.control}.", "Check the path with `ls`.")
+    since = _photos_since(workspace, digests)
+    if not request.other_photos:
+        refuse_other_photos(workspace, photos, since)
     masks = request.masks.resolve() if request.masks else None
     poses = locate_poses(request.poses).resolve() if request.poses else None
-    if str(photos) == recorded:
-        masks = masks or _remembered(known.get("masks"), request.no_masks)
-        poses = poses or _remembered(known.get("poses"), request.no_poses)
-    if masks is None and request.poses and poses is not None and not request.no_masks:
-        masks = masks_beside(poses)
-    return {"photos": photos, "masks": masks, "poses": poses}
+    control = request.control.resolve() if request.control else None
+    if str(photos) == workspace.record.sources.get("photos") or since.kind not in ("new", "other"):
+        masks = masks or (None if request.no_masks else find_source(workspace, "masks", photos))
+        poses = poses or (None if request.no_poses else find_source(workspace, "poses", photos))
+        control = control or (None if request.no_control else find_source(workspace, CONTROL, photos))
+    if masks is None and request.poses:
+        masks = _masks_of(poses, request.no_masks)
+    return {"photos": photos, "masks": masks, "poses": poses, CONTROL: control}
 
 
-def _remembered(path: str | None, forget: bool) -> Path | None:
-    return Path(path) if path and not forget else None
+def _photos_since(workspace: Workspace, digests: SourceDigests) -> PhotosSince:
+    """What has become of the workspace's photos. Those that are gone are no others."""
+    photos = digests.sources["photos"]
+    assert photos is not None
+    if not workspace.stage_folder(READS_PHOTOS).exists():
+        return PhotosSince("new")
+    if not holds_files(photos):
+        return PhotosSince("same")
+    return photos_since(workspace, photos, digests.files("photos") or {})
+
+
+def _tell_sources(request: Request, workspace: Workspace, sources: Mapping[str, Path | None]) -> None:
+    """Where the workspace is that was not named, and what has become of the last run's photos, masks and poses."""
+    if request.workspace is None and request.photos is not None and (why := default_workspace(request.photos).why):
+        log.info("workspace: %s (%s)", workspace.root, why)
+    given = {"photos": request.photos, "masks": request.masks, "poses": request.poses, CONTROL: request.control}
+    forgotten = {"masks": request.no_masks, "poses": request.no_poses, CONTROL: request.no_control}
+    for name, before in workspace.record.sources.items():
+        now = sources.get(name)
+        if before is None or forgotten.get(name) or (given.get(name) and name != "photos"):
+            continue
+        if now is None:
+            log.warning(
+                "the %s of the last run, %s, are not used: they were given for other photos. To use them for these, "
+                "too: `--%s %s`",
+                name,
+                before,
+                name,
+                shlex.quote(before),
+            )
+        elif not now.exists() or (name == "photos" and not holds_files(now)):
+            log.warning("%s", _gone(name, now, workspace.root))
+        elif str(now) != before:
+            log.info("%s: %s (those of the last run were %s)", name, now, before)
+
+
+def _gone(name: str, place: Path, root: Path) -> str:
+    """What can still be done when a source is no longer there, and the command for the rest."""
+    return (
+        f"The {name} are no longer at {place}. What was made from them is kept, and what does not read them still "
+        f"runs. When they are back, or to name their new place: `{naming_command(name, root)}`."
+    )
+
+
+def _masks_of(poses: Path | None, without: bool) -> Path | None:
+    """The folder of the masks that come with these poses."""
+    return masks_beside(poses) if poses is not None and not without else None
 
 
 def choose_config(request: Request, workspace: Workspace) -> tuple[str | None, Config]:
     """The preset's name and the settings.
 
-    A workspace goes on with the settings it was last run with, `--set` on top, until a preset or a file is named.
+    A workspace goes on with the settings it was last run with, `--set` on top, until a preset or a file is named;
+    a preset says nothing of its masks.
 
     Raises:
         ConfigError: see `load_config`.
@@ -187,7 +313,7 @@ def choose_config(request: Request, workspace: Workspace) -> tuple[str | None, C
     kept = request.preset is None and request.config is None and workspace.config_path.exists()
     if not kept:
         named = request.preset or default_preset()
-        return named, load_config(named, request.config, request.sets)
+        return named, load_config(named, request.config, [*_of_these_masks(request, workspace), *request.sets])
     preset = workspace.record.preset
     log.info("settings: those of the last run (preset %s); name a --preset to start anew", preset or "none")
     try:
@@ -198,6 +324,19 @@ def choose_config(request: Request, workspace: Workspace) -> tuple[str | None, C
         raise ConfigError(
             error.message, "These are the settings of the last run. Name a preset to start anew: `--preset cpu`."
         ) from error
+
+
+def _of_these_masks(request: Request, workspace: Workspace) -> list[str]:
+    """What the last run said of masks, where only a preset is new: a workspace remembers its masks, too."""
+    recorded = workspace.record.sources.get("photos")
+    same_photos = request.photos is None or str(request.photos.resolve()) == recorded
+    if not same_photos or request.masks or request.no_masks or request.config or not workspace.config_path.exists():
+        return []
+    try:
+        before = load_config(None, workspace.config_path).ingest
+    except ConfigError:  # of another version; the preset replaces it
+        return []
+    return [f"ingest.masks_keep={before.masks_keep}", f"ingest.own_masks={str(before.own_masks).lower()}"]
 
 
 def choose_device(name: str) -> str:
@@ -223,19 +362,12 @@ def default_preset() -> str:
 def has_cuda() -> bool:
     """Whether PyTorch can use a CUDA device; quick where there is no driver."""
     try:
-        ctypes.CDLL("libcuda.so.1")
+        ctypes.CDLL("nvcuda" if sys.platform == "win32" else "libcuda.so.1")
     except OSError:
         return False
     import torch
 
     return bool(torch.cuda.is_available())
-
-
-def available_cores() -> int:
-    """CPU cores this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def _existing(path: Path) -> Path | None:

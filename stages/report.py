@@ -52,7 +52,7 @@ def run(context: StageContext[ReportParams]) -> dict[str, Any]:
     """Write report.html. Returns its size in bytes, and how the final mesh meets held-out photos."""
     import jinja2
 
-    from stages.reporting import curves, numbers, photo_table, pictures, poses
+    from stages.reporting import control, curves, numbers, photo_table, pictures, poses
     from stages.reporting.held_out_photos import compare_held_out
 
     scene, place, atlas = context.read(SCENE), context.read(WORLD_PLACE), context.read(ATLAS_MESH)
@@ -88,6 +88,7 @@ def run(context: StageContext[ReportParams]) -> dict[str, Any]:
         "overview": overview_svg(scene, region_corners(scene, region)),
         "warnings": numbers.warnings(manifests),
         "where": numbers.describe_where(scene, place, placed),
+        "control": control.describe_control(place),
         "poses": poses.describe_poses(registration, place),
         "charts": curves.training_charts(context.read(METRICS)),
         "previews": pictures.training_previews(context.read(PREVIEWS)),
@@ -170,7 +171,7 @@ def replay(context: StageContext[ReportParams]) -> str:
 
 REPORT: Stage[ReportParams] = Stage(
     name="report",
-    version=7,
+    version=8,
     settings=lambda config: config.report,
     run=run,
     reads=(

@@ -15,9 +15,11 @@ class Request:
 
     Attributes:
         photos: folder of photos, or a video; a workspace that was run before knows its own.
-        workspace: folder; default `<photos' name>_hineus` here.
+        workspace: folder; default `<photos' name>_hineus` beside the photos.
+        other_photos: the workspace may be used although it was made of other photos; its results are replaced.
         masks: folder of masks; kept from the last run while the photos are the same, unless `no_masks`.
         poses: file or folder of known poses; kept like the masks, unless `no_poses`.
+        control: file or folder of ground control points; kept like the masks, unless `no_control`.
         preset, config, sets: layers of settings. With neither preset nor config, a workspace keeps its own.
         from_stage, until, force: see `run_pipeline`.
         device: "auto", "cpu" or "cuda".
@@ -26,10 +28,13 @@ class Request:
 
     photos: Path | None = None
     workspace: Path | None = None
+    other_photos: bool = False
     masks: Path | None = None
     no_masks: bool = False
     poses: Path | None = None
     no_poses: bool = False
+    control: Path | None = None
+    no_control: bool = False
     preset: str | None = None
     config: Path | None = None
     sets: Sequence[str] = ()

@@ -1,6 +1,7 @@
 """Sfm: upright images -> a COLMAP model (the largest component), with a reason for every photo left out.
 
-With poses that are known already they are taken as they are, and only points are found.
+With poses that are known already they are taken as they are, and only points are found. Where photos came or went since
+the last model, poses of the others stay (`stages.posing.adding`).
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ import shutil
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,28 +19,35 @@ import numpy as np
 
 from configs.params import SfmParams
 from stages.artifacts import (
+    FEATURES,
     GIVEN_POSES,
     IMAGE_SET,
+    LEFT_OUT,
     MODEL,
+    PHOTO_CONTENTS,
     PHOTOS,
     REGISTRATION,
     GivenPoses,
     ImageSet,
+    PhotoContents,
+    Pictures,
     Registration,
     Unregistered,
 )
 from stages.capture.salient import INSTALL, find_weights
+from stages.engine.fingerprint import digest, file_sha256
 from stages.engine.stage import Stage, StageContext
 from stages.errors import InputError, ReconstructionError
+from stages.posing.adding import STAYED, KnownPhotos, known_lenses, put_back, same_contents
 from stages.posing.adjustment import LastAdjustment, adjust_last
 from stages.posing.evidence import MIN_VERIFIED, Evidence
 from stages.posing.joining import view_distance
 from stages.posing.known import match_photos
-from stages.posing.ladder import Step, climb, describe, photos_wanted
+from stages.posing.ladder import Solution, Step, better, climb, describe, photos_wanted
 from stages.posing.reading import read_poses
 from stages.posing.triangulation import DATABASE, triangulate
 from stages.posing.turning import MIN_PARALLAX, Depth, from_one_place, judge_depth, refuse_one_place, relief, two_places
-from stages.posing.workbench import RELAXED, Workbench, learned_available
+from stages.posing.workbench import ADDED, RELAXED, Workbench, learned_available
 
 log = logging.getLogger(__name__)
 
@@ -69,6 +78,8 @@ def run(context: StageContext[SfmParams]) -> dict[str, Any]:
     _check_masks(image_set, params)
     names = [record.name for record in image_set.images]
     needed = _needed(len(names), params)
+    contents = _contents(photos, names)
+    known = _known_photos(context, contents, image_set)
 
     with _working(context) as work:
         bench = Workbench(
@@ -81,12 +92,15 @@ def run(context: StageContext[SfmParams]) -> dict[str, Any]:
             workers=context.workers,
             cuda=context.device == "cuda",
             progress=context.progress,
+            known=known,
         )
         wanted = photos_wanted(len(names), params.wanted)
-        best, steps = climb(bench.rungs(), wanted, max(needed, len(names) // 2))
+        best, steps = _solve(bench, wanted, max(needed, len(names) // 2), params)
         evidence = Evidence(bench.database())
         # of the same matches as at first, where nothing else was tried
         depth = bench.depth if len(steps) == 1 else judge_depth(bench.database())
+        if best is not None and not best.base.corners:
+            _keep_features(bench.database(best.base), context.to_write(FEATURES))
 
     if best is None:
         if bench.stands_still:
@@ -121,21 +135,125 @@ def run(context: StageContext[SfmParams]) -> dict[str, Any]:
         log.warning("poses were found with relaxed thresholds only: they are rough, and some may be wrong")
     if len(steps) > 1 and len(best.registered) < wanted and not learned_available():
         log.warning("`%s` adds a way to place photos of plain objects", FEATURES_EXTRA)
-    last = _adjusted(context, best.model, bench.threads)
+    kept = known if known is not None and steps[-1].rung == ADDED else None
+    last = _adjusted(context, best.model, bench.threads, kept)
     others = len(best.others)
+    lineage, since = _since(context, last.model, known)
     numbers = _publish(context, last, best.registered, unregistered, params.mapper, bench.matcher, others, steps)
+    _keep_contents(context, contents, lineage)
     warnings = [
         *_place_warnings(from_one_place(depth.parallaxes), len(names), last.model),
         *_flat_warnings(depth, last, bench),
     ]
-    return {**numbers, "warnings": warnings}
+    return {**numbers, **since, "warnings": warnings}
 
 
-def _adjusted(context: StageContext[SfmParams], model: Any, threads: int) -> LastAdjustment:
-    """The last adjustment of a model that was found, and what it freed and took in the log."""
+# ---------------------------------------------------------------- photos that came or went
+def _contents(photos: Pictures, names: Iterable[str]) -> dict[str, str]:
+    """Photo -> digest of its file and its mask's."""
+    files = {name: [photos.path(name), photos.mask_path(name)] for name in names}
+    return {name: digest([file_sha256(path) for path in paths if path.exists()]) for name, paths in files.items()}
+
+
+def _known_photos(
+    context: StageContext[SfmParams], contents: dict[str, str], image_set: ImageSet
+) -> KnownPhotos | None:
+    """The last publication's model as far as it is of these photos; None where poses are to be found from all."""
+    import pycolmap
+
+    before, folder = context.read_previous(PHOTO_CONTENTS), context.read_previous(FEATURES)
+    rigs = any(record.frame for record in image_set.images)  # whose frames a known model would have to keep
+    if before is None or folder is None or not folder.exists() or rigs:
+        return None
+    names = same_contents(before.contents, contents)
+    registration = context.read_previous(REGISTRATION)
+    known = KnownPhotos(
+        names=names,
+        new=tuple(name for name in contents if name not in names),
+        gone=tuple(sorted(before.contents.keys() - set(names.values()))),
+        model=pycolmap.Reconstruction(str(context.read_previous(MODEL))),
+        features=next(folder.iterdir()),
+        lenses=registration.lenses if registration else (),
+    )
+    if known.gone and any(item.reason == LEFT_OUT for item in image_set.skipped):
+        log.info("%s: poses are found anew, since photos that are left out must not have been seen", known.describe())
+        return None
+    if not known.enough:
+        log.info("%s, %d placed before: too few, poses are found anew", known.describe(), len(known.poses))
+        return None
+    log.info("%s: poses of the known stay, and the new are placed beside them", known.describe())
+    return known
+
+
+def _solve(bench: Workbench, wanted: int, enough: int, params: SfmParams) -> tuple[Solution | None, list[Step]]:
+    """The best solution and the attempts: beside the known photos, and where that does not do, from all."""
+    known = bench.known
+    if known is None:
+        return climb(bench.rungs(), wanted, enough)
+    connected = len(known.poses) + photos_wanted(len(known.new), params.wanted)
+    beside, steps = None, list[Step]()
+    try:
+        beside, steps = climb([bench.adding()], wanted, enough)
+    except (RuntimeError, ValueError) as error:  # COLMAP's checks
+        log.warning("the known poses are no start: %s", " ".join(str(error).split()))
+    placed = 0 if beside is None else len(beside.registered)
+    if beside is not None and (placed >= min(connected, wanted) or not known.changed):
+        return beside, steps
+    log.warning(
+        "beside the known photos %d of %d photos could be placed (%d wanted): poses are found anew from all",
+        placed, len(bench.names), min(connected, wanted),
+    )  # fmt: skip
+    anew, more = climb(bench.rungs(), wanted, enough)
+    if better(anew, beside):
+        return anew, steps + more
+    log.info("poses of the known photos stay, since no more photos were placed")
+    return beside, [replace(step, kept=False) for step in more] + steps
+
+
+def _since(
+    context: StageContext[SfmParams], model: Any, known: KnownPhotos | None
+) -> tuple[str | None, dict[str, Any]]:
+    """The lineage that the model goes on, if it does, and numbers of what was kept; the model is put where it was."""
+    before = context.read_previous(PHOTO_CONTENTS)
+    if known is None or before is None:
+        return None, {}
+    moved = put_back(known, model) if known.changed else 0.0
+    stayed = moved is not None and moved <= STAYED
+    if moved is not None:
+        log.info(
+            "known photos are %s: %.3g %% of the distance to what they see (median)",
+            "where they were" if stayed else "elsewhere",
+            100 * moved,
+        )
+    numbers: dict[str, Any] = {"known": len(known.names), "new": len(known.new), "gone": len(known.gone)}
+    numbers |= {"poses_stayed": stayed, "moved_percent": None if moved is None else round(100 * moved, 4)}
+    return before.lineage if stayed else None, numbers
+
+
+def _keep_features(database: Path, folder: Path) -> None:
+    folder.mkdir()
+    shutil.copyfile(database, folder / database.name)
+
+
+def _keep_contents(context: StageContext[SfmParams], contents: dict[str, str], lineage: str | None) -> None:
+    """Write what the published model was made of; without a lineage to go on, it begins one."""
+    own = [file_sha256(path) for path in sorted(context.to_write(MODEL).iterdir())]
+    context.write(PHOTO_CONTENTS, PhotoContents(lineage=lineage or digest(own), contents=contents))
+
+
+def _adjusted(context: StageContext[SfmParams], model: Any, threads: int, known: KnownPhotos | None) -> LastAdjustment:
+    """The last adjustment of a model that was found, and what it freed and took in the log.
+
+    Args:
+        known: photos that it goes on from.
+    """
+    if known is not None and not known.changed:
+        registration = context.read_previous(REGISTRATION)
+        assert registration is not None
+        return LastAdjustment(model, registration.lenses, registration.pose_error)
     context.progress(1, 1, "the last adjustment")
     start = time.process_time()
-    last = adjust_last(model, context.params, threads)
+    last = adjust_last(model, context.params, threads, None if known is None else known_lenses(known, model))
     freed = [f"{' and '.join(lens.freed)} of {lens.photos} photos" for lens in last.lenses if lens.freed]
     log.info("last adjustment: freed %s (%.1f CPU s)", "; ".join(freed) or "nothing", time.process_time() - start)
     return last
@@ -199,9 +317,13 @@ def _publish(
         others: models that mapping gave beside this one.
         steps: the attempts; none where the poses were given.
     """
+    import pycolmap
+
     model, folder = adjusted.model, context.to_write(MODEL)
     folder.mkdir(parents=True)
     model.write(str(folder))
+    # the photos in the order of their ids, whatever the order in which they were placed
+    pycolmap.Reconstruction(str(folder)).write(str(folder))
     points = model.num_points3D()
     registration = Registration(
         registered=tuple(sorted(registered)),
@@ -267,9 +389,12 @@ def _from_known_poses(context: StageContext[SfmParams]) -> dict[str, Any]:
             progress=context.progress,
         )
     _check_given_places(model, work / DATABASE)
+    contents = _contents(context.read(PHOTOS), [record.name for record in image_set.images])
     context.write(GIVEN_POSES, GivenPoses(origin=poses.origin.name, region=poses.region))
     given = LastAdjustment(model, lenses=(), pose_error=None)
+    lineage = _lineage_of_given(context, model, contents)
     numbers = _publish(context, given, cameras, unregistered, "known poses", matcher)
+    _keep_contents(context, contents, lineage)
     points, error = numbers["points"], numbers["mean_reprojection_error_px"]
     if points < FEW_POINTS * len(cameras):
         log.warning(
@@ -291,6 +416,21 @@ def _check_given_places(model: Any, database: Path) -> None:
     centers = np.array([image.projection_center() for image in model.images.values()])
     if not model.num_points3D() or np.ptp(centers, axis=0).max() < MIN_PARALLAX * view_distance(model):
         refuse_one_place(judge_depth(database))
+
+
+def _lineage_of_given(context: StageContext[SfmParams], model: Any, contents: dict[str, str]) -> str | None:
+    """The lineage of the last publication, where given poses are those given then, as far as both have the photos."""
+    import pycolmap
+
+    before = context.read_previous(PHOTO_CONTENTS)
+    if before is None or context.read_previous(GIVEN_POSES) is None:
+        return None
+    then = pycolmap.Reconstruction(str(context.read_previous(MODEL)))
+    poses = {image.name: image.cam_from_world().matrix() for image in then.images.values()}
+    names = same_contents(before.contents, contents)
+    images = [image for image in model.images.values() if names.get(image.name) in poses]
+    same = all(np.allclose(image.cam_from_world().matrix(), poses[names[image.name]]) for image in images)
+    return before.lineage if images and same else None
 
 
 def _check_masks(image_set: ImageSet, params: SfmParams) -> None:
@@ -402,11 +542,12 @@ def _too_few(
 
 SFM: Stage[SfmParams] = Stage(
     name="sfm",
-    version=7,
+    version=8,
     settings=lambda config: config.sfm,
     run=run,
     reads=(PHOTOS, IMAGE_SET),
-    writes=(MODEL, REGISTRATION, GIVEN_POSES),
+    writes=(MODEL, REGISTRATION, GIVEN_POSES, PHOTO_CONTENTS, FEATURES),
     sources=("poses",),
+    continues=True,
     summary="find the camera poses, or take known ones",
 )

@@ -1,4 +1,7 @@
-"""train: posed images -> neural signed distance field. Resumes from its last checkpoint after a kill."""
+"""train: posed images -> neural signed distance field. Resumes from its last checkpoint after a kill.
+
+Where few photos came or went since the last training, it goes on from what that has learned (docs/adr/0013).
+"""
 
 from __future__ import annotations
 
@@ -7,8 +10,9 @@ import logging
 import os
 import shutil
 import time
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import takewhile
 from pathlib import Path
 from typing import IO, Any, NamedTuple
 
@@ -32,6 +36,12 @@ METRIC_GRADIENTS = (0.8, 1.2)  # mean lengths of grad f within which f passes fo
 # Part of the budget after which the region is looked at: the shape is there, and little of the time is lost.
 LOOK_AT = 0.2
 SETTLED = 500  # steps between looks at that
+# A training goes on from the last one where no more than this part of its photos came and went.
+MAX_CHANGED = 0.25
+# Part of the budget that counts as spent then: where the networks fit as they are, and where only the shape does, whose
+# region is another one: the numbers are in docs/adr/0013.
+KEPT_NETWORKS, KEPT_SHAPE = 0.7, LOOK_AT
+SAME_FRAME = 1e-6  # of the region's radius
 
 
 def run(context: StageContext[TrainParams]) -> dict[str, Any]:
@@ -67,8 +77,9 @@ def run(context: StageContext[TrainParams]) -> dict[str, Any]:
     seconds = training.seconds
     return {
         "steps": trainer.step_index,
+        **({"kept_of_budget": training.head_start} if training.head_start else {}),
         "train_seconds": round(seconds, 1),
-        "rays_per_second": round(trainer.step_index * params.sampling.rays / max(seconds, 1e-9)),
+        "rays_per_second": round(training.steps_done * params.sampling.rays / max(seconds, 1e-9)),
         "photos": len(trainer.photos),
         "sightings": len(trainer.sightings.weights),
         "region_grown": round(training.region.radius if training.region else 1.0, 3),
@@ -94,6 +105,7 @@ class _Training:
 
     Attributes:
         region: the scene's, where it has grown. looked: no more to be asked whether it should.
+        head_start: part of the budget that counts as spent, since what another training learned was there.
         spent: seconds before this process, or this scene.
         started: clock at its start.
     """
@@ -103,27 +115,53 @@ class _Training:
     trainer: Any
     region: _Region | None = None
     looked: bool = False
+    head_start: float = 0.0
     spent: float = 0.0
     started: float = field(default_factory=time.monotonic)
 
     @classmethod
     def begun(cls, context: StageContext[TrainParams]) -> _Training:
-        """From the checkpoint where there is one, in the region that it is of; else from the first shape."""
+        """From the checkpoint where there is one, in the region that it is of; else from what was learned before."""
         scene, saved = context.read(FIRST_SCENE), _checkpoint(context)
         if saved is None:
-            training = cls(context, scene, _make_trainer(context, scene), looked=not scene.growable)
+            training = cls._fresh(context, scene)
             training.metrics.unlink(missing_ok=True)
         else:
             region = _Region(*saved["region"]) if saved["region"] else None
             scene = region.of(scene) if region else scene
             trainer = _make_trainer(context, scene)
-            training = cls(context, scene, trainer, region, saved["looked"], saved["seconds"])
+            training = cls(context, scene, trainer, region, saved["looked"], saved["head_start"], saved["seconds"])
             trainer.load_state(saved["trainer"])
             _cut_after(training.metrics, trainer.step_index)
             log.info("training goes on from step %d", trainer.step_index)
-        if training.trainer.step_index == 0:
-            _start_from_shape(training.trainer, scene.cameras)
         training.started = time.monotonic()
+        return training
+
+    @classmethod
+    def _fresh(cls, context: StageContext[TrainParams], scene: PosedScene) -> _Training:
+        """At the first step: from the last training of this capture where it helps, else from the first shape."""
+        from stages.neural.trained_field import load_field
+
+        before = _last_scene(context, scene)
+        if before is None:
+            training = cls(context, scene, _make_trainer(context, scene), looked=not scene.growable)
+            _start_from_shape(training.trainer, scene.cameras)
+            return training
+        region = _kept_region(scene, before)
+        kept = region.of(scene) if region else scene
+        trainer = _make_trainer(context, kept)
+        if _same_frame(kept, before) and _take_over(trainer, context, kept.contents, before.contents):
+            training = cls(context, kept, trainer, region, looked=True, head_start=KEPT_NETWORKS)
+        else:
+            trainer = _make_trainer(context, scene) if region else trainer
+            earlier = load_field(_previous_field(context), context.device)
+            error = trainer.start_from(_shape_within(earlier.sdf, scene.poses_from_scene, before.poses_from_scene))
+            log.info("the SDF starts from the shape learned before, met to %.4f on average", error)
+            training = cls(context, scene, trainer, looked=not scene.growable, head_start=KEPT_SHAPE)
+        trainer.step_index = training.first_step
+        log.info(
+            "training goes on from what was learned before: %.0f %% of the budget is kept", 100 * training.head_start
+        )
         return training
 
     def where_nothing_is_cut(self) -> _Training:
@@ -136,13 +174,13 @@ class _Training:
         if region is None:
             return self
         scene = region.of(self.scene)
-        shape = _shape_within(self.trainer, scene.poses_from_scene, self.scene.poses_from_scene)
+        shape = _shape_within(self.trainer.distances, scene.poses_from_scene, self.scene.poses_from_scene)
         steps, self.trainer = self.trainer.step_index, None  # its photos would be in memory twice
         trainer = _make_trainer(self.context, scene)
         error = trainer.start_from(shape)
         log.info("the SDF starts from the shape learned so far, met to %.4f on average", error)
         trainer.step_index = steps
-        training = _Training(self.context, scene, trainer, region, True, self.seconds)
+        training = _Training(self.context, scene, trainer, region, True, self.head_start, self.seconds)
         training.save()
         return training
 
@@ -152,7 +190,7 @@ class _Training:
 
         partial = self.checkpoint.with_suffix(".partial")
         state = {"trainer": self.trainer.state(), "region": self.region and tuple(self.region), "looked": self.looked}
-        torch.save({**state, "seconds": self.seconds}, partial)
+        torch.save({**state, "head_start": self.head_start, "seconds": self.seconds}, partial)
         os.replace(partial, self.checkpoint)
 
     @property
@@ -168,10 +206,22 @@ class _Training:
         return self.spent + time.monotonic() - self.started
 
     @property
+    def first_step(self) -> int:
+        """Steps that count as taken before the first one here."""
+        params = self.context.params
+        return 0 if params.minutes else round(self.head_start * params.steps)
+
+    @property
+    def steps_done(self) -> int:
+        return int(self.trainer.step_index) - self.first_step
+
+    @property
     def progress(self) -> float:
         """Part of the budget that is spent, from 0 to 1: of the minutes where they are set, else of the steps."""
         params = self.context.params
-        return self.seconds / (60 * params.minutes) if params.minutes else self.trainer.step_index / params.steps
+        if params.minutes:
+            return self.head_start + self.seconds / (60 * params.minutes)
+        return float(self.trainer.step_index / params.steps)
 
     def advance(self, until: float) -> None:
         """Train to this part of the budget; checkpoints, previews and metric lines on the way."""
@@ -225,7 +275,9 @@ def _grown(training: _Training) -> _Region | None:
     return _Region((x, y, z), float(radius))
 
 
-def _shape_within(trainer: Any, poses_from_new: Similarity, poses_from_old: Similarity) -> np.ndarray:
+def _shape_within(
+    sdf: Callable[[np.ndarray], np.ndarray], poses_from_new: Similarity, poses_from_old: Similarity
+) -> np.ndarray:
     """Signed distances [G, G, G] of a trained SDF in the frame of another region; beyond its own, to its border."""
     from stages.geometry.hull import cube
 
@@ -234,9 +286,75 @@ def _shape_within(trainer: Any, poses_from_new: Similarity, poses_from_old: Simi
     lengths = np.linalg.norm(places, axis=-1)
     beyond = np.maximum(lengths - 1, 0.0)
     within = places / np.maximum(lengths, 1.0)[..., None]
-    distances: np.ndarray = trainer.distances(within.reshape(-1, 3)).reshape(lengths.shape)
+    distances: np.ndarray = sdf(within.reshape(-1, 3)).reshape(lengths.shape)
     shape: np.ndarray = ((distances + beyond) / old_from_new.scale).astype(np.float32)
     return shape
+
+
+# ---------------------------------------------------------------- photos that came or went
+def _last_scene(context: StageContext[TrainParams], scene: PosedScene) -> PosedScene | None:
+    """The scene of the last training, where this one goes on from that; and if not, why, in the log."""
+    before = context.read_previous(SCENE)
+    if before is None:
+        return None
+    if not scene.lineage or before.lineage != scene.lineage:
+        log.info("training starts anew: the poses, or the settings that made the scene, are others than before")
+        return None
+    now, then = set(scene.contents), set(before.contents)
+    changed = len(now - then) + len(then - now)
+    if context.params.hold_out:
+        log.info("training starts anew: photos that are held out now may have been seen before")
+        return None
+    if not little_changed(changed, len(then)):
+        log.info("training starts anew: %d of %d photos are new or gone", changed, len(now | then))
+        return None
+    return before
+
+
+def little_changed(changed: int, before: int) -> bool:
+    """Whether so few photos came and went, of those that were trained on, that training goes on."""
+    return changed <= MAX_CHANGED * before
+
+
+def _kept_region(scene: PosedScene, before: PosedScene) -> _Region | None:
+    """The region of the last training, where it had grown out of the first region of this scene."""
+    if not scene.growable or before.growable:
+        return None
+    first_from_grown = scene.poses_from_scene.inverse().compose(before.poses_from_scene)
+    turned = float(np.abs(first_from_grown.rotation - np.eye(3)).max()) > SAME_FRAME
+    if turned or first_from_grown.scale <= 1:
+        return None
+    x, y, z = first_from_grown.translation.tolist()
+    return _Region((x, y, z), first_from_grown.scale)
+
+
+def _same_frame(scene: PosedScene, before: PosedScene) -> bool:
+    moved = scene.poses_from_scene.inverse().compose(before.poses_from_scene).matrix() - np.eye(4)
+    return float(np.abs(moved).max()) < SAME_FRAME
+
+
+def _take_over(trainer: Any, context: StageContext[TrainParams], now: Sequence[str], then: Sequence[str]) -> bool:
+    """Set the networks to those of the last training, photos' own parameters by contents; False where shapes differ."""
+    from stages.neural.trained_field import load_field
+
+    fields = trainer.fields
+    earlier = load_field(_previous_field(context), context.device).fields
+    if replace(earlier.shape, num_images=0) != replace(fields.shape, num_images=0):
+        return False
+    weights = earlier.state_dict()
+    row = {contents: i for i, contents in enumerate(then)}
+    gains = fields.log_gains.detach().clone()
+    for i, contents in enumerate(now):
+        if contents in row:
+            gains[i] = weights["log_gains"][row[contents]]
+    fields.load_state_dict({**weights, "log_gains": gains})
+    return True
+
+
+def _previous_field(context: StageContext[TrainParams]) -> Path:
+    path = context.read_previous(FIELD)
+    assert path is not None  # `_last_scene`
+    return path
 
 
 def _use_threads(context: StageContext[TrainParams]) -> None:
@@ -345,7 +463,8 @@ def _cut_after(metrics: Path, step: int) -> None:
     """Leave out the metric lines after a step: they will be written again."""
     lines = metrics.read_text(encoding="utf-8").splitlines() if metrics.exists() else []
     # The lines up to the checkpoint were flushed before it was written; a kill may have cut a later one in half.
-    metrics.write_text("".join(f"{line}\n" for line in lines[: step // LOG_EVERY]), encoding="utf-8")
+    known = takewhile(lambda line: line.endswith("}") and json.loads(line)["step"] <= step, lines)
+    metrics.write_text("".join(f"{line}\n" for line in known), encoding="utf-8")
 
 
 def _preview(trainer: Any, folder: Path, progress: float) -> None:
@@ -368,10 +487,11 @@ def _last_numbers(metrics: Path) -> dict[str, float]:
 
 TRAIN: Stage[TrainParams] = Stage(
     name="train",
-    version=5,
+    version=6,
     settings=lambda config: config.train,
     run=run,
     reads=(FIRST_SCENE, PINHOLE_PHOTOS),
     writes=(FIELD, CAMERAS, SCENE, METRICS, PREVIEWS, HELD_OUT),
+    continues=True,
     summary="learn a signed distance field and its colours from the posed images",
 )

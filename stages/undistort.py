@@ -22,20 +22,24 @@ from stages.artifacts import (
     GIVEN_REGION,
     IMAGE_SET,
     MODEL,
+    PHOTO_CONTENTS,
     PHOTOS,
     PINHOLE_PHOTOS,
     SILHOUETTES,
     KnownSphere,
     write_png,
 )
+from stages.engine.fingerprint import digest
+from stages.engine.manifest import jsonable
 from stages.engine.stage import Stage, StageContext
 from stages.errors import ConfigError, ReconstructionError
 from stages.geometry.cameras import PinholeCameras, PosedScene
 from stages.geometry.layout import Layout, find_layout
-from stages.geometry.normalisation import into_frame, scene_frame
+from stages.geometry.normalisation import into_frame, scene_frame, still_fits
 from stages.geometry.place import GivenRegion
 from stages.geometry.region import RegionOfInterest
 from stages.geometry.silhouettes import MIN_SHARE, agreeing, silhouette_agreement
+from stages.geometry.similarity import Similarity
 from stages.geometry.subjects import Subject, find_subjects
 from stages.posing.undistortion import (
     plan_warp,
@@ -78,7 +82,8 @@ def run(context: StageContext[UndistortParams]) -> dict[str, Any]:
         about, warnings = _chosen(subjects, [photo.name for photo in photos], context.params.subject)
     region, ground, up = _find_layout(cameras, points, observations, masks, stated, about)
     region = _set(region, given, context.params.roi_scale)
-    poses_from_scene = scene_frame(region.center, region.radius, up.direction)
+    lineage = _lineage(context, given)
+    poses_from_scene, kept = _frame(context, lineage, scene_frame(region.center, region.radius, up.direction))
     # A region that somebody chose, or made smaller, stays as it is; and masks are believed.
     growable = found and context.params.roi_scale >= 1 and all(mask is None for mask in masks)
     scene = PosedScene(
@@ -92,6 +97,8 @@ def run(context: StageContext[UndistortParams]) -> dict[str, Any]:
         ground=ground and ground.within(poses_from_scene),
         growable=growable,
         roi_scale=context.params.roi_scale,
+        contents=tuple(context.read(PHOTO_CONTENTS).contents[photo.name] for photo in photos),
+        lineage=lineage,
     )
     context.write(FIRST_SCENE, scene)
     context.progress(len(photos) + 1, len(photos) + 1, "done")
@@ -110,6 +117,7 @@ def run(context: StageContext[UndistortParams]) -> dict[str, Any]:
         "points": len(points),
         "points_inside": int(inside.sum()),
         "camera_distance": round(float(np.median(np.linalg.norm(scene.cameras.centers, axis=1))), 3),
+        **({} if kept is None else {"region_kept": kept}),
         "warnings": warnings,
     }
 
@@ -216,10 +224,9 @@ def _chosen(
             sentence = (
                 f"Only what {len(taken.photos)} photos are about is reconstructed ({_named(names, taken)}). "
                 f"{len(other.photos)} others ({_named(names, other)}) are about something {away:.0f} times its "
-                "radius away."
+                "radius away. Its model takes the place of this one: work in a copy of the workspace to keep both."
             )
             command = f"hineus run --workspace WORKSPACE --set undistort.subject={k}"
-            log.warning("%s Its model: `%s`, in a copy of the workspace to keep both.", sentence, command)
             warnings.append({"sentence": sentence, "command": command})
     return taken.photos, warnings
 
@@ -257,12 +264,36 @@ def _set(region: RegionOfInterest, given: GivenRegion | None, scale: float) -> R
     return RegionOfInterest(given.center, given.radius, region.kind, source)
 
 
+# ---------------------------------------------------------------- photos that came or went
+def _lineage(context: StageContext[UndistortParams], given: GivenRegion | None) -> str:
+    """The poses' lineage, with all that makes a scene of them."""
+    region = None if given is None else [given.center.tolist(), given.radius, jsonable(given.box)]
+    poses = context.read(PHOTO_CONTENTS).lineage
+    return digest([poses, UNDISTORT.version, context.params.model_dump(mode="json"), region])
+
+
+def _frame(context: StageContext[UndistortParams], lineage: str, found: Similarity) -> tuple[Similarity, bool | None]:
+    """poses_from_scene: that of the last scene where it still fits what was `found` now; and whether it does.
+
+    None where there is no last scene of these poses.
+    """
+    before = context.read_previous(FIRST_SCENE)
+    if before is None or before.lineage != lineage:
+        return found, None
+    if still_fits(before.poses_from_scene, found):
+        log.info("the region stays as it was")
+        return before.poses_from_scene, True
+    log.info("the region is found anew: that of before does not fit the photos any more")
+    return found, False
+
+
 UNDISTORT: Stage[UndistortParams] = Stage(
     name="undistort",
-    version=9,
+    version=10,
     settings=lambda config: config.undistort,
     run=run,
-    reads=(PHOTOS, IMAGE_SET, MODEL, GIVEN_POSES, GIVEN_REGION),
+    reads=(PHOTOS, IMAGE_SET, MODEL, PHOTO_CONTENTS, GIVEN_POSES, GIVEN_REGION),
     writes=(PINHOLE_PHOTOS, SILHOUETTES, FIRST_SCENE),
+    continues=True,
     summary="make pinhole images and find the region of interest",
 )

@@ -83,18 +83,23 @@ def write_capture(
     folder = artifacts.MODEL.load(sfm)
     folder.mkdir(parents=True)
     model.write(str(folder))
+    contents = {record.name: record.sha256 for record in records}
+    artifacts.PHOTO_CONTENTS.save(sfm, artifacts.PhotoContents(lineage="first", contents=contents))
     return {"ingest": ingest, "sfm": sfm}
 
 
-def undistort(inputs: dict[str, Path], root: Path, **params: object) -> tuple[PosedScene, Path, dict[str, object]]:
-    """Place and undistort; settings of either. Scene, folder and numbers of both."""
+def undistort(
+    inputs: dict[str, Path], root: Path, previous: Path | None = None, **params: object
+) -> tuple[PosedScene, Path, dict[str, object]]:
+    """Place and undistort, after a `previous` run; settings of either. Scene, folder and numbers of both."""
     out, place = root / "undistort", root / "place"
     for folder in (out, place):
         folder.mkdir()
     placing = PlaceParams(**{key: params[key] for key in params if key in PlaceParams.model_fields})  # type: ignore[arg-type]
     rest = UndistortParams(**{key: params[key] for key in params if key not in PlaceParams.model_fields})  # type: ignore[arg-type]
     placed = PLACE.run(StageContext(inputs, {}, place, root, placing))
-    numbers = UNDISTORT.run(StageContext({**inputs, "place": place}, {}, out, root, rest, workers=2))
+    context = StageContext({**inputs, "place": place}, {}, out, root, rest, workers=2, previous=previous)
+    numbers = UNDISTORT.run(context)
     return (
         artifacts.FIRST_SCENE.load(out),
         out,

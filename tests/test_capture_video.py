@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 from pathlib import Path
+from typing import ClassVar
 
 import cv2
 import numpy as np
@@ -12,9 +13,10 @@ import pytest
 from configs.params import IngestParams
 from stages import artifacts
 from stages.capture.photo_reading import UnusableError
-from stages.capture.video import LOST, Look, choose_frames, extract_frames, motion, video_size
+from stages.capture.video import LOST, Look, _look, choose_frames, extract_frames, motion, video_size
 from stages.engine.stage import StageContext
 from stages.ingest import INGEST
+from stages.inputs.formats import Kind
 
 FPS, SIZE = 30, (160, 120)
 
@@ -127,3 +129,75 @@ def test_a_portrait_video_of_a_phone_is_read_upright(tmp_path: Path):
     assert video_size(video) == (30, SIZE[1], SIZE[0])
     frame = cv2.imread(str(extract_frames(video, tmp_path / "frames", 1)[0]))
     assert frame.shape == (SIZE[0], SIZE[1], 3)
+
+
+def test_frames_are_looked_at_by_their_time_whatever_rate_the_file_notes(tmp_path: Path, monkeypatch):
+    """As MediaRecorder's WebM (1000 frames a second, no count), phones of varying rates, streams without time."""
+    video = write_video(tmp_path / "clip.mp4", [5.0 * i for i in range(90)])
+    opened = cv2.VideoCapture
+
+    class Stamped:
+        """A capture whose file notes nonsense, and whose frames have the stamps of `stamps`."""
+
+        stamps: ClassVar[list[float]] = []
+
+        def __init__(self, *arguments: object) -> None:
+            self.capture, self.frame = opened(*arguments), -1
+
+        def grab(self) -> bool:
+            self.frame += 1
+            return self.capture.grab()
+
+        def get(self, key: int) -> float:
+            if key == cv2.CAP_PROP_POS_MSEC:
+                return self.stamps[self.frame]
+            return {cv2.CAP_PROP_FPS: 1000.0, cv2.CAP_PROP_FRAME_COUNT: -9.2e18}.get(key) or self.capture.get(key)
+
+        def __getattr__(self, name: str) -> object:
+            return getattr(self.capture, name)
+
+    monkeypatch.setattr(cv2, "VideoCapture", Stamped)
+    even = [1000 * i / 30 for i in range(90)]
+    halting = [1000 * i / 60 if i < 45 else 750 + 1000 * (i - 45) / 15 for i in range(90)]
+    for stamps, expected in ((even, 30), (halting, 7 + 23), ([0.0] * 90, 30)):
+        Stamped.stamps = stamps
+        assert abs(len(list(_look(video, lambda part: None))) - expected) <= 1
+    assert video_size(video) == (90, *SIZE)
+
+
+@pytest.mark.parametrize("text", [
+    "#EXTM3U\n#EXT-X-TARGETDURATION:1\n#EXTINF:1,\n{secret}\n#EXT-X-ENDLIST\n",
+    "ffconcat version 1.0\nfile {secret}\n",
+])  # fmt: skip
+def test_a_list_of_other_files_is_no_video(tmp_path: Path, text: str):
+    secret = write_video(tmp_path / "secret.mp4", [5.0 * i for i in range(30)])
+    for name in ("clip.mp4", "clip.m3u8"):
+        (tmp_path / name).write_text(text.format(secret=secret.name))
+        with pytest.raises(UnusableError, match="cannot be read as a video"):
+            extract_frames(tmp_path / name, tmp_path / "frames", 5)
+
+
+def test_ffmpeg_itself_may_read_only_this_file(tmp_path: Path, monkeypatch):
+    """Where a file is made to look like a video to us and like a playlist to FFmpeg."""
+    secret = write_video(tmp_path / "secret.mp4", [5.0 * i for i in range(30)])
+    (tmp_path / "clip.mp4").write_text(f"ffconcat version 1.0\nfile {secret.name}\n")
+    monkeypatch.setattr("stages.capture.video.kind_of", lambda file: Kind.VIDEO)
+    with pytest.raises(UnusableError):
+        extract_frames(tmp_path / "clip.mp4", tmp_path / "frames", 5)
+
+
+@pytest.mark.parametrize("name", ["clip", "clip.jpg", "CLIP.MOV", "%03d.mp4", "http:x.mp4", "f\udcfcr.mp4", "-i.mp4"])
+def test_videos_are_told_by_their_content(tmp_path: Path, name: str):
+    write_video(tmp_path / "clip.mp4", [5.0 * i for i in range(60)]).rename(tmp_path / name)
+    photos, out = tmp_path / "photos", tmp_path / "out"
+    for folder in (photos, out):
+        folder.mkdir()
+    (tmp_path / name).rename(photos / name)
+    context = StageContext({}, {"photos": photos}, out, tmp_path / "scratch", IngestParams(video_frames=5))
+    assert INGEST.run(context)["images"] == 5
+
+
+def test_case_13(cases_dir: Path, tmp_path: Path):
+    video = cases_dir / "13-mediarecorder-webm" / "capture.webm"
+    assert video_size(video) == (144, 480, 360)
+    assert len(extract_frames(video, tmp_path / "frames", 80)) == 24

@@ -19,7 +19,7 @@ DOCS = ROOT / "docs"
 # Public functions beside the equations that are none.
 NO_EQUATIONS = {"uniform_points", "has_feature_mlp"}
 PAGES = sorted([*ROOT.glob("*.md"), *DOCS.rglob("*.md")])
-GUIDES = [ROOT / "README.md", *(DOCS / name for name in ("tutorial.md", "howto.md", "what-to-expect.md"))]
+GUIDES = [ROOT / "README.md", *(DOCS / name for name in ("tutorial.md", "install.md", "howto.md", "what-to-expect.md"))]
 MEASURED = [*sorted((DOCS / "benchmarks").glob("*.md")), DOCS / "what-to-expect.md"]
 
 

@@ -578,3 +578,91 @@ def test_many_reasons_are_counted() -> None:
     assert StageStatus("sfm", "stale", ("a", "b", "c")).reason == "a; b; c"
     assert StageStatus("sfm", "stale", ("a", "b", "c", "d", "e")).reason == "a; b; c; and 2 more"
     assert StageStatus("sfm", "fresh").reason == "nothing changed"
+
+
+def test_a_warning_s_command_names_this_workspace(tmp_path: Path, caplog) -> None:
+    def warning(context: StageContext) -> dict[str, Any]:
+        numbers = TOY[1].run(context)
+        return {**numbers, "warnings": [{"sentence": "A cut.", "command": "hineus run --workspace WORKSPACE --x"}]}
+
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    workspace = Workspace.open(tmp_path / "my work", create=True)
+    run_pipeline(with_stage("sfm", run=warning), workspace, Config(), {"photos": photos, "masks": None})
+    assert f"A cut. Try: `hineus run --workspace '{tmp_path}/my work' --x`" in caplog.text
+    made = workspace.published("sfm")
+    assert made is not None
+    assert made.numbers["warnings"][0]["command"] == "hineus run --workspace WORKSPACE --x"
+
+
+# ---------------------------------------------------------------- going on from the last publication
+def _longer(context: StageContext) -> dict[str, Any]:
+    """Adds a letter to what was published before, after a try that fails."""
+    before = context.read_previous(POSES)
+    tried = context.scratch / "tried"
+    if (os.environ.get("TOY_FAIL"), tried.exists()) == ("once", False):
+        tried.write_text("")
+        raise ValueError("bad luck")
+    (context.out / "model").mkdir()
+    context.write(POSES, "first " if before is None else before + "x")
+    return {"tried": tried.exists()}
+
+
+GROWING = with_stage("sfm", run=_longer, continues=True)
+
+
+def _poses(bench: Bench) -> str:
+    return POSES.load(bench.root / "sfm")
+
+
+def test_a_stage_goes_on_from_its_last_publication_and_says_so_in_its_manifest(bench: Bench) -> None:
+    bench.run(GROWING)
+    first = load_manifest(bench.root / "sfm")
+    assert first is not None
+    assert first.identity.previous is None
+    assert "previous" not in first.identity.parts
+    (bench.photos / "IMG_3.jpg").write_text("date")
+    assert bench.ran(GROWING)["sfm"] == "input ingest/letters.txt changed"
+    assert _poses(bench) == "first x"
+    second = load_manifest(bench.root / "sfm")
+    assert second is not None
+    assert second.identity.previous == first.digest
+    assert second.identity.fingerprint != replace(second.identity, previous=None).fingerprint
+    assert bench.ran(GROWING) == {}
+    assert bench.states()["sfm"] == "fresh: nothing changed"
+
+
+@pytest.mark.parametrize("why", ["forced", "settings", "version", "damage", "a flipped bit", "not declared"])
+def test_a_stage_starts_anew_where_its_last_publication_is_no_ground(bench: Bench, why: str) -> None:
+    bench.run(GROWING)
+    (bench.photos / "IMG_3.jpg").write_text("date")
+    pipeline, options = GROWING, {}
+    if why == "forced":
+        options = {"force": ("sfm",)}
+    elif why == "settings":
+        options = {"sets": ("sfm.max_features=200",)}
+    elif why == "version":
+        pipeline = with_stage("sfm", run=_longer, continues=True, version=2)
+    elif why == "damage":
+        (bench.root / "sfm" / "model" / "poses.txt").unlink()
+    elif why == "a flipped bit":
+        (bench.root / "sfm" / "model" / "poses.txt").write_text("fIrst ")
+    else:
+        pipeline = with_stage("sfm", run=_longer)
+    assert "sfm" in bench.ran(pipeline, **options)  # type: ignore[arg-type]
+    assert _poses(bench) == "first "
+    manifest = load_manifest(bench.root / "sfm")
+    assert manifest is not None
+    assert manifest.identity.previous is None
+
+
+def test_a_stage_that_went_on_resumes_after_a_failure(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    bench.run(GROWING)
+    (bench.photos / "IMG_3.jpg").write_text("date")
+    monkeypatch.setenv("TOY_FAIL", "once")
+    with pytest.raises(ValueError, match="bad luck"):
+        bench.run(GROWING)
+    assert _poses(bench) == "first "  # what it goes on from is still there
+    outcomes = {outcome.name: outcome for outcome in bench.run(GROWING)}
+    assert outcomes["sfm"].numbers == {"tried": True}
+    assert _poses(bench) == "first x"

@@ -278,6 +278,24 @@ def test_the_glb_says_its_units_and_where_on_earth_it_is(tmp_path):
     assert len(trimesh.load(context.out / "model.ply", process=False).faces) == 4
 
 
+def test_where_on_earth_it_lies_is_beside_the_files(tmp_path):
+    context = workspace(tmp_path)
+    EXPORT.run(context)
+    beside = {name: context.out / name for name in (artifacts.GEOREFERENCE, artifacts.METADATA)}
+    assert not any(file.exists() for file in beside.values())
+    place = Place(Similarity.identity(), True, "GPS", 0.01, (47.0, 8.5, 400.0), 1.2)
+    artifacts.WORLD_PLACE.save(context.inputs["place"], place)
+    EXPORT.run(context)
+    said = json.loads(beside[artifacts.GEOREFERENCE].read_text())
+    assert said["origin"] == {"latitude_deg": 47.0, "longitude_deg": 8.5, "altitude_m": 400.0}
+    assert "<SRS>ENU:47.000000000,8.500000000</SRS>" in beside[artifacts.METADATA].read_text()
+    assert all(artifacts.ASSET.covers(name) for name in beside)
+    in_grid = replace(place, origin=None, crs="EPSG:32632", offset=(465000.0, 5200000.0, 400.0))
+    artifacts.WORLD_PLACE.save(context.inputs["place"], in_grid)
+    assert extras_of(context)["world_crs"] == "EPSG:32632"
+    assert json.loads(beside[artifacts.GEOREFERENCE].read_text())["offset"] == [465000.0, 5200000.0, 400.0]
+
+
 def extras_of(context: StageContext) -> dict:
     EXPORT.run(context)
     data = artifacts.asset_path(context.out, "glb").read_bytes()

@@ -9,8 +9,9 @@ from hypothesis import strategies as st
 from rigs import UP, capture, ring
 
 from stages.geometry.cameras import PosedScene
+from stages.geometry.earth import EARTH_RADIUS, FLATTENING, east_north_up
 from stages.geometry.normalisation import into_frame, rotation_onto, scene_frame
-from stages.geometry.place import EARTH_RADIUS, FLATTENING, Place, east_north_up, given_region
+from stages.geometry.place import Place, given_region
 from stages.geometry.plane import Plane, fit_plane
 from stages.geometry.region import meeting_point
 from stages.geometry.similarity import Similarity, align_points

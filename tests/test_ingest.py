@@ -6,8 +6,10 @@ import shutil
 import struct
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
+import psutil
 import pytest
 from PIL import Image
 
@@ -15,10 +17,11 @@ from configs.params import IngestParams
 from stages import artifacts
 from stages.artifacts import ImageSet
 from stages.capture.exif import DIAGONAL_35MM
-from stages.capture.photo_reading import read_head, register_formats
+from stages.capture.photo_reading import UnusableError, read_head
 from stages.engine.stage import StageContext
 from stages.errors import InputError
 from stages.ingest import INGEST
+from stages.inputs.formats import register_formats
 
 SIZE = (96, 72)
 
@@ -66,6 +69,7 @@ def exif_of(
         tags[0xA20E], tags[0xA210] = pitch
     if taken_width:
         tags[0xA002] = taken_width
+    exif[0x8769] = dict(tags)  # without that, Pillow writes none to TIFF
     return exif
 
 
@@ -111,16 +115,7 @@ def test_a_second_run_gives_the_same_records(photos: Path):
 def test_exif_orientation_is_applied_and_gone(photos: Path, orientation: int):
     write_photos(photos, 3)
     upright = picture(7)
-    undo = {
-        2: Image.Transpose.FLIP_LEFT_RIGHT,
-        3: Image.Transpose.ROTATE_180,
-        4: Image.Transpose.FLIP_TOP_BOTTOM,
-        5: Image.Transpose.TRANSPOSE,
-        6: Image.Transpose.ROTATE_90,
-        7: Image.Transpose.TRANSVERSE,
-        8: Image.Transpose.ROTATE_270,
-    }[orientation]
-    upright.transpose(undo).save(photos / "turned.jpg", quality=97, exif=exif_of(orientation))
+    upright.transpose(UNDONE[orientation]).save(photos / "turned.jpg", quality=97, exif=exif_of(orientation))
     image_set, out, _ = ingest(photos)
     record = image_set.images[-1]
     assert record.name == "turned.jpg"
@@ -129,6 +124,55 @@ def test_exif_orientation_is_applied_and_gone(photos: Path, orientation: int):
         assert written.getexif().get(0x0112, 1) == 1
         difference = np.abs(np.asarray(written, dtype=int) - np.asarray(upright, dtype=int))
     assert difference.mean() < 4  # JPEG twice; a wrong turn differs by about 60
+
+
+UNDONE = {
+    1: None,
+    2: Image.Transpose.FLIP_LEFT_RIGHT,
+    3: Image.Transpose.ROTATE_180,
+    4: Image.Transpose.FLIP_TOP_BOTTOM,
+    5: Image.Transpose.TRANSPOSE,
+    6: Image.Transpose.ROTATE_90,
+    7: Image.Transpose.TRANSVERSE,
+    8: Image.Transpose.ROTATE_270,
+}
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".tif", ".png", ".webp"])
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_photos_are_upright_for_every_reader(photos: Path, suffix: str, orientation: int):
+    """Pillow, OpenCV with and without regard to EXIF, and COLMAP see one picture; its record and masks fit it."""
+    import cv2
+    import pycolmap
+
+    upright, undo = picture(7), UNDONE[orientation]
+    stored = upright if undo is None else upright.transpose(undo)
+    exif = exif_of(orientation, focal_mm=8.0, pitch=(20.0 * 25.4, 2), taken_width=stored.width, model="A")
+    for i in range(3):  # one camera, so that nothing is left out
+        stored.point(lambda value, i=i: max(0, value - i)).save(photos / f"{i}{suffix}", quality=97, exif=exif)
+    masks = write_masks(photos.parent / "masks", ["0.x", "1.x", "2.x"])
+    images, out, _ = ingest(photos, masks)
+    record = images.images[0]
+    assert (record.width, record.height) == SIZE
+    assert record.focal_px == pytest.approx(160)
+    assert read_head(photos / f"0{suffix}", "0", 3200).width == SIZE[0]
+    path = artifacts.Pictures(out).path(record.name)
+    with Image.open(path) as written:
+        seen = [np.asarray(written.convert("RGB"))]
+    seen += [cv2.imread(str(path), flags)[:, :, ::-1] for flags in (1, 1 | cv2.IMREAD_IGNORE_ORIENTATION)]
+    seen.append(pycolmap.Bitmap.read(str(path), True).to_array())
+    for pixels in seen:
+        assert np.abs(pixels.astype(int) - np.asarray(upright)).mean() < 5
+    np.testing.assert_array_equal(artifacts.Pictures(out).mask(record.name), half_mask())
+
+
+@pytest.mark.parametrize(("folder", "count"), [("photos", 8), ("photos_180", 16)])
+def test_case_07(cases_dir: Path, tmp_path: Path, folder: str, count: int):
+    (tmp_path / "photos").symlink_to(cases_dir / "07-tiff-orientation" / folder)
+    images, _, numbers = ingest(tmp_path / "photos")
+    assert numbers["images"] == count
+    assert {(record.width, record.height) for record in images.images} == {(480, 360)}
+    assert {Path(record.name).suffix for record in images.images} == {".png"}
 
 
 def test_formats_colmap_cannot_read_are_encoded_anew(photos: Path):
@@ -233,7 +277,7 @@ def test_raw_files_are_developed_alike_and_upright(photos: Path):
     records = {record.source: record for record in image_set.images}
     assert (records["dark.dng"].width, records["dark.dng"].height) == (96, 128)
     assert records["bright.dng"].camera.startswith("Test Camera")
-    head = read_head(photos / "dark.dng", "dark.dng")  # undeveloped
+    head = read_head(photos / "dark.dng", "dark.dng", 3200)  # undeveloped
     assert (head.width, head.height, head.camera) == (96, 128, records["dark.dng"].camera)
     means = [np.asarray(Image.open(artifacts.Pictures(out).path(f"{name}.png"))).mean() for name in ("bright", "dark")]
     assert means[0] / means[1] == pytest.approx(2 ** (1 / 2.222), rel=0.1)  # one stop apart: no automatic brightness
@@ -271,6 +315,40 @@ def test_large_photos_are_reduced_and_the_focal_prior_with_them(photos: Path):
     record = image_set.images[0]
     assert (record.width, record.height) == (100, 75)
     assert record.focal_px == pytest.approx(50 / DIAGONAL_35MM * 125)
+
+
+def available(monkeypatch: pytest.MonkeyPatch, megabytes: float) -> None:
+    monkeypatch.setattr(psutil, "virtual_memory", lambda: SimpleNamespace(available=megabytes * 1e6))
+
+
+@pytest.mark.slow
+def test_a_photo_of_108_megapixels_is_reduced_while_it_is_decoded(photos: Path, monkeypatch, recwarn):
+    write_photos(photos, 2)
+    picture(7, (12000, 9000)).save(photos / "z.jpg", quality=30, exif=exif_of(focal_35mm=24))
+    available(monkeypatch, 300)  # decoded whole it would take four times as much
+    images, _, _ = ingest(photos)
+    record = images.images[-1]
+    assert (record.width, record.height) == (3200, 2400)
+    assert record.focal_px == pytest.approx(24 / DIAGONAL_35MM * 4000)
+    assert not [warning for warning in recwarn if "Decompression" in str(warning.category)]
+
+
+def test_the_limit_is_the_memory_that_is_free(photos: Path, monkeypatch):
+    write_photos(photos)
+    Image.new("L", (10000, 8000)).save(photos / "z.png")  # 80 megapixels, and next to nothing as a file
+    available(monkeypatch, 700)
+    images, _, _ = ingest(photos)
+    assert reasons(images)["z.png"] == "10000 x 8000 pixels take 1.2 GiB of memory to read, 0.7 are free"
+    with pytest.raises(UnusableError, match=r"1\.2 GiB of memory"):
+        read_head(photos / "z.png", "z.png", 3200)
+
+
+def test_case_05(cases_dir: Path, tmp_path: Path):
+    (tmp_path / "photos").symlink_to(cases_dir / "05-200mp" / "photos")
+    images, _, _ = ingest(tmp_path / "photos")
+    assert not images.skipped
+    sizes = {record.source: (record.width, record.height) for record in images.images}
+    assert sizes["A_200mp.jpg"] == (3200, 2400)
 
 
 # ---------------------------------------------------------------- focal prior and cameras
@@ -354,7 +432,8 @@ def test_unusable_files_are_named_and_counted(photos: Path):
     image_set, _, numbers = ingest(photos)
     why = reasons(image_set)
     assert [record.name for record in image_set.images] == names
-    assert numbers["skipped"] == len(why) == 6
+    assert len(why) == 6
+    assert (numbers["skipped"], numbers["companions"]) == (5, 1)
     assert "truncated" in why["cut.jpg"]
     assert why["text.jpg"].startswith("no image, whatever its name says")
     assert why["notes.txt"] == "not an image (.txt)"

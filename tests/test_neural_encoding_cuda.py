@@ -223,5 +223,7 @@ def test_without_triton_the_reference_goes_on_and_it_is_said_once(monkeypatch, c
 def test_the_kernels_are_taken_on_cuda_and_agree(features):
     kernels = kernels_for(RANDOM.cuda(), grid_of(features))
     assert kernels is not None
-    for grid in (grid_of(features), HashGrid(12, features, 19, 16, 2048)):
-        assert disagreement(kernels, grid, "cuda", 10_000) < encodings.AGREEMENT
+    assert disagreement(kernels, grid_of(features), "cuda", 10_000) < encodings.AGREEMENT
+    finest = 2048  # where a position in cells is rounded to so much, and which way is the compiler's choice
+    rounding = finest * torch.finfo(torch.float32).eps
+    assert disagreement(kernels, HashGrid(12, features, 19, 16, finest), "cuda", 10_000) < rounding

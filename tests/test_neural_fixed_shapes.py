@@ -165,3 +165,43 @@ def test_a_refresh_near_the_surface_takes_a_fixed_part_of_the_grid(like_cuda):
     renewed = cache.values == 9
     assert kept[renewed].abs().max() <= kept[~renewed].abs().min()
     assert kept[renewed].abs().max() > 2 * cache.cell
+
+
+def test_a_graph_reads_what_changes_from_tensors():
+    """As CUDA replays it: the scale and the sightings' weight come as tensors, and the step is the same."""
+    plain, replayed = make_trainer(), make_trainer()
+    replayed.replay = lambda step, kind: step()
+    for progress in (0.0, 0.2, 0.5):
+        expected, got = plain.step(progress), replayed.step(progress)
+        torch.testing.assert_close(got["loss"], expected["loss"], rtol=1e-4, atol=1e-6)
+    assert replayed._scale.item() == pytest.approx(plain.moment(0.5).scale)
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+def test_a_step_on_cuda_is_replayed_and_learns_the_same():
+    replayed, plain = make_trainer(device="cuda"), make_trainer(device="cuda")
+    plain.replay = None
+    losses = {}
+    for name, trainer in (("replayed", replayed), ("plain", plain)):
+        losses[name] = torch.tensor([trainer.step(0.3 + step / 1000)["loss"].item() for step in range(12)])
+    assert replayed.replay.recording.graph is not None
+    assert len(losses["replayed"].unique()) == 12  # each step draws anew
+    torch.testing.assert_close(losses["replayed"], losses["plain"], rtol=1e-2, atol=1e-4)
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+def test_a_checkpoint_of_the_cpu_goes_on_on_cuda():
+    started, going_on = make_trainer(), make_trainer(device="cuda")
+    for _ in range(2):
+        started.step(0.1)
+    state = started.state()
+    state["generator"] = going_on.generator.get_state()  # that of a CPU means nothing to a GPU
+    going_on.load_state(state)
+    before = going_on.fields.sdf.table.detach().clone()
+    for _ in range(6):
+        numbers = going_on.step(0.2)
+    assert torch.isfinite(numbers["loss"])
+    assert not torch.equal(going_on.fields.sdf.table, before)
+    assert all(isinstance(group["lr"], torch.Tensor) for group in going_on.optimizer.param_groups)

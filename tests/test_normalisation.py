@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from rigs import EAST, NORTH, capture, look_at, ring, scene_without_points
 
 from stages.geometry.cameras import PinholeCameras
-from stages.geometry.normalisation import into_frame, regrown, rotation_onto, scene_frame
+from stages.geometry.normalisation import into_frame, regrown, rotation_onto, scene_frame, still_fits
 from stages.geometry.region import (
     ATTENDED_MARGIN,
     SEEN_WHOLE_MARGIN,
@@ -283,3 +283,23 @@ def test_scene_frame_turns_up_to_z_and_the_sphere_to_the_unit_sphere():
     with pytest.raises(ValueError, match="got radius 0"):
         scene_frame(TARGET, 0.0, UP)
     assert isinstance(frame, Similarity)
+
+
+@pytest.mark.parametrize(
+    ("center", "radius", "tilt_deg", "fits"),
+    [
+        ((0.0, 0.0, 0.0), 1.0, 0.0, True),
+        ((0.05, 0.0, 0.0), 1.0, 3.0, True),
+        ((0.0, 0.0, 0.0), 0.85, 0.0, True),
+        ((0.2, 0.0, 0.0), 1.0, 0.0, False),  # what is new sticks out
+        ((0.0, 0.0, 0.0), 1.2, 0.0, False),
+        ((0.0, 0.0, 0.0), 0.7, 0.0, False),  # cells would be wasted
+        ((0.0, 0.0, 0.0), 1.0, 8.0, False),
+    ],
+)
+def test_a_region_stays_while_it_holds_the_one_found_anew(center, radius, tilt_deg, fits):
+    before = scene_frame(np.array([3.0, -1.0, 2.0]), 2.5, NORTH)
+    tilt = np.radians(tilt_deg)
+    up = before.rotation @ np.array([np.sin(tilt), 0.0, np.cos(tilt)])
+    found = scene_frame(before.apply(np.array(center)), 2.5 * radius, up)
+    assert still_fits(before, found) is fits

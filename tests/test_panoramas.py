@@ -65,7 +65,7 @@ def test_two_circles_on_black_are_no_sphere(tmp_path: Path, sphere: np.ndarray):
     Image.fromarray(fisheyes()).save(tmp_path / "R0010.jpg")
     spheres, others = find_spheres({"R0010.jpg": tmp_path / "R0010.jpg"}, "auto")
     assert spheres == {}
-    assert "dual-fisheye" in others["R0010.jpg"]
+    assert "two fisheye lenses" in others["R0010.jpg"]
     assert "equirectangular" in others["R0010.jpg"]
 
 

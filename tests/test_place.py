@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from rigs import UP, capture, flight, look_at, ring
 
+from stages.geometry.earth import east_north_up, from_east_north_up, middle_position
 from stages.geometry.normalisation import into_frame, rotation_onto
-from stages.geometry.place import Place, east_north_up, given_region, locate
+from stages.geometry.place import Place, given_region, locate
 from stages.geometry.similarity import Similarity
 from stages.geometry.up import angle_deg
 from stages.posing.markers import detect_markers, measure_markers
@@ -187,3 +188,77 @@ def test_a_region_given_in_metres_is_brought_into_the_frame_of_the_poses():
     np.testing.assert_allclose(corners.min(0), [10, 20, 30])
     np.testing.assert_allclose(corners.max(0), [12, 22, 34])
     np.testing.assert_allclose(np.linalg.norm(box.box_corners() - box.center, axis=1), box.radius / 1.05)
+
+
+# ---------------------------------------------------------------- the globe
+@pytest.mark.parametrize(
+    "home",
+    [
+        (-16.8, 180.0, 5.0),
+        (-16.8, -180.0, 5.0),
+        (90.0, 0.0, 2800.0),
+        (-89.9999, 77.0, 2800.0),
+        (31.5, 35.5, -430.0),
+    ],
+)
+def test_a_flight_anywhere_on_the_globe(home: tuple[float, float, float]):
+    import pycolmap
+
+    cameras, _ = flight()
+    transform = pycolmap.GPSTransform(pycolmap.GPSTransformEllipsoid.WGS84)
+    positions = np.asarray(transform.enu_to_ellipsoid(cameras.centers, *home))
+    found = locate(model_of(cameras).centers, positions)
+    assert found.used >= len(cameras) - 2
+    assert found.residual < 1e-4
+    assert found.world_from_poses.scale == pytest.approx(TRUE.scale, rel=1e-6)
+    assert angle_deg(found.up, TRUE.rotation[2]) < 0.01
+    truth = east_north_up(positions, found.origin)
+    np.testing.assert_allclose(found.world_from_poses.apply(model_of(cameras).centers), truth, atol=0.01)
+    assert abs(abs(found.origin[1]) - 180) < 0.01 or abs(home[1]) < 179
+
+
+@pytest.mark.parametrize("origin", [HOME, (0.0, 180.0, 0.0), (89.99, -120.0, 3000.0), (-90.0, 0.0, -10.0)])
+def test_there_and_back(origin: tuple[float, float, float]):
+    metres = np.random.default_rng(3).uniform(-5000, 5000, (30, 3))
+    np.testing.assert_allclose(east_north_up(from_east_north_up(metres, origin), origin), metres, atol=1e-6)
+
+
+def test_less_than_half_of_the_positions_may_be_anywhere():
+    positions = np.tile((10.0, 179.9999, 7.0), (5, 1))
+    positions[:2] = (0.1, 0.1, 9000.0)
+    positions[2, 1] = -179.9999
+    latitude, longitude, altitude = middle_position(positions)
+    assert latitude == pytest.approx(10, abs=0.01)
+    assert longitude % 360 == pytest.approx(180, abs=0.01)
+    assert altitude == 7
+
+
+def test_one_photo_a_thousand_kilometres_away_changes_nothing():
+    cameras, _ = flight()
+    positions = gps_of(cameras.centers, 0.5)
+    positions[3, 0] += 9
+    found = locate(model_of(cameras).centers, positions)
+    assert found.world_from_poses.scale == pytest.approx(TRUE.scale, rel=0.01)
+    assert found.origin[:2] == pytest.approx(HOME[:2], abs=0.01)
+
+
+@pytest.mark.parametrize("places", [1, 3])
+def test_photos_of_one_place_tell_nothing(places: int):
+    cameras, _ = flight()
+    positions = gps_of(cameras.centers)[np.arange(len(cameras)) % places]
+    with pytest.raises(ValueError, match=f"only {places} different positions, 4 are needed"):
+        locate(model_of(cameras).centers, positions)
+
+
+def test_a_far_origin_on_earth_moves_and_stays_on_earth():
+    place = Place(TRUE, True, "GPS", origin=HOME)
+    far = np.array([40e3, -30e3, 200.0])
+    moved = place.near(far, 5.0)
+    inside = far + np.array([[0.0, 0, 0], [3, 2, 1]])
+    poses = TRUE.inverse().apply(inside)
+    np.testing.assert_allclose(
+        from_east_north_up(moved.world_from_poses.apply(poses), moved.origin),
+        from_east_north_up(inside, HOME),
+        atol=1e-8,
+    )
+    assert np.abs(moved.world_from_poses.apply(poses)).max() < 5

@@ -5,18 +5,21 @@ from __future__ import annotations
 import json
 import os
 import pickle
-from collections.abc import Callable
+import unicodedata
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from configs.params import IngestParams
 from stages import artifacts
 from stages.engine.stage import StageContext
 from stages.errors import InputError
 from stages.ingest import INGEST
+from stages.inputs.folders import readable, short_name
 from stages.posing.known import KnownCamera, KnownPoses, match_photos
 from stages.posing.reading import locate_poses, masks_beside, read_poses
 
@@ -128,6 +131,59 @@ def test_colmap_model(tmp_path: Path, text: bool):
     assert_reprojects(read_poses(tmp_path), opencv, [f"{name}.jpg" for name in NAMES])
 
 
+def text_model(folder: Path, names: Sequence[str], encoding: str = "utf-8", newline: str = "\n") -> Path:
+    """As COLMAP writes it: the second line of an image has its points, or nothing."""
+    folder.mkdir(parents=True, exist_ok=True)
+    camera = f"# cameras\n1 OPENCV {WIDTH} {HEIGHT} {' '.join(map(str, OPENCV))}\n"
+    lines = ["# images, two lines each"]
+    for i, name in enumerate(names):
+        pose = cam_from_world(i)
+        x, y, z, w = Rotation.from_matrix(pose[:, :3]).as_quat()
+        lines += [" ".join(map(str, (i + 1, w, x, y, z, *pose[:, 3], 1, name))), "" if i % 2 else "5.5 6.5 -1 1 2 3"]
+    for file, text in (("cameras", camera), ("images", "\n".join(lines) + "\n"), ("points3D", "# none\n")):
+        data = text.replace("\n", newline).encode(encoding, "surrogateescape")
+        (folder / f"{file}.txt").write_bytes(data)
+    return folder
+
+
+@pytest.mark.parametrize(("encoding", "newline"), [
+    ("utf-8", "\n"), ("utf-8-sig", "\n"), ("utf-8-sig", "\r\n"), ("utf-16", "\r\n"),
+])  # fmt: skip
+def test_names_in_colmap_s_text_reach_to_the_end_of_the_line(tmp_path: Path, encoding: str, newline: str):
+    names = ["DSC 00 (2).jpg", "DSC 01 (2).jpg", "a/b  c.jpg", "back\\slash, 'x'.jpg"][: len(NAMES)]
+    assert_reprojects(read_poses(text_model(tmp_path, names, encoding, newline)), opencv, names)
+
+
+@pytest.mark.parametrize("photo", [
+    "Käse 1.jpg", unicodedata.normalize("NFD", "Käse 1.jpg"), " x.jpg", "back\\slash.jpg", "ü" * 120 + ".jpg",
+    os.fsdecode(b"f\xfcr.jpg"), "new\nline.jpg",
+])  # fmt: skip
+def test_photos_of_any_name_find_their_poses_in_any_spelling(tmp_path: Path, photo: str):
+    spellings = {readable(photo), short_name(readable(photo)), unicodedata.normalize("NFD", readable(photo))}
+    for spelling in spellings | ({photo} if "\n" not in photo else set()):
+        poses = read_poses(text_model(tmp_path, [spelling]))
+        assert set(match_photos(poses, [readable(photo)])) == {readable(photo)}
+
+
+def test_case_08(cases_dir: Path):
+    poses = read_poses(cases_dir / "08-colmap-names-with-spaces" / "sparse")
+    photos = sorted(path.name for path in (cases_dir / "08-colmap-names-with-spaces" / "photos").iterdir())
+    assert set(match_photos(poses, photos)) == set(photos)
+    assert len(photos) == 24
+
+
+def test_a_text_model_that_lacks_something_is_named(tmp_path: Path):
+    text_model(tmp_path, NAMES)
+    lines = (tmp_path / "images.txt").read_text().split("\n")
+    for damaged in (lines[1].rsplit(" ", 2)[0], lines[1].replace(" 1 ", " 7 ")):
+        (tmp_path / "images.txt").write_text("\n".join([damaged, *lines[2:]]))
+        with pytest.raises(InputError, match=r"The COLMAP model .* cannot be read"):
+            read_poses(tmp_path)
+    (tmp_path / "cameras.txt").write_text(f"1 OPENCV {WIDTH} {HEIGHT} 1 2\n")
+    with pytest.raises(InputError, match=r"The COLMAP model .* cannot be read"):
+        read_poses(tmp_path)
+
+
 def test_a_damaged_model_is_named(tmp_path: Path):
     (tmp_path / "cameras.bin").write_bytes(b"\x01")
     with pytest.raises(InputError, match="cannot be read"):
@@ -156,6 +212,13 @@ def test_nerfstudio_with_shared_intrinsics(tmp_path: Path):
     poses = read_poses(tmp_path)
     assert_reprojects(poses, opencv, IMAGES)
     assert poses.region is None
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
+def test_transforms_of_any_editor(tmp_path: Path, encoding: str):
+    file = write_transforms(tmp_path, OPENCV_KEYS | SIZE, IMAGES)
+    file.write_bytes(file.read_text().replace("\n", "\r\n").encode(encoding))
+    assert_reprojects(read_poses(file), opencv, IMAGES)
 
 
 def test_intrinsics_of_frames_and_frames_in_any_order(tmp_path: Path):

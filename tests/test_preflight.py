@@ -9,7 +9,6 @@ from types import SimpleNamespace
 
 import cv2
 import numpy as np
-import psutil
 import pytest
 from PIL import Image, ImageFile, ImageFilter
 from typer.testing import CliRunner, Result
@@ -18,8 +17,10 @@ from configs.load import load_config
 from hineus_cli.app import app
 from stages import preflight as module
 from stages import reconstruct
+from stages.capture.colour import ADOBE_RGB, matrix_profile
 from stages.capture.inspection import Inspection, Video, inspect
 from stages.capture.photo_reading import read_head
+from stages.errors import InputError
 from stages.preflight import GIB, estimate, preflight
 
 SIZE = (320, 240)
@@ -48,7 +49,7 @@ def photos(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def room(monkeypatch: pytest.MonkeyPatch, memory_gib: float, disk_gb: float) -> None:
-    monkeypatch.setattr(psutil, "virtual_memory", lambda: SimpleNamespace(available=memory_gib * GIB))
+    monkeypatch.setattr(module, "available_memory", lambda: memory_gib * GIB)
     monkeypatch.setattr(module.shutil, "disk_usage", lambda path: SimpleNamespace(free=disk_gb * 1e9))
 
 
@@ -57,7 +58,7 @@ def check(*arguments: str) -> Result:
 
 
 def look(folder: Path) -> Inspection:
-    return inspect(folder, None, video_frames=80, workers=2, decode=True)
+    return inspect(folder, None, video_frames=80, max_side=3200, workers=2, decode=True)
 
 
 # ---------------------------------------------------------------- what is noticed
@@ -90,11 +91,11 @@ def test_exif_and_size_are_those_of_the_upright_photo(photos: Path):
     exif.get_ifd(0x8769)[0xA405] = 28
     large = picture(40).resize((2400, 1800))  # large enough to be decoded smaller
     large.save(photos / "z.jpg", exif=exif)
-    seen = read_head(photos / "z.jpg", "z.jpg")
+    seen = read_head(photos / "z.jpg", "z.jpg", 3200)
     assert (seen.width, seen.height) == (1800, 2400)
     assert seen.camera == "Phone | 28 mm equivalent | 1800 x 2400"
     assert seen.has_focal
-    assert not read_head(photos / "00.jpg", "00.jpg").has_focal
+    assert not read_head(photos / "00.jpg", "00.jpg", 3200).has_focal
 
 
 def test_damaged_files_are_told_with_the_reason_and_other_files_are_no_warning(photos: Path, capfd):
@@ -106,9 +107,10 @@ def test_damaged_files_are_told_with_the_reason_and_other_files_are_no_warning(p
     data = json.loads(result.stdout)
     assert data["verdict"] == "go with warnings"
     assert {item["source"] for item in data["left_out"]} == {"bad.jpg", "empty.png", "torn.mp4", "notes.txt"}
-    assert len(data["warnings"]) == 2
-    assert data["warnings"][0].startswith("Left out bad.jpg, empty.png: no image")
-    assert data["warnings"][1].startswith("Left out torn.mp4: cannot be read as a video")
+    assert len(data["warnings"]) == 3
+    assert data["warnings"][0].startswith("Left out bad.jpg: no image")
+    assert data["warnings"][1] == "Left out empty.png: no image, whatever its name says (empty)."
+    assert data["warnings"][2].startswith("Left out torn.mp4: cannot be read as a video")
     assert "VIDEOIO" not in capfd.readouterr().err
 
 
@@ -128,6 +130,22 @@ def test_a_plain_background_is_noticed(tmp_path: Path):
         cloth.paste(picture(i).resize((120, 120)), (100, 60))
         cloth.save(tmp_path / f"{i}.png")
     assert look(tmp_path).plain
+
+
+def test_what_is_done_to_files_is_said_beforehand(photos: Path):
+    wide = matrix_profile("Adobe RGB", ADOBE_RGB, lambda values: values**2.2)
+    picture(50).save(photos / "wide.jpg", icc_profile=wide)
+    picture(51).save(photos / "broken.jpg", icc_profile=b"nothing")
+    picture(52).resize((4000, 3000)).save(photos / "large.jpg")
+    picture(53).save(photos / "IMG_1.THM", format="JPEG")
+    said = dict(module.facts(preflight(photos, None, photos.parent, load_config("cpu"), "cpu", 2, decode=False)))
+    assert said["reduced"] == "1 of 27 to 3200 pixels, by `ingest.max_side`"
+    assert said["colours"] == "Adobe RGB (1 photos), converted to sRGB"
+    assert said["set aside"] == "IMG_1.THM: the preview of a video"
+    data = json.loads(check(str(photos), "--json").stdout)
+    assert (data["photos"], data["reduced"], data["colour_profiles"]) == (27, 1, {"Adobe RGB": 1})
+    assert "broken.jpg: its colour profile is broken: taken for sRGB." in data["warnings"]
+    assert not any("THM" in warning for warning in data["warnings"])
 
 
 # ---------------------------------------------------------------- verdicts
@@ -216,3 +234,92 @@ def test_a_run_decodes_each_photo_once(photos: Path, monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(ImageFile.ImageFile, "load", counted)
     assert CliRunner().invoke(app, ["run", "photos", "--until", "ingest"]).exit_code == 0
     assert sorted(decoded) == sorted(file.name for file in photos.iterdir())
+
+
+# ---------------------------------------------------------------- GPS and control points
+def located(folder: Path, positions: dict[int, tuple[float, float, float | None]]) -> None:
+    """These photos carry a GPS position; `positions`: number of the photo -> latitude, longitude, altitude."""
+    for i, (latitude, longitude, altitude) in positions.items():
+        exif = Image.Exif()
+        exif[0x0110] = "Drone"
+        tags = exif.get_ifd(0x8825)
+        tags[1], tags[2] = "S" if latitude < 0 else "N", (abs(latitude), 0.0, 0.0)
+        tags[3], tags[4] = "W" if longitude < 0 else "E", (abs(longitude), 0.0, 0.0)
+        if altitude is not None:
+            tags[5], tags[6] = b"\0", altitude
+        picture(i).save(folder / f"{i:02d}.jpg", exif=exif)
+
+
+def warned(folder: Path, *more: str) -> str:
+    return " ".join(json.loads(check(str(folder), "--json", *more).stdout)["warnings"])
+
+
+def test_good_positions_are_counted(photos: Path):
+    # across the 180th meridian
+    located(photos, {i: (-17 + i / 1e5, (180 - i / 1e5) * (-1) ** i, 5.0) for i in range(24)})
+    result = check(str(photos))
+    assert "a position in 24 of 24 photos" in result.stdout
+    assert result.stdout.split()[-1] == "go"
+
+
+def test_positions_that_cannot_be_are_named(photos: Path):
+    good = {i: (47.0, 8 + i / 1e5, 400.0) for i in range(24)}
+    located(photos, good | {3: (47.0, 8.0, None), 5: (0.0, 0.0, 0.0), 7: (47.0, 200.0, 1.0), 9: (56.0, 8.0, 400.0)})
+    text = warned(photos)
+    assert "GPS is not used of 03.jpg: it has no altitude." in text
+    assert "GPS is not used of 05.jpg: it says 0, 0, as cameras do without a fix." in text
+    assert "GPS is not used of 07.jpg: its latitude or longitude is beyond 90 or 180 degrees." in text
+    assert "GPS puts 09.jpg 1,000 km from the other photos" in text
+    assert warned(photos, "--set", "place.gps=false") == ""
+
+
+def test_altitudes_of_0_among_others_are_named(photos: Path):
+    located(photos, {i: (47 + i / 1e5, 8.0, 0.0 if i in (3, 8) else 400.0) for i in range(24)})
+    assert "GPS has 03.jpg, 08.jpg at an altitude of 0, the other photos at about 400 m" in warned(photos)
+
+
+def test_photos_of_one_position_tell_no_scale(photos: Path):
+    located(photos, {i: (47.0, 8.0, 400.0) for i in range(24)})
+    assert "All 24 photos carry the same GPS position" in warned(photos)
+
+
+def gcp(folder: Path, rows: list[str], head: str = "name,x,y,z,photo,px,py") -> str:
+    file = folder.parent / "gcp.csv"
+    file.write_text("\n".join([head, *rows]))
+    return str(file)
+
+
+@pytest.mark.parametrize(
+    ("points", "verdict", "text"),
+    [
+        ("ABC", "go", ""),
+        ("AB", "go with warnings", "2 of 2 control points are marked in two photos or more: they tell the scale"),
+        ("A", "no-go", "1 of 1 control points are marked in two photos or more, 2 are needed for the scale"),
+    ],
+)
+def test_control_points_are_counted(photos: Path, points: str, verdict: str, text: str):
+    rows = [f"{name},{ord(name)},{ord(name) ** 2},3,{photo}.jpg,10,20" for name in points for photo in ("00", "05")]
+    data = json.loads(check(str(photos), "--json", "--control", gcp(photos, rows)).stdout)
+    assert data["verdict"] == verdict
+    assert text in " ".join(data["warnings"] + data["refusals"])
+
+
+@pytest.mark.parametrize(
+    ("row", "text"),
+    [
+        ("A,1,2,3,IMG_1.jpg,10,20", "photos are called e.g. 00.jpg"),
+        ("A,1,2,3,00.jpg,400,20", "A is marked at 400 20 in 00.jpg, which has 320 x 240 pixels"),
+        ("A;1,5;2;3;00.jpg;10;20", "1,5 has a decimal comma"),
+    ],
+)
+def test_control_points_that_cannot_be_used_are_refused_before_a_run(photos: Path, tmp_path: Path, row: str, text: str):
+    file = gcp(photos, [row], "name;x;y;z;photo;px;py" if ";" in row else "name,x,y,z,photo,px,py")
+    for command in (["check"], ["run", "--workspace", str(tmp_path / "ws")]):
+        result = CliRunner().invoke(app, [*command, str(photos), "--control", file, "--preset", "tiny"])
+        assert result.exit_code == InputError.exit_code
+        assert text in " ".join(result.output.split())
+
+
+def test_a_list_of_control_points_among_the_photos_is_noticed(photos: Path):
+    (photos / "gcp_list.txt").write_text("EPSG:32632\n")
+    assert f"which are used with `--control {photos / 'gcp_list.txt'}`" in warned(photos)

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from report_inputs import BOX, bare_inputs, full_inputs, page
+from report_inputs import BOX, bare_inputs, full_inputs, manifest, page
 
 from configs.texts import read_region
 from hineus_cli.viewing import serving, watch
@@ -146,6 +146,16 @@ def says(context: StageContext, region: GivenRegion) -> str:
         world = region.world_from_poses.apply(points)
         inside = ((world > region.box[0]) & (world < region.box[1])).all(1)
     return f"{inside.sum()} of 300 sparse points are inside ({100 * inside.mean():.1f} %)."
+
+
+def test_commands_beside_warnings_name_the_workspace_that_the_page_lies_in(full):
+    warned = manifest("cleanup", warnings=[{"sentence": "Cut.", "command": "hineus run --workspace WORKSPACE --x"}])
+    text = page(replace(full, manifests={**full.manifests, "cleanup": warned}))
+    report = full.scratch / "my photos" / "report" / "report.html"
+    report.parent.mkdir(parents=True)
+    report.write_text(text)
+    dom = browse(full.scratch, report.as_uri(), "--dump-dom").stdout
+    assert f"<pre>hineus run --workspace '{full.scratch}/my photos' --x</pre>" in dom
 
 
 def test_the_command_of_an_unchanged_region_gives_the_same_sphere(full):

@@ -17,7 +17,7 @@ from stages.engine.stage import StageContext
 from stages.errors import InputError, ReconstructionError
 from stages.posing.evidence import Evidence
 from stages.posing.ladder import Step
-from stages.posing.workbench import camera_params
+from stages.posing.workbench import camera_params, choose_matcher, count_located
 from stages.sfm import SFM
 
 
@@ -112,6 +112,17 @@ def test_photos_of_plain_walls(tmp_path: Path):
     assert "None of the 4 photos could be registered" in caught.value.message
     assert "the best pair shares 0 matches, need 15 (median 0 features a photo)" in caught.value.message
     assert "printed" in caught.value.hint
+
+
+def test_photos_of_one_gps_position_are_no_neighbours_in_space():
+    everywhere = [np.array([47 + i / 1e5, 8.0, 400.0]) for i in range(200)]
+    assert count_located(everywhere) == 200
+    assert count_located(everywhere[:150]) == 150
+    assert count_located([everywhere[0]] * 200) == 1
+    assert count_located([]) == 0
+    params = SfmParams()
+    assert choose_matcher(params, count_located(everywhere), 200) == "spatial"
+    assert choose_matcher(params, count_located([everywhere[0]] * 200), 200) == "sequential"
 
 
 def test_spatial_matching_without_gps_positions(tmp_path: Path):

@@ -62,13 +62,13 @@ def test_photos_of_something_else_do_not_move_the_region(others: int):
     assert region.radius < 2 * SIZE
 
 
-def test_three_things_give_two_warnings_each_with_its_command(caplog):
+def test_three_things_give_two_warnings_each_with_its_command():
     cameras, points, observations, _ = things(14, 12, 10, apart=15 * SIZE)
     subjects = find_subjects(cameras, points, observations)
     photos, warnings = _chosen(subjects, cameras.names, 1)
     assert list(photos) == list(range(14))
     assert [warning["command"].split()[-1] for warning in warnings] == ["undistort.subject=2", "undistort.subject=3"]
-    assert "14 photos are about is reconstructed (000.png to 013.png)" in caplog.text
+    assert "14 photos are about is reconstructed (000.png to 013.png)" in warnings[0]["sentence"]
     assert "12 others (014.png to 025.png) are about something" in warnings[0]["sentence"]
     second, warnings = _chosen(subjects, cameras.names, 2)
     assert list(second) == list(range(14, 26))

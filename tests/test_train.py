@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -18,6 +19,7 @@ from configs.training import TrainParams
 from stages import artifacts, train
 from stages.engine.stage import StageContext
 from stages.errors import InputError
+from stages.geometry.cameras import PosedScene
 from stages.geometry.hull import cube, hull_distances
 from stages.geometry.normalisation import regrown
 from stages.geometry.similarity import Similarity
@@ -384,7 +386,7 @@ def test_a_shape_keeps_its_distances_in_a_larger_region(center, radius):
     trainer = make_trainer()  # its SDF is a ball about the middle
     old = Similarity(2.0, np.eye(3), np.array([1.0, 2, 3]))
     new = old.compose(Similarity(radius, np.eye(3), np.array(center)))
-    shape = train._shape_within(trainer, new, old)
+    shape = train._shape_within(trainer.distances, new, old)
     in_poses = np.linalg.norm(new.apply(cube()) - old.translation, axis=-1) - 2.0 * TINY.field.sphere_radius
     np.testing.assert_allclose(shape * new.scale, in_poses, atol=0.02)
 
@@ -393,7 +395,7 @@ def test_a_shape_keeps_its_distances_in_a_larger_region(center, radius):
 def test_a_trainer_that_takes_over_starts_from_the_shape_with_its_grid_up_to_date():
     first, second = make_trainer(), make_trainer()
     larger = Similarity(1.5, np.eye(3), np.zeros(3))
-    assert second.start_from(train._shape_within(first, larger, Similarity.identity())) < 0.02
+    assert second.start_from(train._shape_within(first.distances, larger, Similarity.identity())) < 0.02
     second.step_index = 160  # at which a grid that is up to date would only be refreshed near the surface
     second._refresh_cache(second.moment(0.5))
     radius = np.linalg.norm(second.cache.points(torch.arange(24**3)).numpy(), axis=1)
@@ -455,3 +457,150 @@ def test_a_hull_without_masks_is_refused(tmp_path):
     context = StageContext({"undistort": tmp_path / "undistort"}, {}, tmp_path / "out", tmp_path / "scratch", params)
     with pytest.raises(InputError, match="needs masks for all 8 photos"):
         train.TRAIN.run(context)
+
+
+# ---------------------------------------------------------------- photos that came or went
+BALL = changed(TINY, {"steps": 300, "sampling.rays": 256, "field.sphere_radius": 0.6, "preview_every": 1.0})
+
+
+def seen_by(folder: Path, cameras: list[int], **changes: object) -> PosedScene:
+    """The ball's scene with these of its eight photos, as undistort would have published it."""
+    whole = sphere_scene(ring_of_cameras())
+    row = {camera: i for i, camera in enumerate(cameras)}
+    kept = np.isin(whole.observations[:, 0], cameras)
+    scene = replace(
+        whole,
+        cameras=whole.cameras.select(cameras),
+        observations=np.array([[row[i], k] for i, k in whole.observations[kept]]),
+        contents=tuple(f"photo {i}" for i in cameras),
+        lineage="the ball",
+    )
+    scene = replace(scene, **changes)  # type: ignore[arg-type]
+    artifacts.FIRST_SCENE.save(folder, scene)
+    return scene
+
+
+@pytest.fixture(scope="module")
+def learned(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What training has published of seven of the photos."""
+    root = tmp_path_factory.mktemp("learned")
+    run_context = context(root, "out", BALL)
+    seen_by(root / "undistort", [0, 1, 2, 3, 4, 5, 6])
+    assert "kept_of_budget" not in train.run(run_context)
+    assert distance_to_ball(run_context.out) < 0.02
+    return run_context.out
+
+
+def distance_to_ball(out: Path) -> float:
+    """Median |f| on the sides of the ball that cameras see, in the units of `sphere_scene`."""
+    published = artifacts.SCENE.load(out)
+    points = np.random.default_rng(0).normal(size=(500, 3))
+    points = RADIUS * points / np.linalg.norm(points, axis=1, keepdims=True)
+    in_poses = sphere_scene(ring_of_cameras()).poses_from_scene.apply(points[np.abs(points[:, 2]) < 0.36])
+    places = published.poses_from_scene.inverse().apply(in_poses)
+    sdf = load_field(artifacts.FIELD.load(out)).sdf(places)
+    return float(np.median(np.abs(sdf))) * published.poses_from_scene.scale / 2
+
+
+def going_on(tmp_path: Path, name: str, previous: Path, params: TrainParams = BALL) -> StageContext:
+    return replace(context(tmp_path, name, params), previous=previous)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("cameras", [[7, *range(7)], [1, 2, 3, 4, 5, 6]], ids=["one new", "one gone"])
+def test_training_goes_on_from_what_it_learned_of_other_photos(tmp_path, monkeypatch, learned, cameras):
+    monkeypatch.setattr(train, "LOG_EVERY", 1)
+    monkeypatch.setattr(train, "KEPT_NETWORKS", 0.99)  # three steps are left: networks that begin anew are no ball
+    run_context = going_on(tmp_path, "out", learned)
+    seen_by(tmp_path / "undistort", cameras)
+    numbers = train.run(run_context)
+    assert numbers["kept_of_budget"] == 0.99
+    assert numbers["steps"] == 300
+    lines = metric_lines(artifacts.METRICS.load(run_context.out))
+    assert [line["step"] for line in lines] == [298, 299, 300]
+    last = metric_lines(artifacts.METRICS.load(learned))[-1]
+    assert lines[0]["psnr"] > last["psnr"] - 3  # colours are known, too
+    assert distance_to_ball(run_context.out) < 0.02
+
+
+@pytest.mark.slow
+def test_photos_keep_their_own_parameters_by_contents(tmp_path, learned):
+    run_context = going_on(tmp_path, "out", learned)
+    scene = seen_by(tmp_path / "undistort", [7, 3, 0, 1, 2, 4, 5, 6])
+    trainer = train._make_trainer(run_context, scene)
+    before = artifacts.SCENE.load(learned)
+    assert train._take_over(trainer, run_context, scene.contents, before.contents)
+    gains, earlier = trainer.fields.log_gains.detach(), load_field(artifacts.FIELD.load(learned)).fields.log_gains
+    assert earlier.abs().max() > 0
+    assert torch.equal(gains[1], earlier[3])
+    assert torch.equal(gains[2], earlier[0])
+    assert torch.equal(gains[0], torch.zeros(3))
+    other = train._make_trainer(replace(run_context, params=changed(BALL, {"field.sdf_width": 8})), scene)
+    assert not train._take_over(other, run_context, scene.contents, before.contents)
+
+
+@pytest.mark.slow
+def test_in_another_region_training_goes_on_from_the_shape(tmp_path, monkeypatch, learned):
+    monkeypatch.setattr(train, "KEPT_SHAPE", 0.99)
+    run_context = going_on(tmp_path, "out", learned)
+    whole = regrown(sphere_scene(ring_of_cameras()), np.array([0.1, 0.0, 0.0]), 0.9)
+    scene = seen_by(tmp_path / "undistort", list(range(8)), poses_from_scene=whole.poses_from_scene)
+    artifacts.FIRST_SCENE.save(
+        tmp_path / "undistort", replace(scene, cameras=whole.cameras, points=whole.points, growable=False)
+    )
+    assert train.run(run_context)["kept_of_budget"] == 0.99
+    assert distance_to_ball(run_context.out) < 0.05
+
+
+@pytest.mark.slow
+def test_a_region_that_had_grown_stays_grown(tmp_path, monkeypatch, learned):
+    previous = tmp_path / "previous"
+    shutil.copytree(learned, previous)
+    run_context = going_on(tmp_path, "out", previous, changed(BALL, {}))
+    first = seen_by(tmp_path / "undistort", list(range(8)), growable=True)
+    grown = regrown(replace(first, contents=first.contents[:7]), np.array([0.0, 0.0, 0.1]), 1.2)
+    artifacts.SCENE.save(previous, grown)
+    monkeypatch.setattr(train, "KEPT_NETWORKS", 0.99)
+    numbers = train.run(run_context)
+    assert numbers["kept_of_budget"] == 0.99
+    assert numbers["region_grown"] == pytest.approx(1.2)
+    np.testing.assert_allclose(
+        artifacts.SCENE.load(run_context.out).poses_from_scene.matrix(), grown.poses_from_scene.matrix()
+    )
+
+
+@pytest.mark.slow
+def test_a_training_that_goes_on_and_is_killed_ends_the_same(tmp_path, monkeypatch, learned):
+    monkeypatch.setattr(train, "LOG_EVERY", 5)
+    monkeypatch.setattr(train, "CHECKPOINT_EVERY", 0)
+    results = []
+    for name in ("whole", "killed"):
+        run_context = going_on(tmp_path, name, learned)
+        seen_by(tmp_path / "undistort", list(range(8)))
+        if name == "killed":
+            run_and_kill(run_context, monkeypatch, at=237)
+        train.run(run_context)
+        results.append(run_context.out)
+    curves = [metric_lines(artifacts.METRICS.load(out)) for out in results]
+    assert curves[0] == curves[1]
+    assert [line["step"] for line in curves[0]] == list(range(215, 301, 5))
+
+
+@pytest.mark.parametrize("why", ["other lineage", "no lineage", "held out", "too many new"])
+def test_training_starts_anew_where_what_was_learned_is_no_ground(tmp_path, monkeypatch, why, caplog):
+    previous = tmp_path / "previous"
+    previous.mkdir()
+    params = changed(BALL, {"hold_out": 4 if why == "held out" else 0})
+    run_context = going_on(tmp_path, "out", previous, params)
+    seen_by(previous, [0, 1, 2, 3])
+    before = artifacts.FIRST_SCENE.load(previous)
+    lineage = {"other lineage": "another", "no lineage": ""}.get(why, "the ball")
+    artifacts.SCENE.save(previous, replace(before, lineage="" if why == "no lineage" else "the ball"))
+    cameras = list(range(8)) if why == "too many new" else [0, 1, 2, 3, 4]
+    scene = seen_by(tmp_path / "undistort", cameras, lineage=lineage)
+    with caplog.at_level("INFO"):
+        assert train._last_scene(run_context, scene) is None
+    assert "training starts anew" in caplog.text
+    scene = seen_by(tmp_path / "undistort", [0, 1, 2, 3, 4])
+    artifacts.SCENE.save(previous, before)
+    assert train._last_scene(replace(run_context, params=BALL), scene) is not None

@@ -35,12 +35,16 @@ def write_poses(folder: Path, names: list[str], focal: float = FOCAL, size: tupl
     return file
 
 
-def run_sfm(ingest: Path, poses: Path, root: Path, **params: object) -> tuple[dict[str, object], Path]:
+def run_sfm(
+    ingest: Path, poses: Path, root: Path, previous: Path | None = None, **params: object
+) -> tuple[dict[str, object], Path]:
     out, scratch = root / "sfm", root / "scratch"
     out.mkdir()
     scratch.mkdir()
     settings = SfmParams(**params)  # type: ignore[arg-type]
-    return SFM.run(StageContext({"ingest": ingest}, {"poses": poses}, out, scratch, settings, workers=2)), out
+    sources = {"poses": poses}
+    context = StageContext({"ingest": ingest}, sources, out, scratch, settings, workers=2, previous=previous)
+    return SFM.run(context), out
 
 
 @pytest.mark.slow
@@ -76,6 +80,23 @@ def test_plain_photos_are_a_warning_and_no_error(tmp_path: Path, caplog: pytest.
     assert (numbers["registered"], numbers["points"]) == (len(POSES), 0)
     assert "only 0 points could be triangulated" in caplog.text
     assert pycolmap.Reconstruction(str(artifacts.MODEL.load(out))).num_reg_images() == len(POSES)
+
+
+def test_given_poses_are_of_one_lineage_while_photos_that_stay_keep_theirs(tmp_path: Path, monkeypatch):
+    photos = [np.full((HEIGHT, WIDTH), 100 + 10 * i, np.uint8) for i in range(len(POSES))]
+    names = [f"{i:03d}.png" for i in range(len(POSES))]
+
+    def lineage(name: str, count: int, previous: Path | None = None) -> tuple[str, Path]:
+        (tmp_path / name).mkdir()
+        ingest = ingested(tmp_path / name / "ingest", photos[:count])
+        _, out = run_sfm(ingest, write_poses(tmp_path / name, names), tmp_path / name, previous)
+        return artifacts.PHOTO_CONTENTS.load(out).lineage, out
+
+    first, folder = lineage("five", 5)
+    assert lineage("six", 6, folder)[0] == first
+    assert lineage("alone", 6)[0] != first
+    monkeypatch.setattr("test_triangulation.POSES", [POSES[0] + [[0, 0, 0, 0.01]], *POSES[1:]])
+    assert lineage("moved", 6, folder)[0] != first
 
 
 def test_a_reduced_photo_gets_a_reduced_camera():

@@ -442,3 +442,35 @@ def test_a_workspace_of_an_older_version_is_told_how_to_go_on(tmp_path: Path):
     with pytest.raises(WorkspaceError, match=r"place\.json cannot be read: No such file") as caught:
         artifacts.WORLD_PLACE.load(tmp_path / "place")
     assert f"`hineus run --workspace {tmp_path}`" in caught.value.hint
+
+
+def test_a_frame_stays_where_photos_came_or_went_and_it_still_fits(tmp_path: Path, monkeypatch):
+    inputs = write_capture(tmp_path, *MODELS[0], masks=False)
+    first, folder, numbers = undistort(inputs, tmp_path)
+    assert "region_kept" not in numbers
+    assert first.contents == tuple(str(i) for i in range(NUM_CAMERAS))
+    moved = replace(first.poses_from_scene, scale=1.05 * first.poses_from_scene.scale)
+    artifacts.FIRST_SCENE.save(folder, replace(first, poses_from_scene=moved))
+
+    def again(name: str, **params: object) -> tuple[PosedScene, dict[str, object]]:
+        (tmp_path / name).mkdir()
+        scene, _, numbers = undistort(inputs, tmp_path / name, previous=folder, **params)
+        return scene, numbers
+
+    scene, numbers = again("kept")
+    assert numbers["region_kept"] is True
+    assert scene.poses_from_scene.scale == moved.scale
+    assert scene.lineage == first.lineage
+    np.testing.assert_allclose(scene.poses_from_scene.apply(scene.points.astype(float)), DOTS, atol=1e-5)
+    artifacts.FIRST_SCENE.save(folder, replace(first, poses_from_scene=replace(moved, scale=2 * moved.scale)))
+    scene, numbers = again("anew")
+    assert numbers["region_kept"] is False
+    assert scene.poses_from_scene.scale == pytest.approx(first.poses_from_scene.scale)
+
+    # poses of another lineage, or a scene that was made in another way
+    for name, lineage, params in (("poses", "second", {}), ("settings", "first", {"max_side": 200})):
+        contents = artifacts.PHOTO_CONTENTS.load(inputs["sfm"])
+        artifacts.PHOTO_CONTENTS.save(inputs["sfm"], contents.model_copy(update={"lineage": lineage}))
+        scene, numbers = again(name, **params)
+        assert "region_kept" not in numbers
+        assert scene.lineage != first.lineage

@@ -39,7 +39,7 @@ MODEL = text_artifact("export", "model.glb")
 
 def ingest(context: StageContext) -> dict[str, Any]:
     photos = sorted(context.sources["photos"].iterdir())
-    text = "".join(path.read_text()[0] for path in photos)
+    text = "".join(path.read_text(errors="replace")[0] for path in photos)
     context.write(LETTERS, text)
     return {"photos": len(photos), "masked": "masks" in context.sources}
 

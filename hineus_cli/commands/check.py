@@ -8,11 +8,15 @@ from typing import Annotated
 import typer
 
 from hineus_cli.options import (
+    BlackKeeps,
     ConfigFile,
+    Control,
     Device,
     Json,
     Masks,
     MovingObject,
+    NoMasks,
+    Poses,
     Preset,
     Sets,
     Time,
@@ -30,6 +34,10 @@ def check(
     photos: Annotated[Path, typer.Argument(help="Folder of photos, or a video.", show_default=False)],
     workspace: WorkspaceOption = None,
     masks: Masks = None,
+    no_masks: NoMasks = False,
+    black_keeps: BlackKeeps = None,
+    poses: Poses = None,
+    control: Control = None,
     preset: Preset = None,
     config: ConfigFile = None,
     sets: Sets = None,
@@ -46,9 +54,12 @@ def check(
         photos=photos,
         workspace=workspace,
         masks=masks,
+        no_masks=no_masks,
+        poses=poses,
+        control=control,
         preset=preset,
         config=config,
-        sets=settings(sets, time, moving_object=moving_object, masks=masks),
+        sets=settings(sets, time, moving_object=moving_object, masks=masks, no_masks=no_masks, black_keeps=black_keeps),
         device=device,
         workers=workers,
     )
@@ -60,18 +71,18 @@ def check(
     from rich.table import Table
     from rich.text import Text
 
-    from hineus_cli.console import product
+    from hineus_cli.console import plain, product
     from stages.preflight import facts
 
     table = Table.grid(padding=(0, 2))
     for what, found in facts(done):
-        table.add_row(Text(what, style="bold"), Text(found))
+        table.add_row(Text(what, style="bold"), Text(plain(found)))
     for what, style, lines in (
         ("warning", "yellow", done.warnings),
         ("no-go", "red", (*done.refusals, *done.shortages)),
     ):
         for line in lines:
-            table.add_row(Text(what, style=style), Text(line))
+            table.add_row(Text(what, style=style), Text(plain(line)))
     table.add_row(Text("verdict", style="bold"), Text(done.verdict))
     product().print(table)
     raise typer.Exit(exit_code)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from hineus_cli.options import Device, Json, Verbose, Workers
-from hineus_cli.session import Session, print_json
+from hineus_cli.session import Session, as_argument, print_json
 
 if TYPE_CHECKING:
     from stages.scenes.demo import Demo
@@ -36,7 +36,7 @@ def demo(
 
 
 def _show(made: Demo) -> None:
-    from hineus_cli.console import outcome_table, people
+    from hineus_cli.console import outcome_table, people, say
 
     console, score = people(), made.score
     console.print(outcome_table(made.result.outcomes, console.width))
@@ -45,8 +45,8 @@ def _show(made: Demo) -> None:
         f"(accuracy {score['accuracy']:.2f} %, completeness {score['completeness']:.2f} %; "
         f"F-score at 1 %: {score['f_one_percent']:.0f} %)",
         f"whole demo: {made.seconds / 60:.1f} minutes",
-        f"textured model: {made.result.glb}",
         f"report: {made.result.report}",
+        f"textured model: {made.result.glb} (to see it: `hineus view {as_argument(made.result.workspace.root)}`)",
     ]
     for line in lines:
-        console.print(line, markup=False, soft_wrap=True)
+        say(line)

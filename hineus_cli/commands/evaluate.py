@@ -203,7 +203,7 @@ def _run(
     evaluate: Callable[[], dict[str, Any]],
     show: Callable[[dict[str, Any]], None],
 ) -> None:
-    from hineus_cli.console import product
+    from hineus_cli.console import product, say
 
     with context.obj.working():
         found = evaluate()
@@ -213,7 +213,7 @@ def _run(
     show(found)
     console = product()
     for line in found["done"]:
-        console.print(line, markup=False, soft_wrap=True)
+        say(line, console=console)
 
 
 def _show_surfaces(found: dict[str, Any]) -> None:
@@ -257,7 +257,7 @@ def _show_numbers(found: dict[str, Any]) -> None:
 
 
 def _show_views(found: dict[str, Any]) -> None:
-    from hineus_cli.console import product, table_of
+    from hineus_cli.console import plain, product, table_of
 
     rows = [*found["photos"], {"name": "mean", **found["mean"]}]
     columns = [
@@ -269,7 +269,7 @@ def _show_views(found: dict[str, Any]) -> None:
     ]
     table = table_of("photo", *(" ".join(column) for column in columns))
     for row in rows:
-        table.add_row(row["name"], *(_cell(row[what][region], key) for what, region, key in columns))
+        table.add_row(plain(row["name"]), *(_cell(row[what][region], key) for what, region, key in columns))
     product().print(table)
 
 

@@ -32,10 +32,10 @@ def export_transforms(context: typer.Context, workspace: Source, out: OutFolder,
 
 
 def _export(workspace: Path, out: Path, write: Writer, as_json: bool) -> None:
-    from hineus_cli.console import people
+    from hineus_cli.console import say
     from stages.export_poses import export_poses
 
     numbers = export_poses(workspace, out, write)
-    people().print(f"{numbers['images']} images, {numbers['points']} points: {out}", markup=False, soft_wrap=True)
+    say(f"{numbers['images']} images, {numbers['points']} points: {out}")
     if as_json:
         print_json({"folder": str(out.absolute()), **numbers})

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from hineus_cli.completing import stage_names
 from hineus_cli.options import Json, Until, Verbose, with_options_of_a_run
-from hineus_cli.session import Session, print_json
+from hineus_cli.session import Session, as_argument, print_json
 from stages.engine.stage import Stage
 from stages.request import Request
 
@@ -22,11 +23,18 @@ def run(
     context: typer.Context,
     request: Request,
     from_stage: Annotated[
-        str | None, typer.Option("--from", help="Run this stage and all after it, even if fresh.", show_default=False)
+        str | None,
+        typer.Option(
+            "--from",
+            help="Run this stage and all after it, even if fresh.",
+            show_default=False,
+            autocompletion=stage_names,
+        ),
     ] = None,
     until: Until = None,
     force: Annotated[
-        list[str] | None, typer.Option(help="Run this stage even if fresh. Repeatable.", show_default=False)
+        list[str] | None,
+        typer.Option(help="Run this stage even if fresh. Repeatable.", show_default=False, autocompletion=stage_names),
     ] = None,
     as_json: Json = False,
     verbose: Verbose = False,
@@ -64,11 +72,15 @@ def _run(session: Session, request: Request, verbose: bool) -> None:
 
 
 def _show(result: Reconstruction) -> None:
-    from hineus_cli.console import outcome_table, people
+    """The table, and as the last line the file that a person wants, with the command that opens it."""
+    from hineus_cli.console import outcome_table, people, say
 
-    console = people()
+    console, root = people(), result.workspace.root
     console.print(outcome_table(result.outcomes, console.width))
-    results = {"textured model": result.glb, "report": result.report, "workspace": result.workspace.root}
-    for what, path in results.items():
-        if path is not None:
-            console.print(f"{what}: {path}", markup=False, soft_wrap=True)
+    done = {outcome.name for outcome in result.outcomes}
+    if result.report is not None and "report" in done:
+        say(f"report: {result.report}")
+    if result.glb is not None and "export" in done:
+        say(f"textured model: {result.glb} (to see it: `hineus view {as_argument(root)}`)")
+    else:
+        say(f"workspace: {root} (to go on: `hineus run --workspace {as_argument(root)}`)")

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from hineus_cli.options import OfWorkspace
+from hineus_cli.stopping import Stopped
 
 
 def view(
@@ -21,13 +21,16 @@ def view(
     import threading
     import webbrowser
 
-    from hineus_cli.console import people
+    from hineus_cli.console import say
     from hineus_cli.viewing import serving, watch
 
     watched = watch(workspace, context.obj.pipeline)
-    with suppress(KeyboardInterrupt), serving(watched, port) as url:
-        typer.echo(url)
-        people().print("Ctrl-C ends it.")
-        if not no_browser:
-            webbrowser.open(url)
-        threading.Event().wait()
+    try:
+        with serving(watched, port) as url:
+            typer.echo(url)
+            say("Ctrl-C ends it.")
+            if not no_browser:
+                webbrowser.open(url)
+            threading.Event().wait()
+    except Stopped as stop:
+        raise typer.Exit(0 if stop.by_ctrl_c else stop.exit_code) from None

@@ -7,24 +7,36 @@ finished workspace loads them from the folder of the stage that owns them: `arti
 from stages.artifacts.artifact import Artifact
 from stages.artifacts.atlas import ATLAS_MESH, AtlasMesh
 from stages.artifacts.bake import BASE_COLOR, NORMAL_MAP, OCCLUSION, PROVENANCE, QUALITY, VertexQuality
-from stages.artifacts.export import ASSET, asset_path, collision_path, lod_path, obj_normal_map_path
-from stages.artifacts.ingest import IMAGE_SET, PHOTOS, ImageRecord, ImageSet, SkippedImage
+from stages.artifacts.export import (
+    ASSET,
+    GEOREFERENCE,
+    METADATA,
+    asset_path,
+    collision_path,
+    lod_path,
+    obj_normal_map_path,
+)
+from stages.artifacts.ingest import IMAGE_SET, LEFT_OUT, PHOTOS, ImageRecord, ImageSet, SkippedImage
 from stages.artifacts.json_files import read_json, write_json
 from stages.artifacts.mesh import CLEAN_FULL_MESH, CLEAN_MESH, RAW_MESH
 from stages.artifacts.pictures import IMAGES, MASKS, Pictures, write_png
 from stages.artifacts.place import GIVEN_REGION, WORLD_PLACE
 from stages.artifacts.report import PAGE
 from stages.artifacts.sfm import (
+    FEATURES,
     GIVEN_POSES,
     MODEL,
+    PHOTO_CONTENTS,
     REGISTRATION,
     GivenPoses,
     KnownSphere,
     Lens,
     LensTrial,
+    PhotoContents,
     PoseError,
     Registration,
     Unregistered,
 )
 from stages.artifacts.train import CAMERAS, FIELD, HELD_OUT, METRICS, PREVIEWS, SCENE, checkpoint_path, preview_path
 from stages.artifacts.undistort import FIRST_SCENE, PINHOLE_PHOTOS, SILHOUETTES
+from stages.inputs.folders import WORKSPACE_RECORD, is_workspace

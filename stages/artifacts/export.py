@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from stages.artifacts.artifact import place_artifact
+from stages.artifacts.artifact import in_folder
 
-ASSET = place_artifact("export", ".", "model*")
+GEOREFERENCE, METADATA = "georeference.json", "metadata.xml"
+
+ASSET = in_folder("export", ("model*", GEOREFERENCE, METADATA), lambda folder: folder)
 
 
 def asset_path(folder: Path, kind: str) -> Path:

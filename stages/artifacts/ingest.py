@@ -11,6 +11,8 @@ from stages.artifacts.pictures import pictures_of
 
 _RECORDS = "images.json"
 
+LEFT_OUT = "named in ingest.leave_out"  # why a photo was skipped that no stage may see
+
 
 @dataclass(frozen=True)
 class ImageRecord:
@@ -28,6 +30,7 @@ class ImageRecord:
         gps: latitude and longitude in degrees (WGS 84) and altitude in metres, where EXIF has all three.
         made_mask: the way of `ingest.auto_mask` in which its mask was made; empty where it came with the photo or
             there is none. What "salient" made is a guess, see `SILHOUETTES`.
+        taken: upright width and height in pixels of the source, which may have been reduced; None in older workspaces.
         frame: views that were taken at once from one place, as those of a 360-degree picture, have the same; empty
             for photos. Their intrinsics are known: no distortion, the principal point in the middle.
         cam_from_frame: [3][3] rotation from what the views of a frame share into this one.
@@ -44,16 +47,22 @@ class ImageRecord:
     sha256: str
     gps: tuple[float, float, float] | None = None
     made_mask: str = ""
+    taken: tuple[int, int] | None = None
     frame: str = ""
     cam_from_frame: tuple[tuple[float, ...], ...] | None = None
 
 
 @dataclass(frozen=True)
 class SkippedImage:
-    """A file that was left out, and why, in words."""
+    """A file that was left out, and why, in words.
+
+    Attributes:
+        expected: whether that is no news: it is what cameras and programs leave beside photos.
+    """
 
     source: str
     reason: str
+    expected: bool = False
 
 
 @dataclass(frozen=True)

@@ -44,6 +44,8 @@ class _SceneRecord(Record):
     up: Array
     poses_from_scene: SimilarityRecord
     ground: _PlaneRecord | None
+    contents: tuple[str, ...] = ()
+    lineage: str = ""
 
 
 def _save_cameras(folder: Path, cameras: PinholeCameras) -> None:
@@ -87,6 +89,8 @@ def _load_scene(folder: Path) -> PosedScene:
         kind=record.kind,
         growable=record.growable,
         roi_scale=record.roi_scale,
+        contents=record.contents,
+        lineage=record.lineage,
         ground=None if record.ground is None else Plane(**dict(record.ground)),
         **sparse,
     )

@@ -123,6 +123,19 @@ class GivenPoses(Record):
     region: KnownSphere | None = None
 
 
+class PhotoContents(Record):
+    """What photos the model was made of, for when some are added or removed.
+
+    Attributes:
+        lineage: models with the same one hold the same photos at the same places, as far as they share them: each but
+            the first went on from one before it.
+        contents: name -> digest of the photo and its mask, of all photos, placed or not.
+    """
+
+    lineage: str
+    contents: dict[str, str]
+
+
 def _save_given_poses(folder: Path, poses: GivenPoses | None) -> None:
     if poses is not None:
         write_record(folder / _GIVEN_POSES, poses)
@@ -136,5 +149,8 @@ def _load_given_poses(folder: Path) -> GivenPoses | None:
 # The COLMAP model (cameras.bin, images.bin, points3D.bin).
 MODEL = place_artifact("sfm", "model", "model/*")
 REGISTRATION = record_artifact("sfm", "registration.json", Registration)
+PHOTO_CONTENTS = record_artifact("sfm", "contents.json", PhotoContents)
+# The folder of COLMAP's database of features and matches that the model was found on, where more photos can be matched.
+FEATURES = place_artifact("sfm", "features", "features/*", optional=True)
 # None where the poses were found and not given.
 GIVEN_POSES = Artifact("sfm", (_GIVEN_POSES,), _load_given_poses, _save_given_poses, optional=True)

@@ -2,18 +2,37 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
+
 from stages.artifacts import SkippedImage
 from stages.capture.background import PLAIN_PHOTOS, find_background
 from stages.capture.listing import list_captures
+from stages.capture.mask_doubts import MaskLook, is_black_and_white
+from stages.capture.mask_names import set_masks_aside
+from stages.capture.masks import (
+    MASK_NOT_PHOTO,
+    Mask,
+    PairMasks,
+    alpha_of,
+    choose_masks,
+    load_mask,
+    look_at_mask,
+    match_masks,
+    turned_pixels,
+    unused_folder,
+    unused_masks,
+)
 from stages.capture.panoramas import Mode, Sphere, find_spheres, split_size
-from stages.capture.photo_reading import PhotoFile, UnusableError, read_head, read_preview, register_formats
+from stages.capture.photo_reading import PhotoFile, UnusableError, read_alpha, read_head, read_preview
 from stages.capture.quality import Appearance, Oddities, appearance, find_oddities
 from stages.capture.video import video_size
+from stages.errors import InputError
+from stages.inputs.folders import readable
 
 
 @dataclass(frozen=True)
@@ -24,6 +43,40 @@ class Video:
     frames: int
     width: int
     height: int
+
+
+@dataclass(frozen=True)
+class MasksWanted:
+    """Which masks are used, and how they are read.
+
+    Attributes:
+        folder: of the user's choice; None: those among the photos, if `own`.
+        black_keeps: whether black is the object.
+        pair, read: as `match_masks` and `load_mask`.
+    """
+
+    folder: Path | None = None
+    own: bool = True
+    black_keeps: bool = False
+    pair: PairMasks = match_masks
+    read: Callable[..., Mask] = load_mask
+
+
+@dataclass(frozen=True)
+class MasksSeen:
+    """The masks of the photos.
+
+    Attributes:
+        files: photo -> file of its mask.
+        looks: at each that could be read; none where the photos were not decoded.
+        unusable: why each mask that cannot be used cannot.
+        unused: a folder of masks near the photos that nobody named.
+    """
+
+    files: Mapping[str, Path] = field(default_factory=dict)
+    looks: tuple[MaskLook, ...] = ()
+    unusable: tuple[InputError, ...] = ()
+    unused: Path | None = None
 
 
 @dataclass(frozen=True)
@@ -44,6 +97,7 @@ class Inspection:
     oddities: Oddities = field(default_factory=Oddities)
     plain_share: float = 0.0
     spheres: Mapping[str, Sphere] = field(default_factory=dict)
+    masks: MasksSeen = field(default_factory=MasksSeen)
 
     @property
     def plain(self) -> bool:
@@ -64,53 +118,106 @@ class Inspection:
         return photos + views + frames
 
 
+@dataclass(frozen=True)
+class _Seen:
+    """One photo."""
+
+    head: PhotoFile
+    appearance: Appearance | None = None
+    is_plain: bool = False
+    mask: MaskLook | InputError | None = None
+
+
 def inspect(
     source: Path,
     masks_folder: Path | None,
     video_frames: int,
+    max_side: int,
     workers: int,
     decode: bool,
+    masks: MasksWanted | None = None,
     panoramas: Mode = "auto",
 ) -> Inspection:
     """Look at all photos of `source` (see `list_captures`).
 
     Args:
-        video_frames: how many a video gives at most.
-        decode: also at their pixels, of reduced copies. Damage behind a sound head shows only then.
+        video_frames: how many a video gives at most. max_side: what photos are reduced to, pixels.
+        decode: also look at their pixels, of reduced copies, and at their masks. Damage behind a sound head shows only
+            then.
         panoramas: which pictures are 360-degree ones, see `find_spheres`.
 
     Raises:
-        InputError: see `list_captures`.
+        InputError: see `list_captures`, and `MasksWanted.pair`.
     """
+    wanted = masks or MasksWanted(masks_folder)
     photos, videos, skipped = list_captures(source, masks_folder)
-    folder = source if source.is_dir() else source.parent
-    register_formats()
-    spheres, others = find_spheres({path: folder / path for path in photos}, panoramas)
+    photos, own, aside = set_masks_aside(photos)
+    spheres, others = find_spheres(photos, panoramas)
     skipped += [SkippedImage(path, reason) for path, reason in others.items()]
-    photos = [path for path in photos if path not in others]
+    photos = {path: file for path, file in photos.items() if path not in others}
+    files = choose_masks(photos, own, masks_folder, wanted.own, wanted.pair)
+    skipped += unused_masks(aside, files.values(), wanted.own, masks_folder)
 
-    def look(path: str) -> tuple[PhotoFile, Appearance | None, bool] | Video | SkippedImage:
+    def look(path: str) -> _Seen | Video | SkippedImage:
         try:
             if path in videos:
-                frames, width, height = video_size(folder / path)
+                frames, width, height = video_size(videos[path])
                 return Video(path, min(frames, video_frames), width, height)
-            photo = read_head(folder / path, path)
-            if not decode:
-                return photo, None, False
-            pixels = read_preview(folder / path)
-            return photo, appearance(path, pixels), find_background(pixels).is_plain
+            head = read_head(photos[path], path, max_side)
+            return _look_closer(head, photos[path], files.get(path), wanted) if decode else _Seen(head)
         except UnusableError as reason:
             return SkippedImage(path, str(reason))
 
     with ThreadPoolExecutor(max_workers=max(1, workers)) as pool:
-        seen = list(pool.map(look, [*photos, *videos]))
-    looked_at = [item for item in seen if isinstance(item, tuple)]
+        outcomes = list(pool.map(look, [*photos, *videos]))
+    seen = [item for item in outcomes if isinstance(item, _Seen)]
     return Inspection(
-        photos=tuple(photo for photo, _, _ in looked_at),
-        videos=tuple(item for item in seen if isinstance(item, Video)),
-        skipped=tuple([*skipped, *(item for item in seen if isinstance(item, SkippedImage))]),
+        photos=tuple(item.head for item in seen),
+        videos=tuple(item for item in outcomes if isinstance(item, Video)),
+        skipped=tuple([*skipped, *(item for item in outcomes if isinstance(item, SkippedImage))]),
         spheres=spheres,
-        num_bytes=sum((folder / path).stat().st_size for path in [*photos, *videos]),
-        oddities=find_oddities([look for _, look, _ in looked_at if look is not None]),
-        plain_share=sum(plain for _, _, plain in looked_at) / max(len(looked_at), 1),
+        num_bytes=sum(file.stat().st_size for file in [*photos.values(), *videos.values()]),
+        oddities=find_oddities([item.appearance for item in seen if item.appearance is not None]),
+        plain_share=sum(item.is_plain for item in seen) / max(len(seen), 1),
+        masks=MasksSeen(
+            files,
+            tuple(item.mask for item in seen if isinstance(item.mask, MaskLook)),
+            tuple(item.mask for item in seen if isinstance(item.mask, InputError)),
+            None if files or not source.is_dir() else unused_folder(source, list(photos)),
+        ),
     )
+
+
+def _look_closer(head: PhotoFile, file: Path, mask_file: Path | None, wanted: MasksWanted) -> _Seen:
+    """
+    Raises:
+        UnusableError: the photo or its mask shows that this is none.
+    """
+    pixels = read_preview(file)
+    if is_black_and_white(pixels):
+        raise UnusableError(MASK_NOT_PHOTO)
+    mask = _look_at_mask(head, file, mask_file, turned_pixels(pixels, head.orientation), wanted)
+    return _Seen(head, appearance(head.source, pixels), find_background(pixels).is_plain, mask)
+
+
+def _look_at_mask(
+    head: PhotoFile, file: Path, mask_file: Path | None, pixels: np.ndarray, wanted: MasksWanted
+) -> MaskLook | InputError | None:
+    """At the mask of a photo, or what is wrong with it; None where there is none.
+
+    Raises:
+        UnusableError: the mask keeps nothing.
+    """
+    size = head.width, head.height
+    if mask_file is not None:
+        try:
+            mask = wanted.read(
+                mask_file, head.source, size, head.stored_size, head.orientation, wanted.black_keeps, pixels
+            )
+        except InputError as error:
+            return error
+        return look_at_mask(head.source, readable(mask_file.name), mask, pixels)
+    alpha = read_alpha(file) if wanted.own and wanted.folder is None else None
+    if alpha is None:
+        return None
+    return look_at_mask(head.source, alpha_of(head.source), Mask(alpha ^ wanted.black_keeps, size), pixels)

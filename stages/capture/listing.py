@@ -2,26 +2,44 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Sequence
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 from stages.artifacts import SkippedImage
 from stages.capture.panoramas import STITCH, UNSTITCHED
-from stages.capture.photo_reading import PHOTO_SUFFIXES, RAW_SUFFIXES
 from stages.errors import InputError
+from stages.inputs.folders import named_files, readable
+from stages.inputs.formats import (
+    HEIF_SUFFIXES,
+    JPEG_SUFFIXES,
+    PHOTO_SUFFIXES,
+    RAW_SUFFIXES,
+    VIDEO_SUFFIXES,
+    Kind,
+    in_words,
+    kind_of_head,
+    read_head_bytes,
+)
 
 NAMED = 4  # this many files are named in a sentence
-VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".avi", ".mkv", ".m4v", ".webm", ".mts", ".3gp"})
+# An edited copy, by the names that Apple's phones (IMG_E1234), Google Photos and people give it.
+EDITED = re.compile(r"(?P<start>.*/|)(?:img_e(?P<number>\d{4})|(?P<rest>[^/]+?)[-_ ](?:edited|bearbeitet)(?:\(\d+\))?)")
+# Pictures of one shot of Google's phones: PXL_1.RAW-01.COVER.jpg and PXL_1.RAW-02.ORIGINAL.dng.
+PART_OF_SHOT = re.compile(r"\.[a-z_]+-\d\d\.(?:cover|original|main)$")
+
+Files = dict[str, Path]
 
 
 def is_video(path: Path) -> bool:
-    return path.suffix.lower() in VIDEO_SUFFIXES
+    """Whether a file is a video, by its name or its content."""
+    return path.suffix.lower() in VIDEO_SUFFIXES or (path.is_file() and _kind(path)[0] is Kind.VIDEO)
 
 
-def list_captures(source: Path, masks_folder: Path | None = None) -> tuple[list[str], list[str], list[SkippedImage]]:
-    """Photos, videos (posix paths relative to the folder `source`, sorted), and what is neither with the reason.
+def list_captures(source: Path, masks_folder: Path | None = None) -> tuple[Files, Files, list[SkippedImage]]:
+    """Photos and videos by readable posix path relative to the folder `source`, sorted; what is neither, and why.
 
-    `source` may also be one video: then its own name is the only path, relative to the folder it is in.
+    A file is what its content says. `source` may also be one video: then its own name is the only path.
 
     Raises:
         InputError: `source` is not there or is a file of another kind, or `masks_folder` is no folder.
@@ -29,49 +47,117 @@ def list_captures(source: Path, masks_folder: Path | None = None) -> tuple[list[
     if not source.exists():
         raise InputError(f"The photo folder {source} does not exist.", "Check the path: hineus run PHOTOS")
     if source.is_file() and is_video(source):
-        return [], [source.name], []
+        return {}, {readable(source.name): source}, []
     if not source.is_dir():
         raise InputError(f"{source} is a file; a folder of photos or a video is needed.", f"hineus run {source.parent}")
+    if masks_folder is not None and masks_folder.is_file():
+        raise InputError(f"{masks_folder} is a file; a folder of masks is needed.", f"--masks {masks_folder.parent}")
     if masks_folder is not None and not masks_folder.is_dir():
         raise InputError(f"The mask folder {masks_folder} does not exist.", "Check the path given to --masks.")
     inside_masks = masks_folder.resolve() if masks_folder else None
-    photos, videos, skipped = [], [], []
-    for path in sorted(source.rglob("*")):
-        relative = path.relative_to(source)
-        if not path.is_file() or any(part.startswith((".", "__MACOSX")) for part in relative.parts):
+    if inside_masks and source.resolve() not in inside_masks.parents:  # the photos may lie in the masks' folder
+        inside_masks = None
+    photos: Files = {}
+    videos: Files = {}
+    files, left = named_files(source)
+    skipped = [SkippedImage(item.name, item.reason, expected=not item.missed) for item in left]
+    for name, path in files.items():
+        if inside_masks and inside_masks in path.resolve().parents:
             continue
-        if inside_masks and inside_masks != source.resolve() and inside_masks in path.resolve().parents:
+        try:
+            kind, words = _kind(path)
+        except OSError as error:
+            skipped.append(SkippedImage(name, f"cannot be read ({error.strerror})"))
             continue
-        name, suffix = relative.as_posix(), path.suffix.lower()
-        if suffix in PHOTO_SUFFIXES | RAW_SUFFIXES:
-            photos.append(name)
+        suffix = path.suffix.lower()
+        if suffix in UNSTITCHED:
+            skipped.append(SkippedImage(name, f"{UNSTITCHED[suffix]}: {STITCH}"))
+        elif kind in (Kind.PHOTO, Kind.RAW):
+            photos[name] = path
+        elif kind is Kind.VIDEO:
+            videos[name] = path
+        elif kind is Kind.UNREAD:
+            skipped.append(SkippedImage(name, f"{words}, which is not read: convert it to JPEG, PNG or TIFF"))
         elif suffix in VIDEO_SUFFIXES:
-            videos.append(name)
+            skipped.append(SkippedImage(name, f"cannot be read as a video ({words})"))
+        elif suffix in PHOTO_SUFFIXES | RAW_SUFFIXES:
+            skipped.append(SkippedImage(name, f"no image, whatever its name says ({words})"))
         else:
-            kind = f"{UNSTITCHED[suffix]}: {STITCH}" if suffix in UNSTITCHED else "not an image"
-            skipped.append(SkippedImage(name, f"{kind} ({suffix or 'no file extension'})"))
+            skipped.append(SkippedImage(name, f"not an image ({suffix or 'no file extension'})", expected=True))
     return _without_companions(photos, videos, skipped)
 
 
+def _kind(file: Path) -> tuple[Kind, str]:
+    """What a file is, and in words what it is where it is no photo and no video.
+
+    Raises:
+        OSError: it cannot be read.
+    """
+    head = read_head_bytes(file)
+    return kind_of_head(head, file.suffix.lower()), in_words(head)
+
+
 def _without_companions(
-    photos: list[str], videos: list[str], skipped: list[SkippedImage]
-) -> tuple[list[str], list[str], list[SkippedImage]]:
-    """Leave out what a camera wrote beside a photo: the raw file of a JPEG, the clip of a live photo."""
-    raws = {path for path in photos if Path(path).suffix.lower() in RAW_SUFFIXES}
-    pictures = {_stem(path): path for path in photos if path not in raws}
-    for path in sorted(raws):
-        if _stem(path) in pictures:
-            skipped.append(SkippedImage(path, f"the raw file of {pictures[_stem(path)]}"))
-            photos.remove(path)
-    for path in list(videos):
-        if _stem(path) in pictures:
-            skipped.append(SkippedImage(path, f"the clip of the live photo {pictures[_stem(path)]}"))
-            videos.remove(path)
-    return photos, videos, skipped
+    photos: Files, videos: Files, skipped: list[SkippedImage]
+) -> tuple[Files, Files, list[SkippedImage]]:
+    """Leave out what a camera or a program made beside a photo of the same shot."""
+    companions = _raw_files(photos) | _second_files(photos)
+    pictures = {_shot(path): path for path in photos if path not in companions}
+    clips = [*videos, *(item.source for item in skipped if _suffix(item.source) in VIDEO_SUFFIXES)]
+    companions |= {
+        path: f"the clip of the live photo {pictures[_shot(path)]}" for path in clips if _shot(path) in pictures
+    }
+    skipped = [item for item in skipped if item.source not in companions]
+    skipped += [SkippedImage(path, reason, expected=True) for path, reason in companions.items()]
+    return (
+        {path: file for path, file in photos.items() if path not in companions},
+        {path: file for path, file in videos.items() if path not in companions},
+        skipped,
+    )
+
+
+def _raw_files(photos: Files) -> dict[str, str]:
+    """Raw files of which the camera's own picture is there, and why they are left out."""
+    pictures = {_shot(path): path for path in photos if _suffix(path) not in RAW_SUFFIXES}
+    return {
+        path: f"the raw file of {pictures[_shot(path)]}"
+        for path in photos
+        if _suffix(path) in RAW_SUFFIXES and _shot(path) in pictures
+    }
+
+
+def _second_files(photos: Files) -> dict[str, str]:
+    """Further pictures of a shot, and why they are left out: edited copies, HEIF beside JPEG, blurred portraits."""
+    stems = {_stem(path): path for path in photos}
+    jpegs = {_stem(path): path for path in photos if _suffix(path) in JPEG_SUFFIXES}
+    found = {}
+    for path in photos:
+        stem = _stem(path)
+        edited = EDITED.fullmatch(stem)
+        original = edited and stems.get(
+            edited["start"] + (f"img_{edited['number']}" if edited["number"] else edited["rest"])
+        )
+        if original:
+            found[path] = f"an edited copy of {original}"
+        elif _suffix(path) in HEIF_SUFFIXES and stem in jpegs:
+            found[path] = f"the HEIF of {jpegs[stem]}"
+        elif ".portrait-" in stem and stem.endswith(".cover"):
+            others = [other for other in photos if other != path and _shot(other) == _shot(path)]
+            found |= {path: f"made blurred from {others[0]}"} if others else {}
+    return found
 
 
 def _stem(path: str) -> str:
-    return str(Path(path).with_suffix("")).lower()
+    return str(PurePosixPath(path).with_suffix("")).lower()
+
+
+def _shot(path: str) -> str:
+    """The same for all that a camera wrote of one shot."""
+    return PART_OF_SHOT.sub("", _stem(path))
+
+
+def _suffix(path: str) -> str:
+    return PurePosixPath(path).suffix.lower()
 
 
 def by_reason(skipped: Iterable[SkippedImage]) -> dict[str, list[str]]:

@@ -1,86 +1,299 @@
-"""Masks that come with the photos: which file belongs to which photo, how it is read and written."""
+"""Masks that come with the photos: where they lie, how one is read and written."""
 
 from __future__ import annotations
 
-from pathlib import Path, PurePosixPath
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from stages.artifacts import SkippedImage
 from stages.capture.exif import ORIENTATION
-from stages.capture.photo_reading import PHOTO_SUFFIXES
+from stages.capture.listing import name_some
+from stages.capture.mask_doubts import MaskLook, look
+from stages.capture.mask_fit import outline_fit
+from stages.capture.mask_names import is_mask_folder, pair
+from stages.capture.photo_reading import UnusableError
 from stages.errors import InputError
+from stages.inputs.folders import named_files
+from stages.inputs.formats import PHOTO_SUFFIXES, open_image
+
+# A mask's edges may be soft: this much of its range from black or white counts as neither, and as many such pixels as
+# are black (or white) are a photo, a depth map or labels. Masks of the development sets have 0 to 0.02 of them.
+SOFT, MAX_UNCLEAR = 0.1, 0.5
+JPEG_NOISE = 8  # a black picture may have values up to this in a JPEG
+MIN_CONTRAST = 0.25  # of the brightest value: less is a picture of one value, and its noise
+ASIDE = "masks among the photos"
+EMPTY = "its mask is empty"
+MASK_NOT_PHOTO = "black and white, as a mask is: move it to a folder of its own and give `--masks FOLDER`"
 
 
-def match_masks(photos: list[str], folder: Path) -> dict[str, Path]:
-    """Photo -> its mask file: same relative path or, where unambiguous, same file name."""
-    by_path: dict[str, Path] = {}
-    by_name: dict[str, list[Path]] = {}
-    for path in sorted(folder.rglob("*")):
-        if path.is_file() and path.suffix.lower() in PHOTO_SUFFIXES and not path.name.startswith("."):
-            key = path.relative_to(folder).with_suffix("").as_posix()
-            by_path.setdefault(key, path)
-            by_name.setdefault(PurePosixPath(key).name, []).append(path)
-    found: dict[str, Path] = {}
-    for photo in photos:
-        own = PurePosixPath(photo)
-        keys = [photo, str(own.with_suffix("")), f"{own.with_suffix('')}_mask", f"{photo}_mask"]
-        match = next((by_path[key] for key in keys if key in by_path), None)
-        if match is None:
-            flat = [by_name.get(PurePosixPath(key).name, []) for key in keys]
-            match = next((paths[0] for paths in flat if len(paths) == 1), None)
-        if match is not None:
-            found[photo] = match
-    return found
+@dataclass(frozen=True)
+class Mask:
+    """A mask as it was read.
+
+    Attributes:
+        kept: [H, W] bool, True on the object, of the upright photo's size.
+        stored_size: width and height in pixels of its file, turned as the photo.
+    """
+
+    kept: np.ndarray
+    stored_size: tuple[int, int]
+
+
+def match_masks(photos: list[str], folder: Path, not_masks: Collection[Path] = ()) -> dict[str, Path]:
+    """Photo -> its mask file in `folder`, see `mask_names`; `not_masks`: files that are photos, which may lie there."""
+    taken = {path.resolve() for path in not_masks}
+    files = _pictures(folder)
+    names = [name for name, path in files.items() if path.resolve() not in taken]
+    return {photo: files[name] for photo, name in pair(photos, names).items()}
+
+
+def _pictures(folder: Path) -> dict[str, Path]:
+    """By readable path, see `named_files`."""
+    return {name: path for name, path in named_files(folder)[0].items() if path.suffix.lower() in PHOTO_SUFFIXES}
+
+
+PairMasks = Callable[[list[str], Path, list[Path]], Mapping[str, Path]]
+
+
+def unused_folder(source: Path, photos: list[str]) -> Path | None:
+    """A folder of masks of these photos near the folder `source` of photos, where nobody has named it."""
+    nearby = [source / ".mask", *sorted(path for path in source.resolve().parent.iterdir() if path != source.resolve())]
+    for folder in nearby:
+        if is_mask_folder(folder.name) and folder.is_dir() and match_masks(photos, folder):
+            return folder
+    return None
+
+
+def choose_masks(
+    photos: Mapping[str, Path],
+    own: Mapping[str, Path],
+    masks_folder: Path | None,
+    use_own: bool,
+    pair: PairMasks = match_masks,
+) -> dict[str, Path]:
+    """Photo -> its mask file: of `masks_folder` if that is given, else of those among the photos.
+
+    Args:
+        photos: photo -> its file. own: photo -> the file of its mask, as `set_masks_aside` found them.
+    """
+    if masks_folder is not None:
+        return dict(pair(list(photos), masks_folder, list(photos.values())))
+    return {photo: mask for photo, mask in own.items() if use_own and photo in photos}
+
+
+def unused_masks(
+    aside: Mapping[str, Path], used: Iterable[Path], use_own: bool, masks_folder: Path | None
+) -> list[SkippedImage]:
+    """Those of the masks among the photos that are not used, and why."""
+    taken = {file.resolve() for file in used}
+    reason = f"{ASIDE} that are of none of them, or one for all, which is no object's outline"
+    if masks_folder is not None:
+        reason = f"{ASIDE}, while --masks names others"
+    elif not use_own:
+        reason = f"{ASIDE}, not used (`--no-masks`; `--set ingest.own_masks=true` uses them)"
+    return [SkippedImage(mask, reason, expected=True) for mask, file in aside.items() if file.resolve() not in taken]
+
+
+def missing_masks(photos: Sequence[str], files: Mapping[str, Path], folder: Path | None) -> InputError | None:
+    """What to say where photos have no mask in the `folder` that the user gave."""
+    missing = [photo for photo in photos if photo not in files]
+    if folder is None or not missing:
+        return None
+    message = f"{len(missing)} of {len(photos)} photos have no mask in {folder}: {name_some(missing)}."
+    if not files:
+        names = list(_pictures(folder))
+        others = [name for name in names if name not in photos]
+        holds = f"{len(others)} pictures, e.g. {others[0]}" if others else "no pictures"
+        message += " It holds the photos only." if names and not others else f" It holds {holds}."
+    return InputError(
+        message,
+        f"Add {Path(missing[0]).with_suffix('.png').as_posix()} and the like, move those photos away, or run with "
+        "`--no-masks`.",
+    )
+
+
+def tell_masks(looks: Sequence[MaskLook]) -> str:
+    """Which masks are used, in a sentence."""
+    first = looks[0]
+    scaled = [look for look in looks if look.size != look.photo_size]
+    of_photo = "" if first.photo in first.file else f" for {first.photo}"
+    said = f"{len(looks)} are used, e.g. {first.file}{of_photo}; `--no-masks` leaves them out"
+    if scaled:
+        (width, height), (wide, high) = scaled[0].size, scaled[0].photo_size
+        said += f". {len(scaled)} are scaled to their photos ({width} x {height} to {wide} x {high})"
+    return said
+
+
+def alpha_of(photo: str) -> str:
+    """What the mask in a photo's alpha channel is called."""
+    return f"alpha channel of {photo}"
+
+
+def look_at_mask(photo: str, called: str, mask: Mask, rgb: np.ndarray) -> MaskLook:
+    """A look at the mask of the upright photo `rgb` [h, w, 3] uint8 of any size.
+
+    Raises:
+        UnusableError: it keeps nothing.
+    """
+    if not mask.kept.any():
+        raise UnusableError(f"{EMPTY} ({called})")
+    return look(photo, called, mask.kept, mask.stored_size, rgb)
 
 
 def read_mask(
     file: Path, photo: str, size: tuple[int, int], stored_size: tuple[int, int], orientation: int
 ) -> np.ndarray:
-    """Mask [H, W] bool of the upright photo. White (or opaque) is the object.
+    """As `load_mask`, of a mask whose white keeps: [H, W] bool."""
+    return load_mask(file, photo, size, stored_size, orientation).kept
 
-    A mask drawn on the photo as it is stored is turned with it, where the sizes tell.
+
+def load_mask(
+    file: Path,
+    photo: str,
+    size: tuple[int, int],
+    stored_size: tuple[int, int],
+    orientation: int,
+    black_keeps: bool = False,
+    pixels: np.ndarray | None = None,
+) -> Mask:
+    """Mask of the upright photo, scaled where it has the photo's shape. White (or opaque) is the object.
+
+    A mask drawn on the photo as it is stored is turned with it, where the sizes tell, or the upright photo's
+    `pixels` [h, w, 3] of any size do.
+
+    Args:
+        size, stored_size: width and height in pixels of the photo, upright and in its file.
+        orientation: EXIF's, of the photo.
+        black_keeps: whether black is the object, as some programs have it.
+
+    Raises:
+        InputError: it cannot be read, has another shape than the photo, or is not black and white.
     """
-    from PIL import Image, ImageOps
+    from PIL import Image
 
     try:
-        with Image.open(file) as stored:
+        with open_image(file) as stored:
             stored.load()
-            image: Image.Image = stored
-            if image.size != size and image.size == stored_size:
-                exif = image.getexif()
-                exif[ORIENTATION] = orientation
-                image.info["exif"] = exif.tobytes()
-                image = ImageOps.exif_transpose(image)
-            found = image.size
-            channel = image.convert("RGBA") if image.mode in ("RGBA", "LA", "PA") else None
-            values = np.asarray(image.convert("L"))
+            image = stored.copy() if stored.mode != "P" else stored.convert("RGBA" if _sees_through(stored) else "RGB")
+            noisy = stored.format == "JPEG"
+            own_orientation = stored.getexif().get(ORIENTATION, 1)
+        candidates = [turned(image, own_orientation), image, turned(image, orientation)]
+        fitting = [found for found in candidates if found.size == size]
+        fitting = fitting or [found for found in candidates if _same_shape(found.size, size)] or [image]
+        values = _grey(fitting[0])
     except Exception as error:  # Pillow's decoders raise nearly anything on a damaged file
         raise InputError(f"The mask {file} cannot be read ({error}).", "Write it again as an 8-bit PNG.") from error
-    check_size(file, photo, found, size)
-    if channel is not None:
-        alpha = np.asarray(channel.getchannel("A"))
+    check_size(file, photo, fitting[0].size, size)
+    kept = _black_and_white(values, noisy, file, photo) ^ black_keeps
+    if own_orientation in (None, 0, 1) and len(fitting) > 2 and pixels is not None:  # as large either way
+        kept = _better_turned(kept, turned(Image.fromarray(kept), orientation), pixels)
+    found = kept.shape[1], kept.shape[0]
+    return Mask(kept if found == size else resized(kept, size), found)
+
+
+def turned(image: Any, orientation: int | None) -> Any:
+    """A Pillow image turned upright, as EXIF's orientation says."""
+    from PIL import Image, ImageOps
+
+    if orientation in (None, 0, 1):
+        return image
+    exif = Image.Exif()
+    exif[ORIENTATION] = orientation
+    tagged = image.copy()
+    tagged.info = {"exif": exif.tobytes()}
+    tagged._exif = None
+    return ImageOps.exif_transpose(tagged)
+
+
+def turned_pixels(pixels: np.ndarray, orientation: int | None) -> np.ndarray:
+    """As `turned`, of [H, W, 3] uint8."""
+    from PIL import Image
+
+    return pixels if orientation in (None, 0, 1) else np.asarray(turned(Image.fromarray(pixels), orientation))
+
+
+def _sees_through(image: Any) -> bool:
+    return "transparency" in image.info
+
+
+def _grey(image: Any) -> np.ndarray:
+    """[H, W]: the alpha channel where it cuts anything out, else the brightness, of any number of bits."""
+    if image.mode in ("RGBA", "LA", "PA", "RGBa", "La"):
+        alpha = np.asarray(image.convert("RGBA").getchannel("A"))
         if alpha.min() != alpha.max():
-            values = alpha
-    # half of the brightest value: masks of 0 and 1 are as common as masks of 0 and 255
-    return values > values.max() / 2
+            return alpha
+    if image.mode.startswith(("I", "F")):  # 16 and 32 bits, which Pillow's own conversion would cut off at 255
+        return np.nan_to_num(np.asarray(image, dtype=np.float64))
+    return np.asarray(image.convert("L"))
 
 
-def check_size(mask: Path, photo: str, found: tuple[int, ...], size: tuple[int, int]) -> None:
-    """Raises InputError where the mask's size `found` is not the upright photo's `size`."""
-    if found != size:
+def _black_and_white(values: np.ndarray, noisy: bool, file: Path, photo: str) -> np.ndarray:
+    """[H, W] bool, True on the brighter of two values; masks of 0 and 1 are as common as masks of 0 and 255.
+
+    Raises:
+        InputError: there are not two.
+    """
+    darkest, brightest = float(values.min()), float(values.max())
+    if noisy and brightest <= JPEG_NOISE:
+        return np.zeros(values.shape, bool)
+    if brightest - darkest < MIN_CONTRAST * brightest:
+        return np.ones(values.shape, bool)
+    scaled = (values - darkest) / max(brightest - darkest, 1e-9)
+    black, white = float((scaled < SOFT).mean()), float((scaled > 1 - SOFT).mean())
+    neither = 1 - black - white
+    if neither > MAX_UNCLEAR * (neither + min(black, white)):
         raise InputError(
-            f"The mask {mask.name} is {found[0]} x {found[1]} pixels, {photo} is {size[0]} x {size[1]}.",
-            "Masks need the size of their (upright) photo: make the masks again from these photos.",
+            f"{file}, taken for the mask of {photo}, is not black and white: {neither:.0%} of its pixels are neither "
+            f"(need less than {min(black, white):.1%}, as many as are {'white' if white < black else 'black'}). "
+            "It looks like a photo, a depth map or labels.",
+            "Name the folder of the masks with `--masks FOLDER`, or run without: `--no-masks`.",
         )
+    return scaled > 0.5
+
+
+def _better_turned(kept: np.ndarray, other: Any, pixels: np.ndarray) -> np.ndarray:
+    """The one of two masks whose outline meets the photo's edges better."""
+    other_kept = np.asarray(other)
+    fits = [outline_fit(mask, pixels) for mask in (kept, other_kept)]
+    if None in fits or other_kept.shape != kept.shape:
+        return kept
+    return other_kept if fits[1].own > fits[0].own and fits[1].fits else kept  # type: ignore[union-attr]
+
+
+def _same_shape(found: tuple[int, int], size: tuple[int, int]) -> bool:
+    """Whether one is the other scaled, both sides rounded."""
+    across, down = found[0] / size[0], found[1] / size[1]
+    return abs(across - down) * max(size) <= max(1.0, across)
+
+
+def check_size(mask: Path, photo: str, found: tuple[int, int], size: tuple[int, int]) -> None:
+    """Raises InputError where the mask's size `found` has another shape than the upright photo's `size`."""
+    if _same_shape(found, size):
+        return
+    lies = " (it lies on its side)" if _same_shape(found[::-1], size) else ""
+    raise InputError(
+        f"The mask {mask.name} is {found[0]} x {found[1]} pixels, {photo} is {size[0]} x {size[1]}{lies}.",
+        "Masks need the size of their (upright) photo, or its shape: make the masks again from these photos, or run "
+        "without: `--no-masks`.",
+    )
+
+
+def resized(mask: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """A mask [H, W] bool at `size` (width, height); pixels that are half covered are not kept."""
+    import cv2
+
+    smaller = size[0] < mask.shape[1]
+    values = mask.astype(np.uint8) * 255
+    return cv2.resize(values, size, interpolation=cv2.INTER_AREA if smaller else cv2.INTER_LINEAR) > 127
 
 
 def write_mask(mask: np.ndarray, target: Path, size: tuple[int, int]) -> None:
-    import cv2
-
-    values = mask.astype(np.uint8) * 255
-    if values.shape[::-1] != size:
-        values = np.where(cv2.resize(values, size, interpolation=cv2.INTER_AREA) > 127, 255, 0).astype(np.uint8)
-    target.parent.mkdir(parents=True, exist_ok=True)
     from PIL import Image
 
+    values = (mask if mask.shape[::-1] == size else resized(mask, size)).astype(np.uint8) * 255
+    target.parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(values).save(target)

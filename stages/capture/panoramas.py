@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from stages.capture.photo_reading import PREVIEW_SIDE, RAW_SUFFIXES, UnusableError, telling_damage
+from stages.capture.photo_reading import PREVIEW_SIDE, UnusableError, telling_damage
+from stages.inputs.formats import RAW_SUFFIXES, open_image
 
 if TYPE_CHECKING:
     from jaxtyping import Float, UInt8
@@ -23,9 +24,7 @@ if TYPE_CHECKING:
 Mode = Literal["auto", "split", "off"]
 
 VIEW_DEG = 90.0  # field of view of a view, both ways
-LEVEL_STEP_DEG = (
-    45.0  # a feature is never more than half of it off the middle of some view, where it is little stretched
-)
+LEVEL_STEP_DEG = 45.0  # a feature is never more than half of it off the middle of some view, so little stretched
 STRETCH = 0.005  # a picture this near to twice as wide as high may be a sphere: some are reduced by odd factors
 # The left and the right border of a sphere are neighbours: their detail, smoothed over a part of the height taken off,
 # is alike. Plain walls have none in grey levels that would tell.
@@ -34,11 +33,11 @@ DETAIL_PART, MIN_DETAIL, MIN_LIKENESS = 0.03, 1.5, 0.5
 DARK, DARK_SHARE, LIT_SHARE = 16, 0.97, 0.6
 # Files of 360-degree cameras that only their makers' programs stitch.
 UNSTITCHED = {
-    ".insp": "a dual-fisheye picture of an Insta360",
-    ".insv": "a dual-fisheye video of an Insta360",
-    ".360": "a video of a GoPro Max before it is stitched",
+    ".insp": "an Insta360's photo of two fisheye lenses",
+    ".insv": "an Insta360's video of two fisheye lenses",
+    ".360": "a GoPro Max's video of two lenses",
 }
-STITCH = "export it as a 360-degree picture or video (equirectangular) with the camera's own program"
+STITCH = "stitch it and export it as a 360-degree picture or video (equirectangular) with the camera's own program"
 
 _PROJECTION = re.compile(rb"ProjectionType\s*(?:=\s*[\"']|>)\s*([A-Za-z]+)")
 
@@ -133,15 +132,13 @@ def _look(file: Path, mode: Mode) -> tuple[Sphere | None, bool | None]:
     if grey is None:
         return None, None
     if is_dual_fisheye(grey):
-        raise UnusableError(f"a dual-fisheye picture: {STITCH}")
+        raise UnusableError(f"a picture of two fisheye lenses: {STITCH}")
     return Sphere(size, size[0]), None if mode == "split" else borders_meet(grey)
 
 
 def _glance(file: Path) -> tuple[tuple[int, int], bytes, np.ndarray | None]:
     """Size, XMP, and, where it is twice as wide as high, grey pixels [H, W] uint8, perhaps reduced."""
-    from PIL import Image
-
-    with telling_damage(), Image.open(file) as stored:
+    with telling_damage(), open_image(file) as stored:
         size, xmp, grey = stored.size, _xmp(stored), None
         if abs(size[0] / size[1] / 2 - 1) <= STRETCH:
             stored.draft("L", (PREVIEW_SIDE, PREVIEW_SIDE // 2))

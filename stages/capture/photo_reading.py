@@ -3,28 +3,47 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator
+import threading
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from stages.capture.exif import ORIENTATION, camera_key, focal_px
+from stages.capture.colour import Colours, colours_of, in_srgb
+from stages.capture.exif import EXIF_IFD, GPS_IFD, NO_GPS, ORIENTATION, Gps, camera_key, focal_px, read_gps
+from stages.inputs.formats import TIFF, Kind, kind_of_head, open_image, read_head_bytes
 
-# What COLMAP's reader takes as it is; the rest is re-encoded.
-COLMAP_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"})
-COLMAP_FORMATS = frozenset({"JPEG", "MPO", "PNG", "TIFF", "BMP"})  # a name may lie: phones write HEIC as .jpg
-HEIF_SUFFIXES = frozenset({".heic", ".heif"})
-PHOTO_SUFFIXES = COLMAP_SUFFIXES | HEIF_SUFFIXES | {".webp", ".avif"}
-RAW_SUFFIXES = frozenset({".dng", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".rw2", ".raf", ".pef", ".srw"})
+# What COLMAP's reader takes as it is, with the suffixes that it knows; the rest is re-encoded.
+COLMAP_SUFFIXES = {
+    "JPEG": (".jpg", ".jpeg"),
+    "MPO": (".jpg", ".jpeg"),
+    "PNG": (".png",),
+    "TIFF": (".tif", ".tiff"),
+    "BMP": (".bmp",),
+}
+COLMAP_COMPRESSIONS = frozenset({"raw", "tiff_lzw", "tiff_adobe_deflate"})  # of TIFF
 LOSSY_FORMATS = frozenset({"JPEG", "MPO", "WEBP", "HEIF", "AVIF"})
 ANIMATED_FORMATS = frozenset({"WEBP", "AVIF"})  # a HEIF of several pictures is a burst; its first one counts
 
 TURNED, RAW_TURNED = (5, 6, 7, 8), (5, 6)  # EXIF orientations, and LibRaw's flips, that swap width and height
-PREVIEW_SIDE = 1000  # JPEG decodes at 1/2, 1/4 or 1/8 not below this; blur that matters still shows
+TIFF_WIDTH, TIFF_HEIGHT, DNG_VERSION = 256, 257, 50706
+PREVIEW_SIDE = 1000  # pictures are reduced to whole parts not below this; blur that matters still shows
 MIN_SIDE = 64  # a picture smaller than this is an icon or a thumbnail, not a photo
+THINNEST = 16  # nor is a line
+GREY_16_BIT = ("I;16", "I;16B", "I;16L", "I")
+WITH_ALPHA = ("RGBA", "LA", "PA", "RGBa", "La")
+
+# What reading a picture takes at most; measured: 5.4 (PNG), 7 (HEIF), 9 (turned TIFF), 13 (alpha channel), 16 (WebP).
+BYTES_PER_PIXEL = 16
+PROGRESSIVE_BYTES = 6  # libjpeg keeps all coefficients of a progressive JPEG, also where it reduces
+JPEG_MOST_REDUCED = 8
+LARGE_BYTES = 1 << 29  # pictures that take more are read one at a time
+GIB = 1 << 30
+_large = threading.Lock()
 
 
 class UnusableError(Exception):
@@ -40,6 +59,10 @@ class PhotoFile:
         width, height: upright size in pixels.
         camera: photos with the same value share one camera's intrinsics.
         has_focal: whether EXIF gives the focal length.
+        bytes_to_read: memory that reading it takes.
+        colours: what it says of its colours.
+        gps: what EXIF says of the place.
+        orientation: EXIF's, of the stored pixels.
     """
 
     source: str
@@ -47,6 +70,15 @@ class PhotoFile:
     height: int
     camera: str
     has_focal: bool
+    bytes_to_read: int
+    colours: Colours
+    gps: Gps = NO_GPS
+    orientation: int = 1
+
+    @property
+    def stored_size(self) -> tuple[int, int]:
+        """Width and height in pixels before it is turned upright."""
+        return (self.height, self.width) if self.orientation in TURNED else (self.width, self.height)
 
 
 @dataclass(frozen=True)
@@ -54,64 +86,76 @@ class Photo:
     """One photo as it was read.
 
     Attributes:
-        rgb: Pillow image, RGB, upright.
-        alpha: [H, W] bool, what its alpha channel keeps; None where it cuts nothing out.
+        rgb: Pillow image, RGB in sRGB, upright, reduced to what was asked for.
+        alpha: [H, W] bool, what its alpha channel keeps, not reduced; None where it cuts nothing out.
         exif: Pillow's EXIF of the file.
-        stored_size: width and height in pixels before it was turned upright.
+        size: width and height in pixels, upright, before it was reduced.
+        stored_size: the same before it was turned upright.
         orientation: EXIF orientation that was undone.
         lossy: whether the file's format loses detail anyway.
-        as_is: whether COLMAP would read the same pixels from the file itself.
+        as_is: the suffixes under which COLMAP reads the same pixels from the file itself; empty where it does not.
+        colours: what it said of its colours.
     """
 
     rgb: Any
     alpha: np.ndarray | None
     exif: Any
+    size: tuple[int, int]
     stored_size: tuple[int, int]
     orientation: int
     lossy: bool
-    as_is: bool
+    as_is: tuple[str, ...]
+    colours: Colours
 
 
-def register_formats() -> None:
-    """Teach Pillow HEIC (it has AVIF and WebP built in)."""
-    from pillow_heif import register_heif_opener
-
-    register_heif_opener()
-
-
-def read_photo(file: Path) -> Photo:
-    """The photo in `file`; `register_formats` must have been called for HEIC.
+def read_photo(file: Path, max_side: int) -> Photo:
+    """The photo in `file`, reduced to `max_side` pixels along its longest side; a JPEG while it is decoded.
 
     Raises:
-        UnusableError: it is damaged, an animation, too small, or a raw file without rawpy.
+        UnusableError: it is damaged, an animation, too small, too large for the memory that is free, or a raw file
+            without rawpy.
     """
     with telling_damage():
-        photo = _develop(file) if _is_raw(file) else _decode(file)
-    _check_side(photo.rgb.size)
+        photo = _develop(file, max_side) if _is_raw(file) else _decode(file, max_side)
+    _check_side(photo.size)
     return photo
 
 
-def read_head(file: Path, source: str) -> PhotoFile:
+def read_head(file: Path, source: str, max_side: int) -> PhotoFile:
     """As `read_photo`, of the file's head only: nothing is decoded.
 
     Raises:
-        UnusableError: it is no photo as far as the head tells, too small, or a raw file without rawpy.
+        UnusableError: it is no photo as far as the head tells, too small, too large for the memory that is free, or a
+            raw file without rawpy.
     """
     from PIL import Image
 
+    colours = Colours()
     with telling_damage():
         if _is_raw(file):
             with import_rawpy().imread(str(file)) as raw:
-                exif, size = _raw_exif(file, raw), (raw.sizes.width, raw.sizes.height)
-                size = size[::-1] if raw.sizes.flip in RAW_TURNED else size
+                exif, stored_size = _raw_exif(file, raw), (raw.sizes.width, raw.sizes.height)
+                size = stored_size[::-1] if raw.sizes.flip in RAW_TURNED else stored_size
+                needed = _bytes_of(stored_size)
         else:
-            with Image.open(file) as stored:
-                # the PNG plug-in's own `getexif` would decode the pixels, to look behind them
-                exif, size = Image.Image.getexif(stored), stored.size
+            with open_image(file) as stored:
+                exif = _exif_of(partial(Image.Image.getexif, stored))  # in front of the pixels
+                stored_size, size = _sizes(stored, exif)
+                needed = _bytes_to_read(stored, max_side)
+                colours = colours_of(stored.info, exif, _flat_mode(stored.mode))
     _check_side(size)
-    width, height = size[::-1] if exif.get(ORIENTATION) in TURNED else size
-    camera = camera_key(exif, (width, height), source)
-    return PhotoFile(source, width, height, camera, has_focal=focal_px(exif, size) is not None)
+    _check_memory(size, needed)
+    return PhotoFile(
+        source=source,
+        width=size[0],
+        height=size[1],
+        camera=camera_key(exif, size, source),
+        has_focal=focal_px(exif, stored_size) is not None,
+        bytes_to_read=needed,
+        colours=colours,
+        gps=read_gps(exif),
+        orientation=exif.get(ORIENTATION) or 1,
+    )
 
 
 def read_preview(file: Path) -> np.ndarray:
@@ -120,22 +164,42 @@ def read_preview(file: Path) -> np.ndarray:
     Raises:
         UnusableError: it cannot be decoded, or is a raw file without rawpy.
     """
-    from PIL import Image
-
     with telling_damage():
         if _is_raw(file):  # half a second each; the previews in raw files have any size, or are not there
-            return np.asarray(_develop(file).rgb)
-        with Image.open(file) as stored:
-            stored.draft("RGB", (PREVIEW_SIDE, PREVIEW_SIDE))
-            return np.asarray(stored.convert("RGB"))
+            return np.asarray(_develop(file, PREVIEW_SIDE).rgb)
+        with open_image(file) as stored, _memory_for(stored, PREVIEW_SIDE):
+            stored.draft(None, (PREVIEW_SIDE, PREVIEW_SIDE))
+            image, _ = _flat_and_alpha(stored)
+            image = image.reduce(max(1, min(image.size) // PREVIEW_SIDE))
+            return np.asarray(in_srgb(image, Colours()))
+
+
+def read_alpha(file: Path) -> np.ndarray | None:
+    """[H, W] bool of the upright photo, what its alpha channel keeps; None where it cuts nothing out.
+
+    Raises:
+        UnusableError: it cannot be decoded.
+    """
+    if _is_raw(file):
+        return None
+    with open_image(file) as stored:
+        if not {"A", "a"} & set(stored.getbands()) and "transparency" not in stored.info:
+            return None
+    return read_photo(file, PREVIEW_SIDE).alpha
 
 
 def _is_raw(file: Path) -> bool:
-    return file.suffix.lower() in RAW_SUFFIXES
+    head = read_head_bytes(file)
+    if kind_of_head(head, file.suffix.lower()) is Kind.RAW:
+        return True
+    if not head.startswith(TIFF):
+        return False
+    with open_image(file) as stored:
+        return DNG_VERSION in stored.tag_v2  # under another name
 
 
 def _check_side(size: tuple[int, int]) -> None:
-    if max(size) < MIN_SIDE:
+    if max(size) < MIN_SIDE or min(size) < THINNEST:
         raise UnusableError(f"only {size[0]} x {size[1]} pixels")
 
 
@@ -154,55 +218,157 @@ def telling_damage() -> Iterator[None]:
         raise UnusableError(f"cannot be read ({error})") from error
 
 
-def _decode(file: Path) -> Photo:
+def _decode(file: Path, max_side: int) -> Photo:
     from PIL import Image, ImageOps
 
-    with Image.open(file) as stored:
+    with open_image(file) as stored, _memory_for(stored, max_side):
         if getattr(stored, "n_frames", 1) > 1 and stored.format in ANIMATED_FORMATS:
             raise UnusableError("an animation")
-        exif = stored.getexif()
-        sixteen_bit = "16" in str(stored.tile[0][3]) if stored.tile else False
+        if stored.format == "JPEG":
+            _check_end(file)
+        exif = _exif_of(stored.getexif)  # a PNG's may stand behind its pixels
+        orientation = exif.get(ORIENTATION) or 1  # before `load`, which turns TIFF
+        stored_size, size = _sizes(stored, exif)
+        scale = min(1.0, max_side / max(size))
+        as_is = _colmap_suffixes(stored) if orientation == 1 and scale == 1 else ()
+        colours = colours_of(stored.info, exif, _flat_mode(stored.mode))
+        stored.draft(None, (max(1, int(stored.width * scale)), max(1, int(stored.height * scale))))
         stored.load()
-        orientation = exif.get(ORIENTATION, 1)
-        image = stored if orientation in (None, 0, 1) else ImageOps.exif_transpose(stored)
-        rgb, alpha = _rgb_and_alpha(image)
-        unchanged = image is stored and stored.mode == "RGB" and not sixteen_bit
+        image = stored if orientation == 1 else ImageOps.exif_transpose(stored)
+        flat, alpha = _flat_and_alpha(image)
+        if scale < 1:
+            flat = flat.resize([max(1, round(side * scale)) for side in size], Image.Resampling.LANCZOS)
+        rgb = in_srgb(flat, colours)
         return Photo(
             rgb=rgb,
             alpha=alpha,
             exif=exif,
-            stored_size=stored.size,
+            size=size,
+            stored_size=stored_size,
             orientation=orientation,
             lossy=stored.format in LOSSY_FORMATS,
-            as_is=unchanged and file.suffix.lower() in COLMAP_SUFFIXES and stored.format in COLMAP_FORMATS,
+            as_is=as_is if rgb is stored else (),
+            colours=colours,
         )
 
 
-def _rgb_and_alpha(image: Any) -> tuple[Any, np.ndarray | None]:
-    """8-bit RGB image and, where the alpha channel cuts something out, the mask [H, W] bool."""
+def _exif_of(read: Callable[[], Any]) -> Any:
+    """What `read` gives, EXIF of a picture that Pillow opened; an empty one where it is damaged."""
     from PIL import Image
 
-    if image.mode in ("I;16", "I;16B", "I;16L", "I"):  # 16-bit grey: Pillow's own conversion clips at 255
-        grey = (np.asarray(image).clip(0, 65535) // 257).astype(np.uint8)
-        return Image.fromarray(grey).convert("RGB"), None
+    try:
+        exif = read()
+        for ifd in (EXIF_IFD, GPS_IFD):
+            exif.get_ifd(ifd)
+    except Exception:  # Pillow raises nearly anything
+        return Image.Exif()
+    return exif
+
+
+def _sizes(stored: Any, exif: Any) -> tuple[tuple[int, int], tuple[int, int]]:
+    """Width and height as they are stored, and upright; Pillow gives the latter of a TIFF, and the former of others."""
+    size = stored.size
+    if stored.format == "TIFF":
+        size = stored.tag_v2[TIFF_WIDTH], stored.tag_v2[TIFF_HEIGHT]
+    return size, size[::-1] if exif.get(ORIENTATION) in TURNED else size
+
+
+def _colmap_suffixes(stored: Any) -> tuple[str, ...]:
+    """The suffixes under which COLMAP reads these pixels, 8-bit RGB, from the file itself."""
+    if stored.mode != "RGB" or (stored.tile and "16" in str(stored.tile[0][3])):
+        return ()
+    if stored.format == "TIFF" and (stored.n_frames > 1 or stored.info.get("compression") not in COLMAP_COMPRESSIONS):
+        return ()
+    return COLMAP_SUFFIXES.get(stored.format, ())
+
+
+def _flat_mode(mode: str) -> str:
+    """Of `_flat_and_alpha`'s image, by the mode of the picture."""
+    if mode in (*GREY_16_BIT, "1", "L", "LA", "La"):
+        return "L"
+    return mode if mode in ("CMYK", "LAB") else "RGB"
+
+
+def _flat_and_alpha(image: Any) -> tuple[Any, np.ndarray | None]:
+    """8-bit image without alpha, see `_flat_mode`; what the alpha channel keeps [H, W] bool, if it cuts anything."""
+    from PIL import Image
+
+    mode = _flat_mode(image.mode)
+    if image.mode in GREY_16_BIT:  # Pillow's own conversion clips at 255
+        return Image.fromarray((np.asarray(image).clip(0, 65535) // 257).astype(np.uint8)), None
     if image.mode == "F":
         raise UnusableError("a floating-point image")
-    if image.mode in ("RGBA", "LA", "PA", "RGBa", "La") or "transparency" in image.info:
+    alpha = None
+    if image.mode in WITH_ALPHA or "transparency" in image.info:
         image = image.convert("RGBA")
-        alpha = np.asarray(image.getchannel("A"))
-        return image.convert("RGB"), None if alpha.min() > 127 else alpha > 127
-    return image if image.mode == "RGB" else image.convert("RGB"), None
+        opacity = np.asarray(image.getchannel("A"))
+        alpha = None if opacity.min() > 127 else opacity > 127
+        image = image.convert("RGB")
+    return image if image.mode == mode else image.convert(mode), alpha
 
 
-def _develop(file: Path) -> Photo:
+# ---------------------------------------------------------------- memory
+@contextmanager
+def _memory_for(stored: Any, max_side: int) -> Iterator[None]:
+    """While a picture that Pillow opened is read: large ones take turns.
+
+    Raises:
+        UnusableError: the memory that is free is not enough.
+    """
+    needed = _bytes_to_read(stored, max_side)
+    if needed < LARGE_BYTES:
+        yield
+        return
+    with _large:
+        _check_memory(stored.size, needed)
+        yield
+
+
+def _bytes_to_read(stored: Any, max_side: int) -> int:
+    """Memory that reading a picture takes, reduced to `max_side` where its decoder can."""
+    if stored.format not in ("JPEG", "MPO"):
+        return _bytes_of(stored.size)
+    by = min(JPEG_MOST_REDUCED, 1 << (max(1, max(stored.size) // max_side).bit_length() - 1))
+    kept = PROGRESSIVE_BYTES * stored.width * stored.height if stored.info.get("progressive") else 0
+    return _bytes_of(stored.size) // by**2 + kept
+
+
+def _bytes_of(size: tuple[int, int]) -> int:
+    return BYTES_PER_PIXEL * size[0] * size[1]
+
+
+def _check_memory(size: tuple[int, int], needed: int) -> None:
+    """Raises UnusableError where reading a picture of `size` takes more memory than is free."""
+    import psutil
+
+    if needed >= LARGE_BYTES and needed > (free := psutil.virtual_memory().available):
+        raise UnusableError(
+            f"{size[0]} x {size[1]} pixels take {needed / GIB:.1f} GiB of memory to read, {free / GIB:.1f} are free"
+        )
+
+
+def _check_end(file: Path) -> None:
+    """Raises UnusableError where the last tenth of a JPEG is zeros: the room was there before the copy was cut off."""
+    with file.open("rb") as stream:
+        end = stream.seek(0, io.SEEK_END)
+        stream.seek(end - max(1, end // 10))
+        if not stream.read().strip(b"\0"):
+            raise UnusableError("half-copied: its end is zeros")
+
+
+# ---------------------------------------------------------------- raw files
+def _develop(file: Path, max_side: int) -> Photo:
     """A raw file with its camera's white balance; without automatic brightness, which would differ between photos."""
     from PIL import Image
 
-    rawpy = import_rawpy()
-    with rawpy.imread(str(file)) as raw:
+    with import_rawpy().imread(str(file)) as raw:
         exif = _raw_exif(file, raw)
         rgb = Image.fromarray(raw.postprocess(use_camera_wb=True, no_auto_bright=True, output_bps=8))
-    return Photo(rgb, None, exif, rgb.size, 1, lossy=False, as_is=False)
+    size = rgb.size
+    scale = min(1.0, max_side / max(size))
+    if scale < 1:
+        rgb = rgb.resize([max(1, round(side * scale)) for side in size], Image.Resampling.LANCZOS)
+    return Photo(rgb, None, exif, size, size, 1, lossy=False, as_is=(), colours=Colours())
 
 
 def import_rawpy() -> Any:
@@ -240,5 +406,5 @@ def _exif_in(data: bytes) -> Any:
         exif = Image.Exif()
         exif.load(data)
         return exif
-    with Image.open(io.BytesIO(data)) as preview:
+    with open_image(io.BytesIO(data)) as preview:
         return preview.getexif()

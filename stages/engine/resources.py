@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-import resource
 import sys
 import threading
 import time
 from types import TracebackType
 
 import psutil
+
+if sys.platform != "win32":
+    import resource
 
 INTERVAL_S = 0.2
 CHILDREN_EVERY = 3  # finding the children reads all of /proc, so it is done on each third sample only
@@ -70,10 +72,19 @@ class ResourceMeter:
 
 
 def _cpu_seconds() -> float:
-    usages = (resource.getrusage(resource.RUSAGE_SELF), resource.getrusage(resource.RUSAGE_CHILDREN))
-    return sum(usage.ru_utime + usage.ru_stime for usage in usages)
+    return time.process_time() + children_cpu_seconds()
+
+
+def children_cpu_seconds() -> float:
+    """User and system seconds of the children that this process has waited for; 0 on Windows, which keeps no count."""
+    if sys.platform == "win32":
+        return 0.0
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
 
 
 def _own_peak_rss() -> int:
+    if sys.platform == "win32":
+        return int(psutil.Process().memory_info().peak_wset)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak if sys.platform == "darwin" else peak * 1024

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import logging
+import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -14,7 +15,7 @@ from stages.engine.fingerprint import Identity, SourceDigests
 from stages.engine.manifest import Manifest, current_versions, describe_outputs, jsonable, now
 from stages.engine.resources import ResourceMeter
 from stages.engine.stage import Stage, StageContext
-from stages.engine.status import Present, StageStatus, stage_status
+from stages.engine.status import Present, StageStatus, previous_to_continue, stage_status
 from stages.engine.system import requirement_error
 from stages.engine.workspace import Workspace, disk_full_error, is_disk_full, storage_errors
 from stages.errors import ConfigError, HineusError, InputError, did_you_mean
@@ -106,7 +107,10 @@ def run_pipeline(
             else:
                 reason = forced[stage.name] if status.state == "fresh" else status.reason
                 listener.stage_started(stage, reason)
-                manifest = _run_stage(stage, present, status, device, workers, listener)
+                previous = None
+                if stage.name not in forced:
+                    previous = previous_to_continue(stage, workspace, config)
+                manifest = _run_stage(stage, present, status, previous, device, workers, listener)
                 outcome = _outcome("ran", reason, manifest)
                 status = StageStatus(stage.name, "fresh", (), manifest, manifest.identity)
             statuses[stage.name] = status
@@ -114,6 +118,12 @@ def run_pipeline(
             listener.stage_finished(stage, outcome)
             outcomes.append(outcome)
     return outcomes
+
+
+def naming_command(source: str, root: Path) -> str:
+    """The command that names the place of an outside path ("photos", "masks") to the workspace at `root`."""
+    option = "" if source == "photos" else f"--{source} "
+    return f"hineus run {option}{source.upper()} --workspace {shlex.quote(str(root))}"
 
 
 def _select(
@@ -139,18 +149,25 @@ def _select(
 
 
 def _run_stage(
-    stage: Stage[Any], present: Present, status: StageStatus, device: str, workers: int, listener: Listener
+    stage: Stage[Any],
+    present: Present,
+    status: StageStatus,
+    previous: Manifest | None,
+    device: str,
+    workers: int,
+    listener: Listener,
 ) -> Manifest:
     workspace, config, digests = present.workspace, present.config, present.digests
     identity = status.identity
     if identity is None:
         raise ValueError(f"stage {stage.name} was asked to run before the stages it needs: {status.reason}")
+    identity = replace(identity, previous=previous.digest if previous else None)
     given = {name: path for name in stage.sources if (path := digests.sources.get(name)) is not None}
     for name, path in given.items():
         if not digests.available(name):
             raise InputError(
                 f"Stage {stage.name} must run ({status.reason}), but its {name} are not at {path} any more.",
-                f"Bring them back, or name the new place: `hineus run PHOTOS --workspace {workspace.root}`.",
+                f"Bring them back, or name the new place: `{naming_command(name, workspace.root)}`.",
             )
 
     def progress(done: float, total: float, note: str = "") -> None:
@@ -171,9 +188,11 @@ def _run_stage(
         manifests={name: manifest for name in stage.reads_manifests if (manifest := workspace.published(name))},
         record=workspace.record if stage.reads_run else None,
         config=config if stage.reads_run else None,
+        previous=workspace.stage_folder(stage.name) if previous else None,
     )
     with ResourceMeter() as meter:
         numbers = _call(stage, context, workspace, status)
+    _tell_warnings(numbers, workspace.root)
     manifest = _describe(identity, out, numbers, meter, workspace)
     _check_outputs(stage, manifest)
     workspace.publish(stage.name, manifest)
@@ -198,10 +217,18 @@ def _call(
         if full:
             # The last publication is the best guess at how much this one needs.
             needed = max(status.manifest.size - written if status.manifest else 0, written, 1)
-            raise disk_full_error(workspace.root, f"running '{stage.name}'", needed) from error
+            raise disk_full_error(workspace.root, f"running '{stage.name}'", error, needed) from error
         if wanted := requirement_error(error, stage.name):
             raise wanted from error
         raise
+
+
+def _tell_warnings(numbers: Mapping[str, Any], root: Path) -> None:
+    """Those with a command to try. Results know no paths: the workspace is named here, and by the report's page."""
+    for warning in numbers.get("warnings", ()):
+        if command := warning.get("command"):
+            named = command.replace("--workspace WORKSPACE", f"--workspace {shlex.quote(str(root))}")
+            log.warning("%s Try: `%s`", warning["sentence"], named)
 
 
 def _check_outputs(stage: Stage[Any], manifest: Manifest) -> None:

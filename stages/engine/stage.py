@@ -47,6 +47,7 @@ class StageContext(Generic[P_co]):
         reads: what `read` may give; None: anything (for a stage that is called by itself).
         manifests: stage name -> its manifest, for `Stage.reads_manifests`.
         record, config: of the workspace, for `Stage.reads_run`.
+        previous: the stage's own last publication, for `Stage.continues`; None where there is none to go on from.
     """
 
     inputs: Mapping[str, Path]
@@ -62,6 +63,7 @@ class StageContext(Generic[P_co]):
     manifests: Mapping[str, Manifest] = field(default_factory=dict)
     record: Record | None = None
     config: BaseModel | None = None
+    previous: Path | None = None
 
     def read(self, artifact: Artifact[T]) -> T:
         """The artifact as an earlier stage published it.
@@ -72,6 +74,10 @@ class StageContext(Generic[P_co]):
         if self.reads is not None and artifact not in self.reads:
             raise ValueError(f"{artifact.name} is read without being declared")
         return artifact.load(self.inputs[artifact.stage])
+
+    def read_previous(self, artifact: Artifact[T]) -> T | None:
+        """The stage's own artifact as it published it last; None where there is nothing to go on from."""
+        return None if self.previous is None else artifact.load(self.previous)
 
     def write(self, artifact: Artifact[T], value: T) -> None:
         """Put an artifact of this stage into its folder."""
@@ -96,6 +102,8 @@ class Stage(Generic[P]):
         sources: names of outside paths ("photos", "masks") whose contents enter the fingerprint.
         reads_manifests: stages whose manifests it reads: what they cost, and with which settings they were made.
         reads_run: whether it reads what the run was started with: the workspace's record and the whole config.
+        continues: whether it may go on from its own last publication, made by this version with these settings. What
+            it was given to go on from enters its fingerprint (docs/adr/0013).
         summary: one line for `--help` and the progress bar.
     """
 
@@ -108,6 +116,7 @@ class Stage(Generic[P]):
     sources: tuple[str, ...] = ()
     reads_manifests: tuple[str, ...] = ()
     reads_run: bool = False
+    continues: bool = False
     summary: str = ""
 
     @property

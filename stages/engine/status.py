@@ -86,6 +86,16 @@ def stage_status(
     return StageStatus(stage.name, state, tuple(reasons), manifest, known)
 
 
+def previous_to_continue(stage: Stage[Any], workspace: Workspace, config: BaseModel) -> Manifest | None:
+    """The publication that a run of the stage would go on from: whole, and of the same version and settings."""
+    made, damage = _publication(stage, workspace, hashes=True)
+    if not stage.continues or made is None or damage:
+        return None
+    before = made.identity
+    alike = section_with_new_names(stage.name, before.params) == _params(stage, config)
+    return made if alike and before.version == stage.version else None
+
+
 def pipeline_status(pipeline: Sequence[Stage[Any]], present: Present, hashes: bool = False) -> list[StageStatus]:
     """How every stage stands. Reads only, so it needs no lock."""
     statuses: dict[str, StageStatus] = {}
@@ -134,10 +144,16 @@ def _identity_now(
     return Identity(
         stage=stage.name,
         version=stage.version,
-        params=jsonable(stage.settings(config).model_dump(mode="json")),
+        params=_params(stage, config),
         inputs=inputs,
         sources={name: _source_files(name, present.digests, before) for name in stage.sources},
+        previous=before.previous if before else None,
     )
+
+
+def _params(stage: Stage[Any], config: BaseModel) -> dict[str, Any]:
+    params: dict[str, Any] = jsonable(stage.settings(config).model_dump(mode="json"))
+    return params
 
 
 def _artifact_digests(stage: Stage[Any], earlier: Mapping[str, StageStatus]) -> dict[str, str]:
@@ -160,7 +176,9 @@ def _by_artifact(inputs: Mapping[str, str], stage: Stage[Any], earlier: Mapping[
 
 
 def _source_files(name: str, digests: SourceDigests, before: Identity | None) -> FileDigests | None:
-    # Photos that are no longer there are no reason to lose what was made from them.
-    if before is not None and name in before.sources and not digests.available(name):
+    # Photos that are no longer there are no reason to lose what was made from them; an empty folder is where a disk
+    # was mounted.
+    files = digests.files(name) if digests.available(name) else {}
+    if files == {} and before is not None and name in before.sources:
         return before.sources[name]
     return digests.files(name)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import re
+import sys
 from importlib import metadata
 
 from stages.errors import SystemRequirementError
@@ -31,7 +32,9 @@ def installed_version(package: str) -> str | None:
 
 
 def missing_libraries() -> list[str]:
-    """Names of those system libraries that cannot be loaded here."""
+    """Names of those system libraries that cannot be loaded here: of Linux, as the wheels of others bring theirs."""
+    if sys.platform != "linux":
+        return []
     missing = []
     for name in SYSTEM_LIBRARIES:
         try:

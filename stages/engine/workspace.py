@@ -15,7 +15,6 @@ removed. `recover` completes whichever of these steps a crash cut off.
 from __future__ import annotations
 
 import errno
-import fcntl
 import json
 import os
 import shutil
@@ -28,6 +27,7 @@ from typing import Any
 
 import psutil
 
+from stages.engine.locking import take
 from stages.engine.manifest import (
     MANIFEST,
     Manifest,
@@ -39,8 +39,10 @@ from stages.engine.manifest import (
 )
 from stages.engine.system import installed_version
 from stages.errors import WorkspaceError
+from stages.inputs.folders import WORKSPACE_RECORD, is_workspace, readable
 
 FORMAT = 1
+WORKSPACE_SUFFIX = "_hineus"  # of the folder that is made beside photos
 
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
 NOT_WRITABLE = (errno.EROFS, errno.EACCES, errno.EPERM, errno.ENOTDIR, errno.ENOENT)
@@ -59,6 +61,8 @@ class Record:
         preset: name of the preset the settings started from, if that is known.
         hineus: version of the program that wrote it.
         created: UTC time, ISO 8601.
+        root: the workspace's own absolute path when this was written, so that what was moved with it is found again;
+            empty in those of 0.2 and before.
     """
 
     format: int = FORMAT
@@ -66,6 +70,7 @@ class Record:
     preset: str | None = None
     hineus: str = ""
     created: str = ""
+    root: str = ""
 
 
 class Workspace:
@@ -85,7 +90,8 @@ class Workspace:
                 holds something else, which stages would overwrite.
         """
         root = Path(root).absolute()
-        path = root / "workspace.json"
+        _check_name(root)
+        path = root / WORKSPACE_RECORD
         try:
             text = path.read_text(encoding="utf-8")
         except (FileNotFoundError, NotADirectoryError):
@@ -149,9 +155,9 @@ class Workspace:
 
     def _take(self, descriptor: int) -> None:
         try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            take(descriptor)
         except BlockingIOError:
-            raise _busy_error(self.root, os.pread(descriptor, 4096, 0)) from None
+            raise _busy_error(self.root, (self.root / ".lock").read_bytes()) from None
         except OSError as error:
             # Some network file systems have no locks. Working without one is better than not working.
             if error.errno not in LOCKS_UNSUPPORTED:
@@ -159,7 +165,8 @@ class Workspace:
         holder = {"pid": os.getpid(), "host": socket.gethostname(), "since": now()}
         with storage_errors(self.root, "opening the workspace"):
             os.ftruncate(descriptor, 0)
-            os.pwrite(descriptor, json.dumps(holder).encode(), 0)
+            os.lseek(descriptor, 0, os.SEEK_SET)
+            os.write(descriptor, json.dumps(holder).encode())
 
     def in_use(self) -> bool:
         """Whether a process on this machine that took the lock is still there. Takes no lock, so it disturbs none."""
@@ -183,10 +190,11 @@ class Workspace:
             preset=preset,
             hineus=_hineus_version(),
             created=self.record.created or now(),
+            root=str(self.root),
         )
         header = f"# The settings of the last run (preset: {preset or 'none'}). Use them again with --config.\n"
         with storage_errors(self.root, "keeping the settings"):
-            _write(self.root / "workspace.json", json.dumps(asdict(self.record), indent=1) + "\n")
+            _write(self.root / WORKSPACE_RECORD, json.dumps(asdict(self.record), indent=1) + "\n")
             _write(self.config_path, header + yaml.safe_dump(jsonable(config), sort_keys=False))
 
     # ------------------------------------------------------------ stages
@@ -258,7 +266,7 @@ def storage_errors(root: Path, doing: str, needed: int | None = None) -> Iterato
         yield
     except OSError as error:
         if error.errno in DISK_FULL:
-            raise disk_full_error(root, doing, needed) from error
+            raise disk_full_error(root, doing, error, needed) from error
         if error.errno in NOT_WRITABLE:
             raise WorkspaceError(
                 f"The workspace {root} cannot be written while {doing}: {error.strerror} ({error.filename}).",
@@ -267,10 +275,16 @@ def storage_errors(root: Path, doing: str, needed: int | None = None) -> Iterato
         raise
 
 
-def disk_full_error(root: Path, doing: str, needed: int | None = None) -> WorkspaceError:
+def disk_full_error(root: Path, doing: str, error: BaseException, needed: int | None = None) -> WorkspaceError:
+    free = free_bytes(root)
+    if isinstance(error, OSError) and error.errno == errno.EDQUOT:
+        return WorkspaceError(
+            f"Your quota is used up while {doing}, though the disk at {root} has {show_bytes(free)} free.",
+            "Nothing published is lost: free some of yours (`quota -s`) and run the same command again to go on.",
+        )
     least = f"at least {show_bytes(needed)} more needed" if needed else "more is needed"
     return WorkspaceError(
-        f"The disk is full while {doing}: {show_bytes(free_bytes(root))} free at {root}, {least}.",
+        f"The disk is full while {doing}: {show_bytes(free)} free at {root}, {least}.",
         "Nothing published is lost: free some space and run the same command again to go on.",
     )
 
@@ -318,13 +332,22 @@ def _busy_error(root: Path, holder: bytes) -> WorkspaceError:
 
 
 # ---------------------------------------------------------------- opening
+def _check_name(root: Path) -> None:
+    """Raises WorkspaceError where libraries that read and write in the workspace cannot take its path."""
+    try:
+        str(root).encode()
+    except UnicodeEncodeError as error:
+        raise WorkspaceError(
+            f"The workspace {readable(str(root))} has a name that is not UTF-8, which OpenCV cannot read.",
+            "Choose another folder with `--workspace DIR`, or rename what is in its way with `mv`.",
+        ) from error
+
+
 def _new_workspace(root: Path, create: bool) -> Workspace:
     if root.exists() and not root.is_dir():
         raise WorkspaceError(f"{root} is a file, not a workspace folder.", "Choose another one with `--workspace DIR`.")
     if not create:
-        raise WorkspaceError(
-            f"There is no workspace at {root}.", f"Make one with `hineus run PHOTOS --workspace {root}`."
-        )
+        raise _no_workspace(root)
     # What a first run leaves when it is killed at once, or a workspace whose record was removed, may go on.
     strangers = [path.name for path in root.iterdir() if not _is_own(path)] if root.is_dir() else []
     if strangers:
@@ -336,8 +359,15 @@ def _new_workspace(root: Path, create: bool) -> Workspace:
     return Workspace(root, Record())
 
 
+def _no_workspace(root: Path) -> WorkspaceError:
+    beside = root.with_name(f"{root.name}{WORKSPACE_SUFFIX}")
+    if is_workspace(beside):
+        return WorkspaceError(f"{root} is no workspace.", f"That of the photos in it is {beside}.")
+    return WorkspaceError(f"There is no workspace at {root}.", f"Make one with `hineus run PHOTOS --workspace {root}`.")
+
+
 def _is_own(path: Path) -> bool:
-    names = (".lock", ".work", "hineus.log", "config.yaml", "workspace.json.tmp", "config.yaml.tmp")
+    names = (".lock", ".work", "hineus.log", "config.yaml", f"{WORKSPACE_RECORD}.tmp", "config.yaml.tmp")
     return path.name in names or (path / MANIFEST).is_file()
 
 
@@ -352,7 +382,8 @@ def _parse_record(text: str, path: Path) -> Record:
                 "Get the newer one with `pip install --upgrade hineus`, or use another `--workspace DIR`.",
             )
         sources = dict(data.get("sources", {}))
-        return Record(found, sources, data.get("preset"), data.get("hineus", ""), data.get("created", ""))
+        texts = {name: str(data.get(name, "")) for name in ("hineus", "created", "root")}
+        return Record(found, sources, data.get("preset"), **texts)
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise WorkspaceError(
             f"{path} is damaged ({error}).",
@@ -401,6 +432,8 @@ def _write(path: Path, text: str) -> None:
 
 
 def _sync(path: Path) -> None:
+    if os.name == "nt":  # it syncs neither folders nor files that are open for reading
+        return
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)

@@ -6,7 +6,7 @@ import platform
 from importlib.metadata import version
 from pathlib import Path
 
-from stages.reconstruct import available_cores
+from stages.limits import available_cores
 
 LIBRARIES = ("hineus", "torch", "pycolmap", "open3d")
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from stages.compiling import njit
 
 
 def thin(points: np.ndarray, distance: float) -> np.ndarray:

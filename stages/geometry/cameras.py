@@ -113,6 +113,9 @@ class PosedScene:
         ground: plane of the ground or table in the scene frame, or None where none was found.
         growable: whether the region may grow where it turns out to cut what the photos show: it was found, not given.
         roi_scale: the `undistort.roi_scale` that would have made a region which holds this one.
+        contents: digest of each camera's photo, for when some are added or removed; empty where it is not known.
+        lineage: scenes with the same one are of one capture at different times, made in the same way, and the photos
+            that they share are at the same places in the frame of the poses; empty: with no other.
     """
 
     cameras: PinholeCameras
@@ -125,6 +128,8 @@ class PosedScene:
     ground: Plane | None = None
     growable: bool = False
     roi_scale: float = 1.0
+    contents: tuple[str, ...] = ()
+    lineage: str = ""
 
     def world_from_scene(self, place: Place) -> Similarity:
         """To the frame of the results."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -12,6 +13,11 @@ from stages.geometry.similarity import Similarity
 
 if TYPE_CHECKING:
     from jaxtyping import Float
+
+
+# A region that was found before stays where the new one reaches no further beyond it than this, in its radii, fills so
+# much of it, and has the same up within so many degrees.
+MAX_REACH, MIN_FILLED, MAX_TILT_DEG = 1.1, 0.8, 5.0
 
 
 def rotation_onto(source: Float[np.ndarray, " 3"], target: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "3 3"]:
@@ -35,6 +41,17 @@ def scene_frame(center: Float[np.ndarray, " 3"], radius: float, up: Float[np.nda
     if not radius > 0:
         raise ValueError(f"got radius {radius}, expected a positive one")
     return Similarity(float(radius), rotation_onto(np.array([0.0, 0.0, 1.0]), up / np.linalg.norm(up)), center)
+
+
+def still_fits(frame: Similarity, found: Similarity) -> bool:
+    """Whether the region of a frame can stay where another was found: it holds that, is not much larger, and upright.
+
+    Both from the normalised frame to that of the poses, see `scene_frame`.
+    """
+    frame_from_found = frame.inverse().compose(found)
+    reach = float(np.linalg.norm(frame_from_found.translation)) + frame_from_found.scale
+    upright = float(frame_from_found.rotation[2, 2]) > math.cos(math.radians(MAX_TILT_DEG))
+    return reach < MAX_REACH and frame_from_found.scale > MIN_FILLED and upright
 
 
 def into_frame(cameras: PinholeCameras, old_from_new: Similarity) -> PinholeCameras:

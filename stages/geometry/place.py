@@ -12,14 +12,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from stages.geometry.earth import east_north_up, east_north_up_axes, from_east_north_up, middle_position
 from stages.geometry.plane import Plane
 from stages.geometry.similarity import Similarity, align_points
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-# WGS 84: semi-major axis in metres and flattening.
-EARTH_RADIUS, FLATTENING = 6378137.0, 1 / 298.257223563
 MIN_LOCATED = 4
 # This part of the positions at least must agree on one place.
 MIN_AGREEING = 0.6
@@ -28,12 +27,48 @@ MIN_STRIP = 0.05
 # The residual may be this part of the positions' spread: a larger one says that GPS wanders as far as the photographer.
 MAX_RESIDUAL = 0.25
 SAMPLES, OUTLIER_SIGMAS = 500, 3.0
+EXACT_M = 1e-3  # positions that are made up agree to the last digit; one that misses by this is no outlier
 # Coordinates keep this part of the region's radius in 32 bits; where they would not, the origin moves.
 PRECISION = 1e-5
 # The sphere about a given box has some air at the corners, because the mesh is cut off near the sphere.
 BOX_MARGIN = 1.05
 # Edges of a box as pairs of corners; bit k of a corner's number is its side of axis k.
 BOX_EDGES = [(i, i | bit) for i in range(8) for bit in (1, 2, 4) if not i & bit]
+
+
+@dataclass(frozen=True)
+class ControlMark:
+    """Where a photo shows a control point.
+
+    Attributes:
+        error_px: pixels of the photo as it was taken by which it misses the point; None where that has no position.
+        used: whether it agrees with the others and took part.
+    """
+
+    photo: str
+    error_px: float | None
+    used: bool
+
+
+@dataclass(frozen=True)
+class ControlPoint:
+    """A point with known coordinates, and how the photos meet them.
+
+    Attributes:
+        coordinates: as they were given.
+        check: whether it only checks the result. used: whether it took part in the fit.
+        miss: metres east, north, up (or x, y, z) from where it should be to where the photos see it; None where they do
+            not tell.
+        left_out_m: distance from where it should be by the fit without it, metres; None where the others do not tell.
+    """
+
+    name: str
+    coordinates: tuple[float, float, float]
+    check: bool
+    used: bool
+    miss: tuple[float, float, float] | None
+    left_out_m: float | None
+    marks: tuple[ControlMark, ...]
 
 
 @dataclass(frozen=True)
@@ -48,7 +83,12 @@ class Place:
         origin: latitude and longitude in degrees and altitude in metres of the world's origin (x east, y north,
             z up), or None.
         gps_residual: root mean square distance in metres of the cameras from their GPS positions, or None.
-        up: unit, in the world, where GPS or the settings tell it; None: as the scene has it.
+        up: unit, in the world, where GPS, control points or the settings tell it; None: as the scene has it.
+        control: the ground control points, where there are any.
+        control_residual: root mean square distance in metres of those used from where they should be, or None.
+        crs: the coordinate system of which world coordinates are a part, as "EPSG:32632"; empty where `origin` says
+            it, or nothing.
+        offset: added to world coordinates it gives those of `crs`, or of the control points; None where there are none.
     """
 
     world_from_poses: Similarity
@@ -58,6 +98,10 @@ class Place:
     origin: tuple[float, float, float] | None = None
     gps_residual: float | None = None
     up: Float[np.ndarray, " 3"] | None = None
+    control: tuple[ControlPoint, ...] = ()
+    control_residual: float | None = None
+    crs: str = ""
+    offset: tuple[float, float, float] | None = None
 
     @property
     def units(self) -> str:
@@ -73,9 +117,18 @@ class Place:
             latitude, longitude, altitude = self.origin
             text += (
                 f" The origin is at latitude {latitude:.6f}, longitude {longitude:.6f}, altitude {altitude:.1f} m; "
-                f"x points east, y north, z up (GPS residual {self.gps_residual:.2g} m)."
+                f"x points east, y north, z up{self._residual()}."
             )
+        elif self.offset is not None:
+            added = " ".join(f"{value:.0f}" for value in self.offset)
+            whose = self.crs or "the control points"
+            text += f" Coordinates plus {added} are those of {whose}{self._residual()}."
         return text
+
+    def _residual(self) -> str:
+        if self.control_residual is not None:
+            return f" (residual of the control points {self.control_residual:.2g} m)"
+        return "" if self.gps_residual is None else f" (GPS residual {self.gps_residual:.2g} m)"
 
     def rescaled(self, factor: float, scale_from: str, scale_error: float | None) -> Place:
         """The same place with all lengths multiplied by `factor`, the origin where it was."""
@@ -92,8 +145,39 @@ class Place:
         """The same place with its origin near `center` (world) where 32-bit coordinates would lose precision."""
         if np.abs(center).max() * np.finfo(np.float32).eps < PRECISION * radius:
             return self
-        shift = Similarity(1.0, np.eye(3), -np.round(center))
-        return replace(self, world_from_poses=shift.compose(self.world_from_poses), origin=None)
+        shift, turn, origin = np.round(center), np.eye(3), None
+        if self.origin is not None:
+            latitude, longitude, altitude = from_east_north_up(shift[None], self.origin)[0].tolist()
+            origin = latitude, longitude, altitude
+            turn = east_north_up_axes(origin) @ east_north_up_axes(self.origin).T
+        move = Similarity(1.0, turn, -(turn @ shift))
+        return replace(
+            self,
+            world_from_poses=move.compose(self.world_from_poses),
+            origin=origin,
+            offset=None if self.offset is None else _added(self.offset, shift),
+        )
+
+    def in_grid(self, crs: str, enu: Float[np.ndarray, "n 3"], grid: Float[np.ndarray, "n 3"]) -> Place:
+        """The same place with world axes, lengths and, but for an offset, coordinates of a map's grid.
+
+        Args:
+            enu: points about the scene, in this world. grid: the same in the coordinate system `crs`.
+        """
+        offset = np.round(grid.mean(0))
+        to_grid = align_points(enu, grid - offset)
+        return replace(
+            self,
+            world_from_poses=to_grid.compose(self.world_from_poses),
+            origin=None,
+            crs=crs,
+            offset=_added((0.0, 0.0, 0.0), offset),
+        )
+
+
+def _added(offset: tuple[float, float, float], shift: Float[np.ndarray, " 3"]) -> tuple[float, float, float]:
+    x, y, z = (np.array(offset) + shift).tolist()
+    return x, y, z
 
 
 @dataclass(frozen=True)
@@ -175,25 +259,6 @@ class Located:
         return self.world_from_poses.rotation[2]
 
 
-def east_north_up(positions: Float[np.ndarray, "n 3"], origin: tuple[float, float, float]) -> Float[np.ndarray, "n 3"]:
-    """Metres east, north and up of `origin` of positions: latitude, longitude (degrees), altitude (m)."""
-    latitude, longitude = np.radians(origin[:2])
-    east = np.array([-np.sin(longitude), np.cos(longitude), 0.0])
-    up = np.array([np.cos(latitude) * np.cos(longitude), np.cos(latitude) * np.sin(longitude), np.sin(latitude)])
-    return (_earth_centred(positions) - _earth_centred(np.array([origin]))) @ np.stack([east, np.cross(up, east), up]).T
-
-
-def _earth_centred(positions: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    """Metres from the Earth's centre (WGS 84)."""
-    latitude, longitude = np.radians(positions[:, :2]).T
-    altitude = positions[:, 2]
-    squared_eccentricity = FLATTENING * (2 - FLATTENING)
-    normal_radius = EARTH_RADIUS / np.sqrt(1 - squared_eccentricity * np.sin(latitude) ** 2)
-    across = (normal_radius + altitude) * np.cos(latitude)
-    along_axis = (normal_radius * (1 - squared_eccentricity) + altitude) * np.sin(latitude)
-    return np.stack([across * np.cos(longitude), across * np.sin(longitude), along_axis], 1)
-
-
 def locate(centers: Float[np.ndarray, "n 3"], positions: Float[np.ndarray, "n 3"]) -> Located:
     """Align camera centres to their GPS positions.
 
@@ -208,9 +273,11 @@ def locate(centers: Float[np.ndarray, "n 3"], positions: Float[np.ndarray, "n 3"
     """
     if len(centers) < MIN_LOCATED:
         raise ValueError(f"{len(centers)} photos carry a GPS position with altitude, {MIN_LOCATED} are needed")
-    latitude, longitude, altitude = (float(value) for value in np.median(positions, axis=0))
-    origin = latitude, longitude, altitude
+    origin = middle_position(positions)
     targets = east_north_up(positions, origin)
+    apart = len(np.unique(np.round(targets / EXACT_M), axis=0))
+    if apart < MIN_LOCATED:
+        raise ValueError(f"{len(centers)} photos carry only {apart} different positions, {MIN_LOCATED} are needed")
     _, lengths, _ = np.linalg.svd(centers - centers.mean(0))
     if lengths[1] < MIN_STRIP * lengths[0]:
         raise ValueError("the photos were taken from one line, and the turn about it stays open")
@@ -250,4 +317,4 @@ def _agreeing(centers: Float[np.ndarray, "n 3"], targets: Float[np.ndarray, "n 3
         median = np.sort(misses)[min(len(misses) - 1, (len(misses) + 3) // 2)]
         if median < best:
             best, best_misses = float(median), misses
-    return best_misses <= max(OUTLIER_SIGMAS * best, 1e-9)
+    return best_misses <= max(OUTLIER_SIGMAS * best, EXACT_M)

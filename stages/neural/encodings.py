@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING, Protocol, runtime_checkable
 import torch
 from torch import Tensor
 
+from stages.caches import compiler_folder
 from stages.neural.acceleration import takes_kernel
 from stages.neural.encoding_shapes import Encoding, Frequencies, HashGrid
 
@@ -147,6 +148,7 @@ def kernels_for(points: Float[Tensor, "n 3"], grid: HashGrid) -> EncodingKernels
 def _cuda_kernels(features: int, device: torch.device) -> EncodingKernels | None:
     """The Triton kernels, if they are there and do on this device what the reference does; says once if not."""
     try:
+        compiler_folder("TRITON_CACHE_DIR", "triton")
         from stages.neural import encoding_cuda
 
         error = disagreement(encoding_cuda, HashGrid(3, features, 9, 4, 16), device)

@@ -14,7 +14,8 @@ signed ones for counting from the end, which costs as much as the read.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange, uint32
+
+from stages.compiling import njit, prange, uint32
 
 PRIME_Y, PRIME_Z = np.uint32(2654435761), np.uint32(805459861)
 CHUNK = 512  # points whose rows, features and Jacobian stay in a core's L2 cache

@@ -91,7 +91,7 @@ class Renderer:
         """Distances of the samples, and the proposal network's histogram where it made them."""
         params = self.params.sampling
         if self.fields.proposal is None:
-            return importance_distances(self.cache, batch, params.samples, moment.width, generator), None
+            return importance_distances(self.cache, batch, params.samples, moment.scale, generator), None
         distances, edges, weights = proposal_distances(
             self.fields.proposal, batch, params.proposal_samples, params.samples, generator
         )

@@ -145,7 +145,11 @@ class SdfCache:
 
 @torch.no_grad()
 def importance_distances(
-    cache: SdfCache, rays: Rays, num_samples: int, scale: float, generator: torch.Generator | None
+    cache: SdfCache,
+    rays: Rays,
+    num_samples: int,
+    scale: Float[Tensor, ""] | float,
+    generator: torch.Generator | None,
 ) -> Float[Tensor, "r {num_samples}"]:
     """Sorted sample distances, drawn by inverse CDF from the cache's rendering weights.
 
@@ -153,7 +157,8 @@ def importance_distances(
     `EVEN_SHARE` is spread evenly. One stratified draw per sample; the strata's centres without a generator.
     """
     places = stratified(len(rays), num_samples, generator, rays.origins.device)
-    scale = max(scale, 0.5 * cache.cell)
+    finest = 0.5 * cache.cell
+    scale = scale.clamp(min=finest) if isinstance(scale, Tensor) else max(scale, finest)
     if not takes_kernel(rays.origins):
         return importance_distances_reference(cache, rays, places, scale)
     from stages.neural import kernels
@@ -161,14 +166,14 @@ def importance_distances(
     distances = torch.empty(places.shape)
     given = (each.contiguous().numpy() for each in (rays.origins, rays.directions, rays.entry, rays.leave, places))
     kernels.importance_distances(
-        cache.values[0, 0].numpy(), *given, scale, FLAT, EVEN_SHARE, _EVEN_FLOOR, _NUM_BINS, distances.numpy()
+        cache.values[0, 0].numpy(), *given, float(scale), FLAT, EVEN_SHARE, _EVEN_FLOOR, _NUM_BINS, distances.numpy()
     )
     return distances
 
 
 @torch.no_grad()
 def importance_distances_reference(
-    cache: SdfCache, rays: Rays, places: Float[Tensor, "r k"], scale: float
+    cache: SdfCache, rays: Rays, places: Float[Tensor, "r k"], scale: Float[Tensor, ""] | float
 ) -> Float[Tensor, "r k"]:
     """Distances at places in [0, 1) of the weights' CDF, in plain torch.
 

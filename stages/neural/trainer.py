@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from stages.neural.fields import Fields, FieldShape
 from stages.neural.proposal import interlevel_loss, sample_edges, updates_now
 from stages.neural.rendered import Rendered
 from stages.neural.renderer import Renderer
+from stages.neural.replaying import Replay
 from stages.neural.sampling import SdfCache
 from stages.neural.schedules import Moment
 from stages.neural.sightings import Sightings, sighting_loss
@@ -84,6 +86,10 @@ class Trainer:
         self.renderer = Renderer(self.fields, self.cache, params, self.terms)
         self.step_index = 0
         self.cache_step = -(10**9)
+        self.replay = Replay(self.device, self.generator) if self._replays() else None
+        # What a graph reads anew at each step: the density's scale, the weight of the sightings.
+        self._scale, self._sparse_weight = torch.zeros(2, device=self.device).unbind()
+        self._keep_rates_on_device()
 
     def start_from(self, distances: Float[np.ndarray, "g g g"]) -> float:
         """Bring the SDF to distances at the centres of a grid over [-1, 1]^3, before the first step.
@@ -119,9 +125,25 @@ class Trainer:
     # ------------------------------------------------------------------ one step
     def step(self, progress: float) -> dict[str, Tensor]:
         """One optimiser step at progress in [0, 1]; returns its terms and checks, batch means as tensors (no sync)."""
-        sampling, schedule, weights = self.params.sampling, self.params.schedule, self.params.losses
+        schedule, weights = self.params.schedule, self.params.losses
         moment = self.moment(progress)
         self._refresh_cache(moment)
+        decay = schedules.warm_up_then_decay if schedule.lr_decay == "cosine" else schedules.warm_up_then_exponential
+        self._set_rates(decay(progress, schedule.lr_warm_up, schedule.lr_final))
+        sparse_weight = weights.sparse * schedules.fade_out(progress, weights.sparse_until)
+        if self.replay is None:
+            numbers = self._update(moment, sparse_weight)
+        else:
+            self._scale.fill_(moment.scale)
+            self._sparse_weight.fill_(sparse_weight)
+            current = replace(moment, scale=self._scale)
+            numbers = self.replay(lambda: self._update(current, self._sparse_weight), moment.levels)
+        self.step_index += 1
+        return numbers
+
+    def _update(self, moment: Moment, sparse_weight: Tensor | float) -> dict[str, Tensor]:
+        """Rays, losses, gradients, and the optimiser's step."""
+        sampling, weights = self.params.sampling, self.params.losses
         batch = self.photos.draw(sampling.rays, self.generator)
         places, sparse_weights = self.sightings.draw(weights.sparse_batch, weights.sparse_step, self.generator)
         anywhere = torch.rand(sampling.free_points, 3, generator=self.generator, device=self.device) * 2 - 1
@@ -149,7 +171,7 @@ class Trainer:
             rgb_loss
             + weights.eikonal * eikonal_loss
             + sum(weight * term_loss for weight, term_loss in of_terms.values())
-            + weights.sparse * schedules.fade_out(progress, weights.sparse_until) * sparse_loss
+            + sparse_weight * sparse_loss
             + weights.mask * mask_loss
             + weights.exposure * exposure_loss
             + proposal_loss
@@ -157,12 +179,7 @@ class Trainer:
         self._forget_gradients()
         with short_products(self.mixed, self.device):
             loss.backward()
-        decay = schedules.warm_up_then_decay if schedule.lr_decay == "cosine" else schedules.warm_up_then_exponential
-        factor = decay(progress, schedule.lr_warm_up, schedule.lr_final)
-        for group in self.optimizer.param_groups:
-            group["lr"] = group["base_lr"] * factor
         self.optimizer.step()
-        self.step_index += 1
         with torch.no_grad():
             squared = ((exposed - batch.colors) ** 2).mean(1)
             if batch.masks is None:
@@ -183,6 +200,27 @@ class Trainer:
                 "reflected": rendered.reflected.mean(),
                 "trust": trust.detach().min(),
             }
+
+    def _replays(self) -> bool:
+        """Whether steps can be a CUDA graph: nothing but levels changes in how they go.
+
+        The paper's terms look at the progress and may wait for the device; a proposal network is not trained in each.
+        """
+        scheduled = self.params.density.scale == "scheduled" and self.fields.proposal is None
+        return self.device.type == "cuda" and scheduled and not self.terms.at_work
+
+    def _keep_rates_on_device(self) -> None:
+        """Learning rates that a graph reads anew, where there is one."""
+        if self.replay is not None:
+            for group in self.optimizer.param_groups:
+                group |= {"lr": torch.tensor(group["base_lr"], device=self.device), "capturable": True}
+
+    def _set_rates(self, factor: float) -> None:
+        for group in self.optimizer.param_groups:
+            if isinstance(group["lr"], Tensor):
+                group["lr"].fill_(group["base_lr"] * factor)
+            else:
+                group["lr"] = group["base_lr"] * factor
 
     def _forget_gradients(self) -> None:
         """None for all gradients, but zero for the tables' on the CPU: making them anew takes longer than filling."""
@@ -270,6 +308,7 @@ class Trainer:
     def load_state(self, state: dict[str, Any]) -> None:
         self.fields.load_state_dict(state["fields"])
         self.optimizer.load_state_dict(state["optimizer"])
+        self._keep_rates_on_device()
         self.cache.values.copy_(state["cache"])
         self.cache_step = state["cache_step"]
         self.generator.set_state(state["generator"].cpu())

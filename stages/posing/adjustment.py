@@ -70,13 +70,15 @@ class LastAdjustment:
     pose_error: PoseError | None
 
 
-def adjust_last(model: Any, params: Any, threads: int) -> LastAdjustment:
+def adjust_last(model: Any, params: Any, threads: int, known: Mapping[int, Lens] | None = None) -> LastAdjustment:
     """Free what the photos determine, and adjust once more with all observations.
 
     Args:
         model: pycolmap reconstruction; it stays as it is.
         params: `configs.params.SfmParams`.
         threads: one for the same result every time.
+        known: camera id -> lens of a model that this one goes on from. Nothing is tried then: these keep what was freed
+            of them, others nothing, and all is adjusted.
     """
     if model.num_reg_images() > MOST_PHOTOS:
         log.info("the lens stays as it is: the last adjustment is for up to %d photos", MOST_PHOTOS)
@@ -86,9 +88,12 @@ def adjust_last(model: Any, params: Any, threads: int) -> LastAdjustment:
         return LastAdjustment(model, lenses=(), pose_error=None)
     freed: Freed = {camera_id: frozenset() for camera_id in _photo_counts(model)}
     trials: dict[int, list[LensTrial]] = {}
-    if params.refine_lens == "auto":
+    if known is not None:
+        freed = {camera_id: frozenset(known[camera_id].freed if camera_id in known else ()) for camera_id in freed}
+        trials = {camera_id: list(lens.trials) for camera_id, lens in known.items()}
+    elif params.refine_lens == "auto":
         freed, trials = try_freedoms(model, params.seed, threads)
-    if any(freed.values()):
+    if any(freed.values()) or known is not None:
         model = bundle_adjust(model, freed, threads)
     precision = estimate_precision(model, _free(model, freed))
     lenses = tuple(

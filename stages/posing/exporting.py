@@ -5,6 +5,7 @@ Everything is in the world frame, that of the exported PLY and OBJ.
 
 from __future__ import annotations
 
+import logging
 import shutil
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,8 @@ from stages.geometry.cameras import PosedScene
 from stages.geometry.normalisation import into_frame
 from stages.geometry.place import Place
 from stages.posing.undistortion import registered_photos
+
+log = logging.getLogger(__name__)
 
 SPARSE, TRANSFORMS, POINTS = "sparse", "transforms.json", "sparse_pc.ply"
 
@@ -39,6 +42,8 @@ def write_colmap(undistort: Path, sfm: Path, place: Path, out: Path) -> dict[str
 
 def write_transforms(undistort: Path, sfm: Path, place: Path, out: Path) -> dict[str, Any]:
     """Write images/, masks/ (where there are any), transforms.json and a PLY of the sparse points.
+
+    transforms.json names the masks where every photo has one.
 
     Arguments and numbers are those of `write_colmap`.
     """
@@ -65,6 +70,11 @@ def write_transforms(undistort: Path, sfm: Path, place: Path, out: Path) -> dict
         if mask.exists():
             frame["mask_path"] = mask.relative_to(out).as_posix()
         frames.append(frame)
+    masked = sum("mask_path" in frame for frame in frames)
+    if 0 < masked < len(frames):  # nerfstudio stops unless all frames have one, or none
+        log.warning("%s names no masks: only %d of %d photos have one", TRANSFORMS, masked, len(frames))
+        for frame in frames:
+            frame.pop("mask_path", None)
     artifacts.write_json(
         out / TRANSFORMS, {"camera_model": "OPENCV", "units": in_world.units, "ply_file_path": POINTS, "frames": frames}
     )

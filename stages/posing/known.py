@@ -15,9 +15,12 @@ import numpy as np
 
 from stages.artifacts import KnownSphere
 from stages.errors import InputError
+from stages.inputs.folders import readable, short_name
+from stages.inputs.formats import open_image
 
 # An image's suffix; "frame.0001" has none.
 SUFFIX = re.compile(r"\.[A-Za-z]{3,5}$")
+SEPARATORS = re.compile(r"[/\\]")
 # Width and height may be scaled by factors that differ by this much: both were rounded.
 MAX_STRETCH = 0.01
 # A rotation written with a few digits only is taken for the nearest true one, within this.
@@ -73,8 +76,8 @@ class KnownPoses:
 def match_photos(poses: KnownPoses, photos: Iterable[str]) -> dict[str, KnownCamera]:
     """The camera of each photo that has one.
 
-    Names agree when their last part does, suffix aside; where several do, the one with more of the path in common
-    is meant, then the one with the same suffix.
+    Names agree when their last part does, suffix aside, however their letters are encoded; where several do, the one
+    with more of the path in common is meant, then the one with the same suffix.
 
     Args:
         photos: relative posix paths.
@@ -85,14 +88,12 @@ def match_photos(poses: KnownPoses, photos: Iterable[str]) -> dict[str, KnownCam
     photos = list(photos)
     by_stem: dict[str, list[str]] = {}
     for photo in photos:
-        by_stem.setdefault(_parts(photo)[-1], []).append(photo)
+        by_stem.setdefault(stem(photo), []).append(photo)
     cameras_of: dict[str, list[tuple[tuple[int, bool], KnownCamera]]] = {}
     for camera in poses.cameras:
-        scored = [(_likeness(camera.name, photo), photo) for photo in by_stem.get(_parts(camera.name)[-1], [])]
-        if not scored:
+        best, fitting = best_fits(camera.name, by_stem.get(stem(camera.name), []))
+        if not fitting:
             continue
-        best = max(score for score, _ in scored)
-        fitting = [photo for score, photo in scored if score == best]
         if len(fitting) > 1:
             raise InputError(
                 f"The pose of {camera.name} in {poses.origin} fits {len(fitting)} photos: {fitting[0]}, {fitting[1]}.",
@@ -113,8 +114,29 @@ def match_photos(poses: KnownPoses, photos: Iterable[str]) -> dict[str, KnownCam
     return matched
 
 
+def best_fits(name: str, photos: Iterable[str]) -> tuple[tuple[int, bool], list[str]]:
+    """How well photos fit a name that another program gave one, and those that fit it best: one where all is well.
+
+    Args:
+        photos: relative posix paths, of which only those count whose last part agrees, suffix aside.
+    """
+    scored = [(_likeness(name, photo), photo) for photo in photos]
+    best = max((score for score, _ in scored), default=(0, False))
+    return best, [photo for score, photo in scored if score == best and score[0] > 0]
+
+
+def stem(name: str) -> str:
+    """The last part of a posix path, suffix aside; "frame.0001" has none."""
+    return _parts(name)[-1]
+
+
 def _parts(name: str) -> tuple[str, ...]:
-    return PurePosixPath(SUFFIX.sub("", name)).parts
+    """Of a path with "/", or with "\\" as Windows has it; photos' names with that in them are cut alike.
+
+    Blanks around a name are lost in texts, long names are those of our own exports.
+    """
+    parts = SEPARATORS.split(SUFFIX.sub("", short_name(readable(name))))
+    return tuple(part.strip() for part in parts if part not in ("", "."))
 
 
 def _likeness(first: str, second: str) -> tuple[int, bool]:
@@ -125,6 +147,19 @@ def _likeness(first: str, second: str) -> tuple[int, bool]:
             break
         common += 1
     return common, PurePosixPath(first).suffix.lower() == PurePosixPath(second).suffix.lower()
+
+
+def check_masks(masks: Mapping[str, Path], origin: Path) -> None:
+    """
+    Raises:
+        InputError: a mask that the poses' file `origin` names is not there.
+    """
+    missing = sorted(str(file) for file in masks.values() if not file.is_file())
+    if missing:
+        raise InputError(
+            f"{len(missing)} of {len(masks)} masks that {origin} names are not there, e.g. {missing[0]}.",
+            "Put them there, name another folder with `--masks FOLDER`, or run without: `--no-masks`.",
+        )
 
 
 # ---------------------------------------------------------------- what readers share
@@ -181,13 +216,12 @@ def image_size(file: Path, origin: Path) -> tuple[int, int]:
     Raises:
         InputError: it cannot be read.
     """
-    from PIL import Image
-
     try:
-        with Image.open(file) as image:
-            return image.size
+        with open_image(file) as image:
+            width, height = image.size
     except OSError as error:
         raise InputError(
             f"{origin} does not say how large its images are, and {file} cannot be read.",
             "Keep the file of poses beside its images.",
         ) from error
+    return width, height

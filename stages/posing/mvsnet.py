@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from stages.errors import InputError
+from stages.inputs.texts import read_text
 from stages.posing.known import KnownPoses, pinhole, reading
 
 CAMERA = "_cam.txt"
@@ -52,7 +53,7 @@ def read_mvsnet(folder: Path) -> KnownPoses:
 def _load(file: Path) -> tuple[np.ndarray, np.ndarray]:
     """Pose [4, 4] and intrinsics [3, 3]."""
     with reading(f"The camera {file}", "`extrinsic` and 16 numbers, `intrinsic` and 9"):
-        words = file.read_text(encoding="utf-8").split()
+        words = read_text(file).split()
         start = words.index("extrinsic") + 1, words.index("intrinsic") + 1
         pose, intrinsics = (
             np.array(words[first : first + side * side], dtype=np.float64).reshape(side, side)

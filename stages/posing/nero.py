@@ -79,7 +79,8 @@ def read_depth(file: Path) -> np.ndarray:
     """
     import cv2
 
-    stored = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+    # not by its path, which may be one that OpenCV cannot take
+    stored = cv2.imdecode(np.fromfile(file, np.uint8), cv2.IMREAD_UNCHANGED)
     if stored is None or stored.dtype != np.uint16:
         found = "it cannot be read" if stored is None else f"it has {8 * stored.itemsize} bits"
         raise InputError(f"{file} is no 16-bit depth image: {found}.", "Leave depth out with `--no-masks`.")

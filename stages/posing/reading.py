@@ -52,7 +52,7 @@ def masks_beside(poses: Path) -> Path | None:
         return folder if folder.is_dir() else None
     if poses.is_dir() and nero.has_cameras(poses) and next(poses.glob(f"*{nero.DEPTH}"), None) is not None:
         return poses
-    return None
+    return transforms.masks_folder(poses) if poses.suffix == ".json" else None
 
 
 def read_poses(path: Path) -> KnownPoses:

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+import os
+from collections.abc import Iterable, Mapping
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -16,7 +17,8 @@ import numpy as np
 
 from stages.artifacts import KnownSphere
 from stages.errors import InputError
-from stages.posing.known import SUFFIX, KnownCamera, KnownPoses, image_size, nearest_rotation, reading
+from stages.inputs.texts import read_text
+from stages.posing.known import SUFFIX, KnownCamera, KnownPoses, check_masks, image_size, nearest_rotation, reading
 
 FILES = ("transforms.json", "transforms_train.json")
 SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG", ".webp")
@@ -46,12 +48,45 @@ def read_transforms(file: Path) -> KnownPoses:
     region = None
     if "camera_angle_x" in data and not {"fl_x", "aabb_scale", "applied_transform"} & set(data):
         region = KnownSphere(center=np.zeros(3), radius=SYNTHETIC_RADIUS, source="the box of NeRF-synthetic")
-    return KnownPoses(file, cameras, region)
+    return KnownPoses(file, cameras, region, masks_of(data["frames"], file))
+
+
+def masks_of(frames: Iterable[Mapping[str, Any]], file: Path) -> dict[str, Path]:
+    """Frame's name -> file of its mask, of frames with a `mask_path`; relative ones are so to the folder of `file`.
+
+    Raises:
+        InputError: a `mask_path` is no text.
+    """
+    masks = {}
+    for frame in frames:
+        name, said = _name(frame), frame.get("mask_path")
+        if said is not None and not isinstance(said, str):
+            raise InputError(f"`mask_path` of {name} in {file} is {said!r}, expected a path.", "Mend or remove it.")
+        if said:
+            masks[name] = file.parent / said.replace("\\", "/")
+    return masks
+
+
+def masks_folder(file: Path) -> Path | None:
+    """The folder that holds all masks that `file` names; None where it names none.
+
+    Raises:
+        InputError: the file cannot be read, or one of its masks is not there.
+    """
+    masks = masks_of(_load(file)["frames"], file)
+    if not masks:
+        return None
+    check_masks(masks, file)
+    return Path(os.path.commonpath([mask.resolve().parent for mask in masks.values()]))
+
+
+def _name(frame: Mapping[str, Any]) -> str:
+    return PurePosixPath(frame["file_path"].replace("\\", "/")).as_posix()
 
 
 def _load(file: Path) -> dict[str, Any]:
     with reading(str(file), "the JSON of nerfstudio or Blender"):
-        data = json.loads(file.read_text(encoding="utf-8"))
+        data = json.loads(read_text(file))
     frames = data.get("frames") if isinstance(data, dict) else None
     if not isinstance(frames, list) or not frames:
         raise InputError(f"{file} has no `frames`.", "It needs the JSON of nerfstudio or Blender.")
@@ -79,7 +114,7 @@ def _camera(
     frame: Mapping[str, Any], original_from_data: tuple[float, np.ndarray, np.ndarray], file: Path
 ) -> KnownCamera:
     """The camera of a frame, in which stands what is said of all of them, too."""
-    name = PurePosixPath(frame["file_path"].replace("\\", "/")).as_posix()
+    name = _name(frame)
     matrix = _array(frame.get("transform_matrix"), f"transform_matrix of {name}", file)
     if matrix.shape not in ((4, 4), (3, 4)):
         raise InputError(f"`transform_matrix` of {name} in {file} is {matrix.shape}, expected (4, 4).", "Mend it.")

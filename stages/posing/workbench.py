@@ -10,11 +10,11 @@ import logging
 import shutil
 import tempfile
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import combinations
+from itertools import combinations, product
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,7 @@ import numpy as np
 from stages.artifacts import ImageSet
 from stages.errors import InputError
 from stages.extras import package_file
+from stages.posing.adding import KnownPhotos, copy_features, known_model, renamed_model
 from stages.posing.evidence import MIN_PNP, MIN_VERIFIED
 from stages.posing.joining import join_models
 from stages.posing.ladder import Rung, Solution, better
@@ -39,6 +40,7 @@ from stages.posing.turning import judge_depth, refuse_one_place
 
 log = logging.getLogger(__name__)
 
+POSITION_DIGITS = 7  # of degrees: a centimetre
 DEFAULT_FOCAL_FACTOR = 1.2  # COLMAP's guess where nothing is known: focal = 1.2 x longest side (about 45 degrees)
 # A focal length that comes out this many times longer or shorter than the photos' EXIF says makes the EXIF doubtful:
 # rounding in EXIF costs a few percent, stabilised or cropped pictures up to a fifth.
@@ -48,6 +50,7 @@ DOUBTFUL_FOCAL = 1.25
 STATIONARY_SHARE = 0.5
 RELAXED = "relaxed thresholds"
 VIEW_MODEL = "SIMPLE_PINHOLE"  # of views that were made, as of 360-degree pictures
+ADDED = "beside the known photos"
 # Relaxed thresholds, with COLMAP's defaults: matches of a pair, 3D points that agree on a photo's position and their
 # share, matches and angle of the first pair.
 RELAXED_VERIFIED, RELAXED_PNP, RELAXED_PNP_SHARE = 10, 12, 0.1  # 15, 30, 0.25
@@ -82,6 +85,13 @@ class Base:
         parts += ["masked"] * self.masked + ["no-priors"] * (not self.focal_priors)
         return "-".join(parts) + ".db"
 
+    @staticmethod
+    def of_file(name: str) -> Base:
+        """The base whose `file` has this name."""
+        flags = (False, True)
+        bases = (Base(*each) for each in product(flags, flags, flags, flags))
+        return next(base for base in bases if base.file == name)
+
 
 class Workbench:
     """The photos of one capture, and one method for each rung.
@@ -92,6 +102,7 @@ class Workbench:
         params: `configs.params.SfmParams`.
         threads: for what depends on their number (matching, mapping). workers: for the rest.
         cuda: whether to use a GPU.
+        known: what an earlier model says of these photos.
     """
 
     def __init__(
@@ -105,9 +116,11 @@ class Workbench:
         workers: int,
         cuda: bool,
         progress: Progress,
+        known: KnownPhotos | None = None,
     ) -> None:
         import pycolmap
 
+        self.known = known
         self.work, self.images_folder, self.masks_folder = work, images_folder, masks_folder
         self.image_set, self.params = image_set, params
         self.names = frozenset(record.name for record in image_set.images)
@@ -116,13 +129,13 @@ class Workbench:
         self._progress, self._rung = progress, ""
         self._other = "global" if params.mapper == "incremental" else "incremental"
         self._guided = self._relaxed = self._stationary = False
-        self._latest = Base(masked=params.masks == "always")
+        self._first = self._latest = Base(masked=params.masks == "always")
         # the most views that were taken at once, as of a 360-degree picture; 1 where all are photos
         self._at_once = max(Counter(record.frame or record.name for record in image_set.images).values())
         self._known: frozenset[int] = frozenset()  # cameras of rigs, whose intrinsics are known
         self._import(self._latest)
         with pycolmap.Database.open(self.database(self._latest)) as database:
-            self.located = database.num_pose_priors()
+            self.located = count_located([prior.position for prior in database.read_all_pose_priors()])
             cameras = [
                 camera
                 for camera in database.read_all_cameras()
@@ -180,13 +193,32 @@ class Workbench:
 
         return Rung(name, named, applies)
 
+    def adding(self) -> Rung:
+        """The attempt that keeps what is `known`."""
+        return self._rung_of(ADDED, self.added)
+
     # ------------------------------------------------------------ rungs
+    def added(self, best: Solution | None) -> Solution | None:
+        """New photos matched with all and placed beside the known ones, which stay where they are."""
+        assert self.known is not None
+        base = Base.of_file(self.known.features.name)
+        if not self.database(base).exists():
+            self._import(base)
+        if not base.focal_priors:
+            forget_focal_priors(self.database(base), self.params.camera_model, self._known)
+        self._features_and_matches(base, best)
+        self.depth = judge_depth(self.database())
+        if not self.known.changed:
+            return self._solution_of(base, [renamed_model(self.known)])
+        start = known_model(self.known, self.database(base), self._mapping().min_num_matches)
+        return self._solution_of(base, self._map_incremental(base, start, fixed=True))
+
     def first(self, best: Solution | None) -> Solution | None:
         """The chosen matcher and mapper."""
-        self._features_and_matches(self._latest, best)
+        self._features_and_matches(self._first, best)
         self.depth = judge_depth(self.database())
         refuse_one_place(self.depth)
-        return self._solve(self._latest, self.params.mapper)
+        return self._solve(self._first, self.params.mapper)
 
     def all_pairs(self, best: Solution | None) -> Solution | None:
         """Photos left out against all others."""
@@ -392,6 +424,8 @@ class Workbench:
                 options=options,
             )
         self._known = write_rigs(path, self.image_set.images)
+        if self.known is not None and self.known.features.name == base.file:
+            copy_features(self.known.features, path, self.known.names)
 
     def _extract(self, base: Base) -> None:
         """Features; finding them is deterministic with any number of threads."""
@@ -543,8 +577,8 @@ class Workbench:
             options.mapper.init_min_tri_angle = RELAXED_INIT_ANGLE_DEG
         return options
 
-    def _map_incremental(self, base: Base, start: Any | None) -> list[Any]:
-        """Photos placed one after another, from the model `start` on where there is one."""
+    def _map_incremental(self, base: Base, start: Any | None, fixed: bool = False) -> list[Any]:
+        """Photos placed one after another, from the model `start` on where there is one; `fixed`: its poses stay."""
         import pycolmap
 
         placed, total, out, input_path = 2, len(self.names), self._new_folder(), ""
@@ -560,11 +594,13 @@ class Workbench:
             part = min(1.0, placed / max(total, 1))
             self._tell(PART_MATCHES + (1 - PART_MATCHES) * part, f"{min(placed, total)} of {total} photos placed")
 
+        options = self._mapping()
+        options.fix_existing_frames = fixed
         models = pycolmap.incremental_mapping(
             self.database(base),
             self.images_folder,
             out,
-            self._mapping(),
+            options,
             input_path=input_path,
             next_image_callback=one_more,
         )
@@ -605,6 +641,12 @@ def learned_weights() -> Path | None:
 
 
 # ---------------------------------------------------------------- on databases
+def count_located(positions: Sequence[np.ndarray]) -> int:
+    """Photos whose GPS position tells which others are near: all that carry one, unless most carry the same ones."""
+    apart = len({tuple(np.round(position[:2], POSITION_DIGITS).tolist()) for position in positions})
+    return len(positions) if 2 * apart > len(positions) else apart
+
+
 def choose_matcher(params: Any, located: int, num_images: int) -> str:
     """auto: all pairs of small sets, neighbours in space where most photos carry GPS, else in name.
 

@@ -13,22 +13,8 @@ function regionText({ form, center, radius, low, high }) {
   return [form, ...numbers.map((value) => regionNumber(value, size))].join(" ");
 }
 
-// The workspace that the page lies in, or that `hineus view` shows; else a name to fill in.
-async function findWorkspace() {
-  if (location.protocol === "file:") {
-    const found = decodeURIComponent(location.pathname).match(/^(.+)\/report\/report\.html$/);
-    return found ? found[1] : "WORKSPACE";
-  }
-  try {
-    return (await (await fetch("/state.json")).json()).workspace || "WORKSPACE";
-  } catch {
-    return "WORKSPACE";
-  }
-}
-
 function regionCommand(region, workspace) {
-  const quoted = (word) => (/^[\w@%+=:,./-]+$/.test(word) ? word : `'${word.replaceAll("'", `'"'"'`)}'`);
-  return `hineus run --workspace ${quoted(workspace)} --set ${quoted("place.region=" + regionText(region))}`;
+  return `hineus run --workspace ${shellWord(workspace)} --set ${shellWord("place.region=" + regionText(region))}`;
 }
 
 /* Draws the region and lets the person edit it.

@@ -6,7 +6,8 @@ They live in one file because a compiled function's cache notices changes in its
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from stages.compiling import njit
 
 # Beyond this angle from the normal (cosine) a photo says nothing about a point.
 MIN_COS = 0.17

@@ -10,8 +10,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
+from stages.compiling import njit
 from stages.drawing.rasterizing import depth_map
 from stages.geometry.cameras import PinholeCameras
 

@@ -7,9 +7,9 @@ Shapes: V vertices, N photos.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from stages.artifacts import AtlasMesh, VertexQuality
+from stages.compiling import njit
 from stages.drawing.rasterizing import Texels
 from stages.surface.triangle_mesh import face_areas, sum_around
 from stages.texture.baking import Provenance

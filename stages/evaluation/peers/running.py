@@ -8,7 +8,6 @@ a folder of its own, and is timed.
 from __future__ import annotations
 
 import contextlib
-import resource
 import shlex
 import shutil
 import subprocess
@@ -21,6 +20,7 @@ from typing import Any
 import psutil
 
 from stages import artifacts
+from stages.engine.resources import children_cpu_seconds
 from stages.errors import ConfigError, ReconstructionError, did_you_mean
 from stages.evaluation.machine import machine
 from stages.evaluation.peers import builtin
@@ -95,9 +95,9 @@ def run_peer(peer: Peer, given: Path, folder: Path) -> dict[str, Any]:
         "out": folder / MESH,
     }
     words = [_filled(word, places) for word in peer.words]
-    started, before = time.monotonic(), _children_s()
+    started, before = time.monotonic(), children_cpu_seconds()
     code, peak_rss = _call(words, folder, peer.name)
-    wall_s, cpu_s = time.monotonic() - started, _children_s() - before
+    wall_s, cpu_s = time.monotonic() - started, children_cpu_seconds() - before
     if code != 0 or not (folder / MESH).is_file():
         said = " ".join((folder / LOG).read_text(encoding="utf-8", errors="replace").split())[-TOLD:]
         what = f"ended with {code}" if code else f"wrote no {MESH}"
@@ -146,12 +146,6 @@ def _held_by(pid: int) -> int:
             with contextlib.suppress(psutil.Error):
                 total += each.memory_info().rss
     return total
-
-
-def _children_s() -> float:
-    """CPU seconds of all children that were waited for."""
-    used = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return used.ru_utime + used.ru_stime
 
 
 def _filled(word: str, places: dict[str, Path]) -> str:

@@ -12,6 +12,7 @@ from stages.evaluation.photos.regions import WHITE
 from stages.geometry.cameras import PinholeCameras, PosedScene
 from stages.geometry.normalisation import into_frame
 from stages.ingest import find_masks, read_mask_file
+from stages.inputs.formats import open_image
 from stages.posing.known import image_size, match_photos
 from stages.posing.reading import read_poses
 from stages.posing.triangulation import fitted_camera
@@ -74,16 +75,14 @@ class NovelPhotos:
         pixels, mask = _read(self._views.folder / name, self._views.background == "white")
         if name in self._masks:
             size = pixels.shape[1], pixels.shape[0]
-            mask = np.where(read_mask_file(self._masks[name], name, size, size, 1), WHITE, 0).astype(np.uint8)
+            mask = np.where(read_mask_file(self._masks[name], name, size, size, 1).kept, WHITE, 0).astype(np.uint8)
         pixels, mask = pinhole_photo(self._lenses[name], pixels, mask, self._max_side)
         return pixels, None if mask is None else mask > OPAQUE
 
 
 def _read(file: Path, on_white: bool) -> tuple[np.ndarray, np.ndarray | None]:
     """Pixels [H, W, 3] and, of a photo with an alpha channel, its mask [H, W], both uint8."""
-    from PIL import Image
-
-    with Image.open(file) as stored:
+    with open_image(file) as stored:
         image: Any = stored.convert("RGBA" if "A" in stored.getbands() else "RGB")
     values = np.asarray(image)
     if values.shape[2] == 3:

@@ -15,6 +15,7 @@ from stages.evaluation.alignment import by_cameras
 from stages.evaluation.reading import Cameras, own_cameras, read_matrix, read_prediction, read_surface
 from stages.evaluation.surfaces import Sampling, Surface, Target, draw_points, moved, score_at
 from stages.evaluation.thinning import one_a_cube
+from stages.inputs.texts import read_text
 from stages.surface.triangle_mesh import face_normals
 
 # Metres; the toolbox's own, by scene.
@@ -274,7 +275,7 @@ def read_tanks(data: Path) -> TanksTruth:
 
 def _crop_volume(path: Path) -> CropVolume:
     try:
-        data: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        data: dict[str, Any] = json.loads(read_text(path))
         axis = "XYZ".index(data["orthogonal_axis"].upper())
         polygon = np.delete(np.array(data["bounding_polygon"], dtype=np.float64), axis, axis=1)
         return CropVolume(axis, float(data["axis_min"]), float(data["axis_max"]), polygon)
@@ -288,7 +289,7 @@ def _crop_volume(path: Path) -> CropVolume:
 def _trajectory(path: Path) -> np.ndarray:
     """Camera centres [N, 3] of a log: for each camera a line of three numbers and a matrix [4, 4] world_from_cam."""
     try:
-        numbers = np.array(path.read_text(encoding="utf-8").split(), dtype=np.float64).reshape(-1, 19)
+        numbers = np.array(read_text(path).split(), dtype=np.float64).reshape(-1, 19)
     except (OSError, ValueError) as error:
         raise InputError(
             f"{path} is no trajectory ({error}).", "It needs a line of three numbers and four of four, a camera each."

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from stages.capture.photo_reading import PHOTO_SUFFIXES
 from stages.evaluation.photos.novel_views import NovelViews
+from stages.inputs.formats import PHOTO_SUFFIXES
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,11 @@ KINDS: tuple[type[Term], ...] = (Ambiguity, Reflection, Planar, Eikonal)
 
 
 class Terms:
-    """All terms on a batch; see `Term` for what each may do."""
+    """All terms on a batch; see `Term` for what each may do.
+
+    Attributes:
+        at_work: whether the settings ask for any of them, now or later in the training.
+    """
 
     def __init__(
         self,
@@ -42,6 +46,8 @@ class Terms:
         photos: Photos | None = None,
         generator: torch.Generator | None = None,
     ) -> None:
+        forms = (params.terms.ambiguity.form, params.terms.reflection.form, params.terms.planar.form)
+        self.at_work = set(forms) != {"off"} or params.terms.eikonal.form != "plain"
         self.all = tuple(kind(fields, cache, params, photos, generator) for kind in KINDS)
 
     def recolored(self, rendered: Rendered, moment: Moment, generator: torch.Generator | None) -> Rendered:

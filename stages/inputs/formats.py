@@ -1,0 +1,139 @@
+"""What a file is by its first bytes, whatever its name says; and the one way in which pictures of users are opened."""
+
+from __future__ import annotations
+
+import warnings
+from enum import Enum, auto
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+# By Pillow's names; MPO is read as JPEG. Pillow knows more, some of which start other programs (EPS: Ghostscript).
+PHOTO_FORMATS = ("JPEG", "PNG", "TIFF", "BMP", "WEBP", "HEIF", "AVIF")
+HEIF_SUFFIXES = frozenset({".heic", ".heif", ".hif", ".heics", ".heifs"})
+JPEG_SUFFIXES = frozenset({".jpg", ".jpeg", ".jpe", ".jfif", ".mpo"})
+PHOTO_SUFFIXES = HEIF_SUFFIXES | JPEG_SUFFIXES | {".png", ".tif", ".tiff", ".bmp", ".webp", ".avif"}
+RAW_SUFFIXES = frozenset({".dng", ".cr2", ".nef", ".nrw", ".arw", ".pef", ".srw", ".rwl", ".3fr", ".iiq"})
+RAW_SUFFIXES |= {".cr3", ".orf", ".rw2", ".raf"}
+VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".avi", ".mkv", ".m4v", ".webm", ".mts", ".m2ts", ".3gp"})
+VIDEO_SUFFIXES |= {".mpg", ".mpeg", ".wmv", ".ogv"}
+
+# All that FFmpeg may take a video for: no playlists, no lists of files, no devices.
+CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts,mpeg,asf,flv,ogg"
+
+HEAD_BYTES = 512
+TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+RAW = (b"IIU\0", b"IIRO", b"IIRS", b"MMOR", b"FUJIFILMCCD-RAW")  # Panasonic, Olympus, Fujifilm
+HEIF_BRANDS = frozenset({"heic", "heix", "heim", "heis", "hevc", "hevx", "hevm", "hevs", "mif1", "mif2", "msf1"})
+AVIF_BRANDS = frozenset({"avif", "avis"})
+AUDIO_BRANDS = frozenset(("M4A ", "M4B ", "M4P "))
+QUICKTIME_ATOMS = (b"moov", b"mdat", b"wide", b"free", b"skip", b"pnot")
+VIDEO = (b"\x1aE\xdf\xa3", b"\0\0\x01\xba", b"0&\xb2u\x8ef\xcf\x11", b"FLV\x01", b"OggS")
+TS_PACKETS = ((0, 188), (4, 192))  # MPEG transport streams: where the sync byte is, and every how many
+# Pictures that are not read, and what else is found under the names of photos.
+UNREAD = {
+    b"\0\0\0\x0cjP  ": "a JPEG 2000 image",
+    b"\0\0\0\x0cJXL ": "a JPEG XL image",
+    b"\xff\x0a": "a JPEG XL image",
+    b"8BPS": "a Photoshop document",
+    b"v/1\x01": "an OpenEXR image",
+    b"#?RADIANCE": "a Radiance HDR image",
+}
+STRANGE = {
+    b"GIF8": "a GIF",
+    b"%!PS": "PostScript",
+    b"%PDF": "a PDF",
+    b"PK\x03\x04": "an archive: unpack it",
+    b"Rar!": "an archive: unpack it",
+    b"7z\xbc\xaf": "an archive: unpack it",
+    b"version https://git-lfs": "a pointer of Git LFS: run `git lfs pull`",
+    b"<!DOCTYPE": "a web page",
+    b"<html": "a web page",
+    b"#EXTM3U": "a playlist",
+}
+
+
+class Kind(Enum):
+    """What a file is."""
+
+    PHOTO = auto()
+    RAW = auto()
+    VIDEO = auto()
+    UNREAD = auto()  # a picture of a format that is not read
+    OTHER = auto()
+
+
+def kind_of(file: Path) -> Kind:
+    """What `file` is: by its content, where that is a TIFF also by its ending, since most raw files are TIFF.
+
+    Raises:
+        OSError: it cannot be read.
+    """
+    return kind_of_head(read_head_bytes(file), file.suffix.lower())
+
+
+def kind_of_head(head: bytes, suffix: str) -> Kind:
+    """The same of the first `HEAD_BYTES` and the ending in lower case."""
+    raw = suffix in RAW_SUFFIXES
+    if head.startswith(TIFF):
+        return Kind.RAW if raw or head[8:10] == b"CR" else Kind.PHOTO
+    if head.startswith((b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n")) or (head.startswith(b"RIFF") and head[8:12] == b"WEBP"):
+        return Kind.PHOTO
+    if head.startswith(b"BM") and head[6:10] == bytes(4):  # these two letters alone begin many a text
+        return Kind.PHOTO
+    if head[4:8] == b"ftyp":
+        return _kind_of_brand(head[8:12].decode("latin-1"))
+    if head.startswith(RAW) or (raw and head):
+        return Kind.RAW
+    if any(head.startswith(magic) for magic in UNREAD):
+        return Kind.UNREAD
+    if head.startswith(VIDEO) or (head.startswith(b"RIFF") and head[8:12] == b"AVI "):
+        return Kind.VIDEO
+    if head[4:8] in QUICKTIME_ATOMS or any(head[at::step][:3] == b"GGG" for at, step in TS_PACKETS):
+        return Kind.VIDEO
+    return Kind.OTHER
+
+
+def _kind_of_brand(brand: str) -> Kind:
+    """Of an ISO base media file: HEIF, Canon's raw files, QuickTime, MP4."""
+    if brand in HEIF_BRANDS | AVIF_BRANDS:
+        return Kind.PHOTO
+    if brand == "crx ":
+        return Kind.RAW
+    return Kind.OTHER if brand in AUDIO_BRANDS else Kind.VIDEO
+
+
+def in_words(head: bytes) -> str:
+    """What a file is that is no photo and no video, as far as its first bytes tell."""
+    if not head:
+        return "empty"
+    known = {**STRANGE, **UNREAD}
+    return next((words for magic, words in known.items() if head.startswith(magic)), "damaged, or another format")
+
+
+def read_head_bytes(file: Path) -> bytes:
+    with file.open("rb") as stream:
+        return stream.read(HEAD_BYTES)
+
+
+def open_image(file: Any) -> Any:
+    """A picture of a user's (a path, or a stream of bytes) as Pillow's image; nothing is decoded yet.
+
+    Raises:
+        OSError: it cannot be read, or is of none of `PHOTO_FORMATS`. Damaged files raise nearly anything.
+    """
+    from PIL import Image
+
+    register_formats()
+    return Image.open(file, formats=PHOTO_FORMATS)
+
+
+@lru_cache
+def register_formats() -> None:
+    """Teach Pillow HEIF (it has AVIF and WebP built in), and let readers judge sizes by the memory that is there."""
+    from PIL import Image
+    from pillow_heif import register_heif_opener
+
+    register_heif_opener()
+    Image.MAX_IMAGE_PIXELS = None  # a fixed limit refuses what phones take; see `stages.capture.photo_reading`
+    warnings.filterwarnings("ignore", category=UserWarning, module=r"PIL\.")  # odd EXIF is no news to users

@@ -1,0 +1,344 @@
+"""Users' folders and files: what is walked, what is set aside, what a file is by content, how it is called."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import unicodedata
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from test_ingest import ingest, picture, reasons, write_photos
+
+from stages.artifacts import Pictures
+from stages.capture.listing import list_captures
+from stages.engine.fingerprint import SourceDigests
+from stages.errors import InputError
+from stages.inputs.folders import MOST_BYTES, named_files, readable, short_name, unique_name
+from stages.inputs.formats import Kind, kind_of, kind_of_head, register_formats
+from stages.inputs.texts import read_text
+
+
+@pytest.fixture
+def photos(tmp_path: Path) -> Path:
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    return folder
+
+
+# ---------------------------------------------------------------- names
+def test_every_spelling_of_a_name_is_read_alike():
+    decomposed = unicodedata.normalize("NFD", "Käse.jpg")
+    latin = os.fsdecode("Käse.jpg".encode("latin-1"))
+    assert decomposed != "Käse.jpg" != latin
+    assert readable(decomposed) == readable(latin) == readable("Käse.jpg") == "Käse.jpg"
+    assert readable("a\nb\x1b[0m\tc.jpg") == "a_b_[0m_c.jpg"
+    assert readable("Bild 1, \"x\" 'y' <b>\\.jpg") == "Bild 1, \"x\" 'y' <b>\\.jpg"
+
+
+def test_long_names_are_cut_alike_whatever_their_suffix():
+    long = "ü" * 125
+    cut = short_name(f"a/{long}.jpg")
+    assert len(cut.encode()) <= 2 + MOST_BYTES + 4
+    assert cut.endswith(".jpg")
+    assert cut.removesuffix(".jpg") == short_name(f"a/{long}.png").removesuffix(".png") == short_name(f"a/{long}")
+    assert cut != short_name(f"a/{long[:-1]}e.jpg")
+    assert short_name("a/b.jpg") == "a/b.jpg"
+
+
+def test_unique_names():
+    assert unique_name("a/b.jpg", {"a/b.jpg", "a/b~2.jpg"}) == "a/b~3.jpg"
+    assert unique_name("B.jpg", {"b.jpg"}, str.lower) == "B~2.jpg"
+
+
+ODD = ["-x.jpg", "a  b.jpg", " lead.jpg", "back\\slash.jpg", "comma, \"'.jpg", "new\nline.jpg", "%03d.jpg", "<b>&.jpg"]
+
+
+@pytest.mark.parametrize("last", [b"f\xfcr.jpg", b"a" * 251 + b".jpg", "ü".encode() * 125 + b".jpg"])
+def test_photos_of_any_name_are_taken(photos: Path, last: bytes):
+    for i, name in enumerate([*ODD, os.fsdecode(last)]):
+        picture(i).save(photos / name)
+    images, out, numbers = ingest(photos)
+    assert numbers["images"] == len(ODD) + 1
+    assert all(record.name == short_name(record.source) for record in images.images)
+    for record in images.images:
+        assert record.name.encode().isascii() or record.name == readable(record.name)
+        assert Pictures(out).path(record.name).is_file()
+
+
+def test_long_names_leave_room_for_masks(photos: Path):
+    names = write_photos(photos, 2)
+    cut_out = picture(5)
+    cut_out.putalpha(Image.fromarray((np.arange(96 * 72).reshape(72, 96) % 2 * 255).astype(np.uint8)))
+    cut_out.save(photos / ("b" * 251 + ".png"))
+    images, out, _ = ingest(photos)
+    assert len(images.images) == len(names) + 1
+    assert Pictures(out).mask(next(record.name for record in images.images if record.has_mask)) is not None
+
+
+def test_names_that_differ_by_case_or_by_encoding_only_stay_apart(photos: Path):
+    decomposed = unicodedata.normalize("NFD", "ä.jpg")
+    for i, name in enumerate(["a.jpg", "A.JPG", "ä.jpg", decomposed, os.fsdecode(b"\xe4.jpg")]):
+        picture(i).save(photos / name)
+    if len(list(photos.iterdir())) < 5:
+        pytest.skip("this file system takes some of these names for one")
+    images, _, numbers = ingest(photos)
+    names = [record.name.lower() for record in images.images]
+    assert numbers["images"] == len(set(names)) == 5
+    assert {"a.jpg", "A.JPG", "ä.jpg"} < {record.source for record in images.images}
+
+
+def test_masks_are_found_whatever_the_encoding_of_their_names(photos: Path):
+    masks = photos.parent / "masks"
+    masks.mkdir()
+    for i, name in enumerate(["ä", "ö", "ü"]):
+        picture(i).save(photos / f"{unicodedata.normalize('NFD', name)}.jpg")
+        mask = Image.new("L", (96, 72), 255)
+        mask.paste(0, (0, 0, 48, 72))
+        mask.save(masks / (f"{name}.png" if i else os.fsdecode(f"{name}.png".encode("latin-1"))))
+    assert ingest(photos, masks)[2]["masks"] == 3
+
+
+# ---------------------------------------------------------------- folders
+def leave_companions(photos: Path) -> set[str]:
+    """What cameras, NAS boxes and programs leave, with a picture in each place; returns where."""
+    folders = ["@eaDir/a.jpg", ".thumbnails", "#recycle", "@Recycle", "__MACOSX", "X Previews.lrdata", "M4ROOT/THMBNL"]
+    folders += ["M4ROOT/SUB", ".picasaoriginals", "$RECYCLE.BIN", "CaptureOne"]
+    for i, folder in enumerate(folders):
+        (photos / folder).mkdir(parents=True)
+        picture(100 + i).save(photos / folder / "p.jpg")
+    files = ["a.THM", "a.jpg_original", "a.jpg~", "a.bak", "a.xmp", "a.AAE", "Thumbs.db", "digikam4.db", "GL01.LRV"]
+    for i, name in enumerate(files):
+        picture(200 + i).save(photos / name, format="JPEG")
+    for hidden in (".DS_Store", "._000.jpg"):
+        (photos / hidden).write_bytes(b"0")
+    return {*(folder.removesuffix("/a.jpg") for folder in folders), *files}
+
+
+def test_what_programs_leave_beside_photos_is_set_aside(photos: Path):
+    names = write_photos(photos)
+    left = leave_companions(photos)
+    images, _, numbers = ingest(photos)
+    assert [record.source for record in images.images] == names
+    assert reasons(images).keys() == left
+    assert all(item.expected for item in images.skipped)
+    assert numbers["skipped"] == 0
+    assert numbers["companions"] == len(left)
+
+
+def test_what_programs_leave_is_no_reason_to_run_again(photos: Path):
+    write_photos(photos)
+    before = SourceDigests({"photos": photos}).files("photos")
+    leave_companions(photos)
+    assert SourceDigests({"photos": photos}).files("photos") == before
+
+
+def test_links_are_followed_once_and_never_in_a_circle(photos: Path, tmp_path: Path):
+    names = write_photos(photos)
+    (tmp_path / "other").mkdir()
+    write_photos(tmp_path / "other", 2, first=10)
+    (photos / "linked").symlink_to(tmp_path / "other")
+    (photos / "twice").symlink_to(tmp_path / "other")
+    (tmp_path / "other" / "back").symlink_to(photos)
+    (photos / "loop").symlink_to(photos)
+    (photos / "x.jpg").symlink_to(tmp_path / "other" / "011.jpg")
+    (photos / "gone.jpg").symlink_to(tmp_path / "nowhere")
+    images, _, _ = ingest(photos)
+    assert [record.source for record in images.images] == [*names, "linked/010.jpg", "linked/011.jpg"]
+    why = reasons(images)
+    assert why["x.jpg"] == "same file as linked/011.jpg"
+    assert why["gone.jpg"] == "a link to nothing"
+    assert why["loop"] == "a link to a folder that this one is in"
+
+
+def test_the_folder_itself_may_be_a_link(photos: Path):
+    names = write_photos(photos)
+    link = photos.parent / "link"
+    link.symlink_to(photos)
+    assert [record.source for record in ingest(link)[0].images] == names
+
+
+def test_a_pipe_does_not_hold_anything_up(photos: Path):
+    write_photos(photos)
+    os.mkfifo(photos / "p.jpg")
+    assert "pipe" in reasons(ingest(photos)[0])["p.jpg"]
+    assert "p.jpg" not in SourceDigests({"photos": photos}).files("photos")
+
+
+def test_what_is_missing_is_said_aloud(photos: Path):
+    write_photos(photos)
+    for name in (".IMG_9.heic.icloud", "IMG_8.jpg.part", "IMG_7.jpg.crdownload"):
+        (photos / name).write_bytes(b"0")
+    images, _, numbers = ingest(photos)
+    assert reasons(images)[".IMG_9.heic.icloud"] == "only in iCloud: download it first"
+    assert numbers["skipped"] == 3
+
+
+def test_folders_of_a_card_with_the_same_names(photos: Path):
+    for i, folder in enumerate(("DCIM/100CANON", "DCIM/101CANON")):
+        (photos / folder).mkdir(parents=True)
+        for k in range(2):
+            picture(10 * i + k).save(photos / folder / f"IMG_000{k}.JPG")
+    images, _, _ = ingest(photos)
+    assert [record.name for record in images.images] == [record.source for record in images.images]
+    assert len(images.images) == 4
+
+
+@pytest.mark.parametrize(("original", "copy"), [
+    ("IMG_1234.JPG", "IMG_E1234.JPG"), ("IMG_1.jpg", "IMG_1-edited.jpg"), ("a/b.jpg", "a/b_edited(1).jpg"),
+    ("IMG_2.JPG", "IMG_2.HIF"), ("P.PORTRAIT-02.ORIGINAL.jpg", "P.PORTRAIT-01.COVER.jpg"),
+])  # fmt: skip
+def test_a_second_picture_of_a_shot_is_set_aside(photos: Path, original: str, copy: str):
+    register_formats()
+    write_photos(photos)
+    for i, name in enumerate((original, copy)):
+        (photos / name).parent.mkdir(exist_ok=True)
+        picture(50 + i).save(photos / name, format="HEIF" if name.endswith("HIF") else "JPEG")
+    images, _, numbers = ingest(photos)
+    assert original in reasons(images)[copy]
+    assert numbers["skipped"] == 0
+    (photos / original).unlink()
+    assert copy in {record.source for record in ingest(photos)[0].images}
+
+
+# ---------------------------------------------------------------- formats
+FORMATS = {"JPEG": "jpg", "PNG": "png", "TIFF": "tif", "BMP": "bmp", "WEBP": "webp", "HEIF": "heic", "AVIF": "avif"}
+
+
+@pytest.mark.parametrize("name", [
+    "a.HIF", "a.heics", "a.jfif", "a.JPE", "a.jpeg", "a", "a.0001", "a.dat", "a.txt", "a.mp4", "a.jpg", "a.png",
+])  # fmt: skip
+@pytest.mark.parametrize("kind", FORMATS)
+def test_photos_are_told_by_their_content(photos: Path, name: str, kind: str):
+    register_formats()
+    write_photos(photos, 2)
+    picture(7).save(photos / name, format=kind)
+    assert kind_of(photos / name) is Kind.PHOTO
+    images, out, _ = ingest(photos)
+    assert not images.skipped
+    record = images.images[-1]
+    assert record.name.startswith("a.0001" if name == "a.0001" else "a")
+    with Image.open(Pictures(out).path(record.name)) as written:
+        assert (
+            written.format
+            == {"jpg": "JPEG", "jpeg": "JPEG", "png": "PNG", "tif": "TIFF", "bmp": "BMP"}[
+                Path(record.name).suffix.lower()[1:]
+            ]
+        )
+        assert np.abs(np.asarray(written, int) - np.asarray(picture(7), int)).mean() < 6
+
+
+@pytest.mark.parametrize(
+    ("name", "target"), [("a.jfif", "a.jpg"), ("a.jpe", "a.jpg"), ("a", "a.jpg"), ("a.tif", "a.jpg")]
+)
+def test_a_jpeg_under_another_name_is_copied_not_encoded_anew(photos: Path, name: str, target: str):
+    write_photos(photos, 2)
+    picture(7).save(photos / name, format="JPEG")
+    images, out, _ = ingest(photos)
+    assert images.images[-1].name == target
+    assert Pictures(out).path(target).read_bytes() == (photos / name).read_bytes()
+
+
+def test_the_first_picture_of_a_stereo_pair_counts(photos: Path):
+    write_photos(photos, 2)
+    picture(7).save(photos / "z.MPO", format="MPO", save_all=True, append_images=[picture(8)])
+    images, out, _ = ingest(photos)
+    assert images.images[-1].name == "z.jpg"
+    with Image.open(Pictures(out).path("z.jpg")) as written:
+        assert np.abs(np.asarray(written, int) - np.asarray(picture(7), int)).mean() < 6
+
+
+def test_nothing_but_photo_formats_is_opened(photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Pillow starts Ghostscript for PostScript, whatever the file is called."""
+    program = tmp_path / "gs"
+    program.write_text(f"#!/bin/sh\ntouch {tmp_path}/started\n")
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+    write_photos(photos)
+    (photos / "x.jpg").write_bytes(b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 96 72\n%%EndComments\nshowpage\n")
+    assert "PostScript" in reasons(ingest(photos)[0])["x.jpg"]
+    assert not (tmp_path / "started").exists()
+
+
+@pytest.mark.parametrize(("data", "words"), [
+    (b"", "(empty)"), (b"version https://git-lfs.github.com/spec/v1\n", "git lfs pull"), (b"GIF89a", "a GIF"),
+    (b"\xff\x0a\0\0", "JPEG XL image, which is not read: convert it"), (b"8BPS\0\1", "Photoshop document"),
+    (b"<!DOCTYPE html>", "a web page"), (b"\0" * 4000, "damaged, or another format"),
+])  # fmt: skip
+def test_what_else_is_found_under_the_name_of_a_photo_is_named(photos: Path, data: bytes, words: str):
+    write_photos(photos)
+    (photos / "x.jpg").write_bytes(data)
+    images, _, numbers = ingest(photos)
+    assert words in reasons(images)["x.jpg"]
+    assert numbers["skipped"] == 1
+
+
+@pytest.mark.parametrize(("head", "suffix", "kind"), [
+    (b"II*\0\x08\0\0\0", ".nef", Kind.RAW), (b"II*\0\x08\0\0\0", ".tif", Kind.PHOTO),
+    (b"II*\0\x10\0\0\0CR\2\0", ".jpg", Kind.RAW), (b"FUJIFILMCCD-RAW ", ".jpg", Kind.RAW),
+    (b"\0\0\0\x18ftypcrx ", ".cr3", Kind.RAW), (b"\0\0\0\x18ftypqt  ", ".jpg", Kind.VIDEO),
+    (b"\0\0\0\x18ftypmif1", ".jpg", Kind.PHOTO), (b"\0\0\0\x18ftypM4A ", ".m4a", Kind.OTHER),
+    (b"\0\0\0\x08wide\0\0\0\0mdat", ".mov", Kind.VIDEO), (b"\x1aE\xdf\xa3", "", Kind.VIDEO),
+    ((b"G" + bytes(187)) * 3, ".mts", Kind.VIDEO), (b"RIFF\0\0\0\0AVI ", ".dat", Kind.VIDEO),
+    (b"BMW is a car", ".txt", Kind.OTHER), (b"RIFF\0\0\0\0WAVE", ".wav", Kind.OTHER),
+])  # fmt: skip
+def test_kinds(head: bytes, suffix: str, kind: Kind):
+    assert kind_of_head(head, suffix) is kind
+
+
+def test_an_unstitched_picture_is_named(photos: Path):
+    write_photos(photos)
+    picture(9).save(photos / "IMG_1.insp", format="JPEG")
+    assert "two fisheye lenses: stitch" in reasons(ingest(photos)[0])["IMG_1.insp"]
+
+
+def test_a_copy_that_was_cut_off_is_named_where_its_end_is_zeros(photos: Path):
+    write_photos(photos)
+    whole = (photos / "000.jpg").read_bytes()
+    (photos / "x.jpg").write_bytes(whole[: len(whole) // 2] + bytes(len(whole)))
+    assert reasons(ingest(photos)[0])["x.jpg"] == "half-copied: its end is zeros"
+
+
+def test_damaged_exif_is_no_reason_to_lose_a_photo(photos: Path):
+    write_photos(photos)
+    picture(9).save(photos / "x.jpg", exif=b"Exif\0\0II*\0\xff\xff\xff\x7f" + b"\xff" * 40)
+    assert "x.jpg" in {record.source for record in ingest(photos)[0].images}
+
+
+def test_case_17(cases_dir: Path, tmp_path: Path):
+    (tmp_path / "photos").symlink_to(cases_dir / "17-hif" / "photos")
+    assert ingest(tmp_path / "photos")[2]["images"] == 6
+
+
+# ---------------------------------------------------------------- texts
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
+def test_texts_of_any_editor_are_read(tmp_path: Path, encoding: str):
+    file = tmp_path / "t.txt"
+    file.write_bytes("# Käse\r\n1 2\r\n".encode(encoding))
+    assert read_text(file) == "# Käse\n1 2\n"
+
+
+def test_names_in_texts_that_are_not_utf_8_match_those_of_files(tmp_path: Path):
+    (tmp_path / "t.txt").write_bytes(b"f\xfcr.jpg")
+    (tmp_path / os.fsdecode(b"f\xfcr.jpg")).touch()
+    assert readable(read_text(tmp_path / "t.txt")) in named_files(tmp_path)[0]
+
+
+def test_a_folder_that_cannot_be_read_is_told_of(photos: Path, monkeypatch: pytest.MonkeyPatch):
+    write_photos(photos)
+    (photos / "locked").mkdir()
+    listed = Path.iterdir
+
+    def refused(path: Path):
+        if path.name == "locked":
+            raise PermissionError(13, "Permission denied")
+        return listed(path)
+
+    monkeypatch.setattr(Path, "iterdir", refused)
+    _, _, skipped = list_captures(photos)
+    assert [(item.source, item.reason) for item in skipped] == [("locked", "a folder that may not be read")]
+    shutil.rmtree(photos)
+    with pytest.raises(InputError, match="does not exist"):
+        list_captures(photos)

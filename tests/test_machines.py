@@ -1,0 +1,355 @@
+"""Machines that are not like ours: no home, nothing writable, containers' limits, other systems."""
+
+from __future__ import annotations
+
+import errno
+import os
+import stat
+import subprocess
+import sys
+import tempfile
+from collections import Counter
+from pathlib import Path
+from types import SimpleNamespace
+
+import psutil
+import pytest
+
+from hineus_cli.__main__ import shadowed
+from stages import caches, limits, machine_check
+from stages.engine.locking import take
+from stages.engine.system import missing_libraries
+from stages.engine.workspace import storage_errors
+from stages.errors import WorkspaceError
+
+REPOSITORY = Path(__file__).parents[1]
+FULL = OSError(errno.ENOSPC, "No space left on device")
+
+
+@pytest.fixture
+def no_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The user's cache would lie below a file, so it cannot be made; the place of temporary files is empty."""
+    (tmp_path / "file").touch()
+    (tmp_path / "temporary").mkdir()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    monkeypatch.setattr(caches, "_user_cache", lambda: tmp_path / "file" / "hineus")
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
+    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
+    caches.cache_folder.cache_clear()
+    yield tmp_path / "temporary"
+    caches.cache_folder.cache_clear()
+
+
+# ---------------------------------------------------------------- a place for compiled code
+def test_compiled_code_goes_to_the_users_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(caches, "_user_cache", lambda: tmp_path / "cache" / "hineus")
+    monkeypatch.setenv("NUMBA_CACHE_DIR", "")
+    caches.cache_folder.cache_clear()
+    assert caches.compiler_folder("NUMBA_CACHE_DIR", "numba") == tmp_path / "cache" / "hineus" / "numba"
+    assert os.environ["NUMBA_CACHE_DIR"] == str(tmp_path / "cache" / "hineus" / "numba")
+    assert stat.S_IMODE((tmp_path / "cache" / "hineus").stat().st_mode) == 0o700
+    caches.cache_folder.cache_clear()
+
+
+def test_without_a_cache_it_goes_to_a_folder_of_this_user_alone(no_cache: Path) -> None:
+    folder, remark = caches.cache_folder()
+    assert folder == no_cache / f"hineus-{os.geteuid()}"
+    assert stat.S_IMODE(folder.stat().st_mode) == 0o700
+    assert remark is not None
+    assert "cannot be written" in remark
+
+
+def test_a_user_without_a_home_has_a_cache(no_cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse() -> Path:
+        raise RuntimeError("could not determine the home directory for '~/.cache'")
+
+    monkeypatch.setattr(caches, "_user_cache", refuse)
+    folder, remark = caches.cache_folder()
+    assert folder.parent == no_cache
+    assert remark is not None
+    assert "home directory" in remark
+
+
+@pytest.mark.parametrize("trap", ["others may write", "link", "file", "of another user"])
+def test_a_folder_that_others_prepared_is_not_used(no_cache: Path, trap: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    planted = no_cache / f"hineus-{os.geteuid()}"
+    if trap == "link":
+        (no_cache / "elsewhere").mkdir(mode=0o700)
+        planted.symlink_to(no_cache / "elsewhere")
+    elif trap == "file":
+        planted.touch()
+    else:
+        planted.mkdir()
+        planted.chmod(0o777 if trap == "others may write" else 0o700)
+    if trap == "of another user":
+        owner = os.geteuid()
+        planted.rename(no_cache / f"hineus-{owner + 1}")
+        monkeypatch.setattr(os, "geteuid", lambda: owner + 1)
+    folder, _ = caches.cache_folder()
+    assert folder.parent == no_cache
+    assert not folder.name.startswith(("hineus-0", f"hineus-{os.geteuid()}"))
+    assert stat.S_IMODE(folder.stat().st_mode) == 0o700
+
+
+def test_a_variable_that_names_no_usable_folder_is_replaced(
+    no_cache: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setenv("NUMBA_CACHE_DIR", "/proc/nowhere")
+    assert caches.compiler_folder("NUMBA_CACHE_DIR", "numba").is_relative_to(no_cache)
+    assert "NUMBA_CACHE_DIR cannot be used: /proc/nowhere cannot be written" in caplog.text
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(no_cache / "mine"))
+    assert caches.compiler_folder("NUMBA_CACHE_DIR", "numba") == no_cache / "mine"
+
+
+def test_a_full_quota_and_a_relative_cache_are_found_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert "no absolute path" in (caches.why_unusable(Path("~/.cache")) or "")
+
+    def refuse(*args: object, **named: object) -> None:
+        raise FULL
+
+    monkeypatch.setattr(tempfile, "TemporaryFile", refuse)
+    assert "No space left on device" in (caches.why_unusable(tmp_path / "cache") or "")
+
+
+@pytest.mark.slow
+def test_kernels_compile_for_a_user_who_can_write_neither_home_nor_program(cases_dir: Path, tmp_path: Path) -> None:
+    """Case 14, as in a container with `--user`."""
+    if os.geteuid() != 0:
+        pytest.skip("only root can become another user")
+    program = (
+        "import numpy as np; from stages.evaluation.thinning import thin; from stages import caches;"
+        "print(caches.cache_folder()[0])"
+    )
+    (tmp_path / "t").mkdir()
+    (tmp_path / "t").chmod(0o1777)
+    settings = [f"PYTHONPATH={REPOSITORY}", f"TMPDIR={tmp_path / 't'}", "PYTHONDONTWRITEBYTECODE=1"]
+    asuser = cases_dir / "14-no-numba-cache" / "asuser.sh"
+    ended = subprocess.run(
+        ["bash", asuser, *settings, sys.executable, "-c", program], capture_output=True, text=True, check=False
+    )
+    assert ended.returncode == 0, ended.stderr
+    assert ended.stdout.strip() == str(tmp_path / "t" / "hineus-23456")
+
+
+# ---------------------------------------------------------------- temporary files
+def test_temporary_files_go_to_the_workspace_where_there_is_no_other_place(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", None)
+    monkeypatch.setattr(tempfile, "_candidate_tempdir_list", lambda: ["/proc/nowhere"])
+    with caches.temporary_files(tmp_path / ".work"):
+        with tempfile.NamedTemporaryFile() as file:
+            assert Path(file.name).is_relative_to(tmp_path / ".work")
+        assert Path(os.environ["TMPDIR"]).is_relative_to(tmp_path / ".work")
+    assert list((tmp_path / ".work").iterdir()) == []
+    assert caches.system_temporary() is None
+    assert "they go to the workspace" in machine_check._temporary_files().found
+
+
+def test_temporary_files_go_to_the_workspace_where_the_other_place_is_full(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    small = str(tmp_path / "small")
+    Path(small).mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", small)
+    monkeypatch.setattr(caches.shutil, "disk_usage", lambda path: SimpleNamespace(free=1 if str(path) == small else 9))
+    with caches.temporary_files(tmp_path / ".work"), tempfile.NamedTemporaryFile() as file:
+        assert Path(file.name).is_relative_to(tmp_path / ".work")
+    assert tempfile.gettempdir() == small
+
+
+def test_temporary_files_stay_where_they_are_otherwise(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    with caches.temporary_files(tmp_path / ".work"):
+        assert tempfile.gettempdir() == str(tmp_path)
+
+
+# ---------------------------------------------------------------- disks
+def test_doctor_says_where_nothing_can_be_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert machine_check._disk(tmp_path / "not" / "yet").state == "ok"
+    monkeypatch.setattr(os, "access", lambda path, mode: False)
+    assert "which cannot be written" in machine_check._disk(tmp_path).found
+
+
+def test_a_quota_is_told_from_a_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with (
+        pytest.raises(WorkspaceError, match="Your quota is used up while writing"),
+        storage_errors(tmp_path, "writing", needed=10),
+    ):
+        raise OSError(errno.EDQUOT, "Disk quota exceeded")
+    monkeypatch.setattr(caches.shutil, "disk_usage", lambda path: SimpleNamespace(free=9))
+    with pytest.raises(WorkspaceError, match="The disk is full"), storage_errors(tmp_path, "writing", needed=10):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+
+# ---------------------------------------------------------------- containers' limits
+LIMITED = {
+    "version 2": (
+        "0::/box\n",
+        {
+            "box/cpu.max": "150000 100000\n",
+            "box/memory.max": "max\n",
+            "box/memory.current": "5\n",
+            "memory.max": "4000\n",
+            "memory.current": "3000\n",
+            "memory.stat": "anon 2000\ninactive_file 500\n",
+        },
+    ),
+    "version 1, of a path that only the host sees": (
+        "4:memory:/docker/abc\n3:cpu,cpuacct:/docker/abc\n0::/\n",
+        {
+            "cpu/cpu.cfs_quota_us": "150000\n",
+            "cpu/cpu.cfs_period_us": "100000\n",
+            "memory/memory.limit_in_bytes": "4000\n",
+            "memory/memory.usage_in_bytes": "3000\n",
+            "memory/memory.stat": "cache 7\ntotal_inactive_file 500\n",
+        },
+    ),
+}
+
+
+def control_groups(folder: Path, own: str, files: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, text in files.items():
+        (folder / "groups" / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / "groups" / name).write_text(text)
+    (folder / "own").write_text(own)
+    monkeypatch.setattr(limits, "CONTROL_GROUPS", folder / "groups")
+    monkeypatch.setattr(limits, "OWN_GROUPS", folder / "own")
+    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: set(range(8)), raising=False)
+    monkeypatch.setattr(psutil, "virtual_memory", lambda: SimpleNamespace(available=6000, total=9000))
+
+
+@pytest.mark.parametrize("version", LIMITED)
+def test_a_containers_quota_of_cores_and_memory_counts(
+    version: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    control_groups(tmp_path, *LIMITED[version], monkeypatch)
+    assert limits.available_cores() == 2  # one and a half
+    assert limits.available_memory() == 1500
+    assert limits.total_memory() == 4000
+    assert machine_check._cores().found.startswith("2 usable of ")
+
+
+@pytest.mark.parametrize(
+    ("own", "files"),
+    [
+        ("0::/box\n", {"box/cpu.max": "max 100000\n", "memory.max": "max\n", "memory.current": "5\n"}),
+        ("2:cpu:/\n1:memory:/\n", {"cpu/cpu.cfs_quota_us": "-1\n", "cpu/cpu.cfs_period_us": "100000\n"}),
+        ("", {}),
+    ],
+)
+def test_without_limits_the_machine_counts(
+    own: str, files: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    control_groups(tmp_path, own, files, monkeypatch)
+    assert (limits.available_cores(), limits.available_memory(), limits.total_memory()) == (8, 6000, 9000)
+
+
+def test_without_affinity_all_cores_count(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    control_groups(tmp_path, "", {}, monkeypatch)
+    monkeypatch.delattr(os, "sched_getaffinity")
+    monkeypatch.setattr(os, "cpu_count", lambda: 3)
+    assert limits.available_cores() == 3
+
+
+# ---------------------------------------------------------------- other systems
+# Twice: what others import is there when ours are to do without.
+WITHOUT_POSIX = """
+import importlib, pkgutil, sys
+
+def import_all():
+    for name in {packages}:
+        for module in pkgutil.walk_packages(importlib.import_module(name).__path__, name + "."):
+            if module.name.split(".")[-1] not in ("encoding_cuda", "__main__"):
+                importlib.import_module(module.name)
+
+import_all()
+for name in list(sys.modules):
+    if name.split(".")[0] in ("configs", "stages", "hineus_cli"):
+        del sys.modules[name]
+sys.platform = "win32"
+for name in ("fcntl", "resource", "pwd", "grp", "termios"):
+    sys.modules[name] = None
+import_all()
+print("imported")
+"""
+
+
+@pytest.mark.parametrize(
+    "packages", [["configs", "stages.engine", "hineus_cli"], pytest.param(["stages"], marks=pytest.mark.slow)]
+)
+def test_modules_import_without_what_only_posix_has(packages: list[str], tmp_path: Path) -> None:
+    ended = subprocess.run(
+        [sys.executable, "-c", WITHOUT_POSIX.format(packages=packages)],
+        capture_output=True,
+        text=True,
+        cwd=REPOSITORY,
+        env={**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)},  # the system's own place would be Windows'
+        check=False,
+    )
+    assert ended.stdout == "imported\n", ended.stderr
+
+
+def test_windows_locks_a_byte_behind_the_text(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    taken: list[tuple[int, int]] = []
+
+    def locking(descriptor: int, mode: int, count: int) -> None:
+        if taken:
+            raise PermissionError(13, "Permission denied")
+        taken.append((os.lseek(descriptor, 0, os.SEEK_CUR), count))
+
+    monkeypatch.setattr(sys, "platform", "win32")
+    monkeypatch.setitem(sys.modules, "msvcrt", SimpleNamespace(locking=locking, LK_NBLCK=2))
+    descriptor = os.open(tmp_path / "lock", os.O_RDWR | os.O_CREAT)
+    take(descriptor)
+    with pytest.raises(BlockingIOError):
+        take(descriptor)
+    os.close(descriptor)
+    assert taken == [(1 << 30, 1)]
+
+
+def test_only_linux_lacks_system_libraries(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "platform", "darwin")
+    assert missing_libraries() == []
+    assert machine_check._system_libraries(broken=False).found == "the packages bring theirs"
+
+
+def test_every_file_can_lie_on_windows_and_macos() -> None:
+    """Their file systems take upper and lower case for the same, and Windows refuses some names."""
+    listed = subprocess.run(["git", "ls-files", "-z"], cwd=REPOSITORY, capture_output=True, text=True, check=True)
+    names = listed.stdout.split("\0")[:-1]
+    assert len(names) > 100
+    assert [name for name, count in Counter(name.lower() for name in names).items() if count > 1] == []
+    reserved = {"con", "prn", "aux", "nul", *(f"{port}{number}" for port in ("com", "lpt") for number in range(1, 10))}
+    parts = {part for name in names for part in name.split("/")}
+    assert [part for part in parts if part.split(".")[0].lower() in reserved or set(part) & set('<>:"|?*\\')] == []
+    assert max(len(name) for name in names) < 150  # of the 260 that Windows has for a whole path
+
+
+# ---------------------------------------------------------------- modules of common names
+def test_another_package_of_the_same_name_is_found_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert shadowed(REPOSITORY) is None
+    (tmp_path / "configs").mkdir()
+    (tmp_path / "configs" / "__init__.py").touch()
+    monkeypatch.setenv("PYTHONPATH", f"{tmp_path}{os.pathsep}{REPOSITORY}")
+    version = [sys.executable, "-m", "hineus_cli", "--version"]
+    ended = subprocess.run(version, capture_output=True, text=True, cwd=REPOSITORY.parent, check=False)
+    assert ended.returncode == 1
+    assert ended.stderr.startswith(f"Error: {tmp_path / 'configs'} is found instead of our part")
+    assert "Traceback" not in ended.stderr
+
+
+def test_doctor_names_packages_that_share_our_modules_names(monkeypatch: pytest.MonkeyPatch) -> None:
+    owners = {"stages": ["hineus", "stages-of-grief"], "configs": ["hineus"], "numpy": ["numpy"]}
+    monkeypatch.setattr(machine_check.metadata, "packages_distributions", lambda: owners)
+    finding = machine_check._names()
+    assert finding.state == "note"
+    assert finding.found == "other packages have the same: stages (of stages-of-grief)"
+
+
+def test_doctor_looks_at_every_dependency() -> None:
+    import tomllib
+
+    project = tomllib.loads((REPOSITORY / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    names = {requirement.split(">")[0] for requirement in project["dependencies"]}
+    assert names == set(machine_check.REQUIRED.values())
