@@ -144,6 +144,7 @@ def run(context: StageContext[SfmParams]) -> dict[str, Any]:
     warnings = [
         *_place_warnings(from_one_place(depth.parallaxes), len(names), last.model),
         *_flat_warnings(depth, last, bench),
+        *_still_warnings(bench.stands_still, image_set),
     ]
     return {**numbers, **since, "warnings": warnings}
 
@@ -276,6 +277,19 @@ def _place_warnings(still: Sequence[str], total: int, model: Any) -> list[dict[s
     else:
         return []
     log.warning("%s Add photos from other places.", sentence)
+    return [{"sentence": sentence}]
+
+
+def _still_warnings(stands_still: bool, image_set: ImageSet) -> list[dict[str, str]]:
+    """For the report and the log: that a background stood still while the object turned, where no masks hide it."""
+    bare = sum(not record.has_mask for record in image_set.images)
+    if not stands_still or not bare:
+        return []
+    sentence = (
+        f"The background stands still while the object turns. The poses do without it, but it is in {bare} photos "
+        "without a mask, where training would find it at many places: `hineus run PHOTOS --moving-object` masks it."
+    )
+    log.warning("%s", sentence)
     return [{"sentence": sentence}]
 
 
