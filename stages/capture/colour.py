@@ -62,9 +62,17 @@ def colours_of(info: Mapping[str, Any], exif: Any, mode: str) -> Colours:
         return Colours()
     if nclx.get("color_primaries") in NCLX_PRIMARIES:
         return _checked(matrix_profile("nclx", NCLX_PRIMARIES[nclx["color_primaries"]], decode_srgb), mode)
-    if str(exif.get_ifd(INTEROPERABILITY_IFD).get(INTEROPERABILITY_INDEX, "")).startswith(DCF_OPTION):
+    if _interoperability(exif).startswith(DCF_OPTION):
         return Colours(matrix_profile("Adobe RGB", ADOBE_RGB, lambda v: v**ADOBE_GAMMA), "Adobe RGB (by EXIF)")
     return Colours()
+
+
+def _interoperability(exif: Any) -> str:
+    """What EXIF says of the file's kind; empty where it says nothing."""
+    try:
+        return str(exif.get_ifd(INTEROPERABILITY_IFD).get(INTEROPERABILITY_INDEX, ""))
+    except KeyError:  # Pillow before 13, where there is no such directory
+        return ""
 
 
 def in_srgb(image: Any, colours: Colours) -> Any:
