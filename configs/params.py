@@ -23,11 +23,18 @@ class IngestParams(Section):
     video_frames: int = Field(
         80, ge=2, description="at most this many frames of a video become photos: spread by motion, the sharpest ones"
     )
-    auto_mask: Literal["off", "plain", "salient"] = Field(
+    auto_mask: Literal["off", "plain", "salient", "object"] = Field(
         "off",
         description="masks of photos without one. plain: from their plain background (black cloth, white sweep, chroma "
         "key), an error where it is not plain; salient: what a network takes for the subject, used where the photos "
-        "agree on it to cut the mesh and find the region; needs `pip install 'hineus[masks]'`",
+        "agree on it to cut the mesh and find the region; object: the same, believed everywhere as masks of your own "
+        "are, for an object that was moved; both need `pip install 'hineus[masks]'`",
+    )
+    panoramas: Literal["auto", "split", "off"] = Field(
+        "auto",
+        description="360-degree pictures (equirectangular) are split into pinhole views: eight around, one up. auto: "
+        "by their metadata, or where the left and right borders of pictures twice as wide as high meet; split: all "
+        "pictures twice as wide as high, too",
     )
     masks_keep: Literal["auto", "white", "black"] = Field(
         "auto",
@@ -62,7 +69,7 @@ class SfmParams(Section):
     masks: Literal["auto", "always", "never"] = Field(
         "auto",
         description="features on the object only, where masks exist; auto: where too few photos have a pose without. "
-        "always: for an object that was turned by hand",
+        "always: for an object that was moved, as `--moving-object` says",
     )
     max_image_size: int = Field(1600, ge=100, description="features are found at this longest side, pixels")
     max_features: int = Field(8192, ge=100, description="SIFT features per image")

@@ -163,6 +163,14 @@ Deterministic = Annotated[
     bool,
     typer.Option("--deterministic", help="The same poses every time, bit for bit, but slower: sfm.deterministic=true."),
 ]
+MovingObject = Annotated[
+    bool,
+    typer.Option(
+        "--moving-object",
+        help="The object was moved between photos, as turned over for a second pass: only what its masks show counts; "
+        "without --masks, a network makes them. Sets sfm.masks, place.gps and ingest.auto_mask.",
+    ),
+]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout.")]
 Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Say more.")]
 
@@ -176,14 +184,20 @@ def settings(
     deterministic: bool = False,
     no_masks: bool = False,
     black_keeps: bool | None = None,
+    moving_object: bool = False,
+    masks: Path | None = None,
 ) -> tuple[str, ...]:
     """Those of --set, then what other options stand for; an option that was not given says nothing."""
+    chosen = masks is not None or any(text.startswith("ingest.auto_mask=") for text in sets or ())
     stood_for = {
         "train.minutes": time,
         HOLD_OUT: hold_out,
         "cleanup.remove_ground": no_ground or None,
         "cleanup.keep_closed": watertight or None,
         "sfm.deterministic": deterministic or None,
+        "sfm.masks": "always" if moving_object else None,
+        "place.gps": False if moving_object else None,  # the cameras' places against the object are others
+        "ingest.auto_mask": "object" if moving_object and not chosen else None,
         "ingest.own_masks": False if no_masks else None,
         "ingest.masks_keep": None if black_keeps is None else "black" if black_keeps else "white",
     }
@@ -212,6 +226,7 @@ def of_a_run(
     no_ground: NoGround = False,
     watertight: Watertight = False,
     deterministic: Deterministic = False,
+    moving_object: MovingObject = False,
 ) -> Request:
     """What `hineus run` and every stage's command ask for; which stages they run is their own."""
     return Request(
@@ -226,7 +241,9 @@ def of_a_run(
         no_control=no_control,
         preset=preset,
         config=config,
-        sets=settings(sets, time, hold_out, no_ground, watertight, deterministic, no_masks, black_keeps),
+        sets=settings(
+            sets, time, hold_out, no_ground, watertight, deterministic, no_masks, black_keeps, moving_object, masks
+        ),
         device=device,
         workers=workers,
     )

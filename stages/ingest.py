@@ -13,7 +13,9 @@ import shutil
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from fnmatch import fnmatchcase
+from functools import cache
 from pathlib import Path, PurePosixPath
 from typing import Any, TypeVar
 
@@ -22,7 +24,7 @@ import numpy as np
 from configs.params import IngestParams
 from stages.artifacts import IMAGE_SET, LEFT_OUT, PHOTOS, ImageRecord, ImageSet, SkippedImage
 from stages.capture.background import PLAIN_PHOTOS, plain_mask
-from stages.capture.exif import ORIENTATION, camera_key, focal_px, read_gps
+from stages.capture.exif import GPS_IFD, ORIENTATION, camera_key, focal_px, read_gps
 from stages.capture.listing import NAMED, by_reason, list_captures, name_some
 from stages.capture.mask_doubts import MaskLook, find_doubts, is_black_and_white, nothing_kept
 from stages.capture.mask_names import set_masks_aside
@@ -42,6 +44,8 @@ from stages.capture.masks import (
     unused_masks,
     write_mask,
 )
+from stages.capture.panoramas import Sphere, View, find_spheres, split
+from stages.capture.panoramas import focal_px as view_focal_px
 from stages.capture.photo_reading import Photo, UnusableError, read_photo
 from stages.capture.quality import Appearance, appearance, find_oddities
 from stages.capture.salient import SalientNetwork
@@ -73,8 +77,8 @@ def run(context: StageContext[IngestParams]) -> dict[str, Any]:
     photos, videos, skipped = list_captures(source, masks_folder)
     photos, own_masks, aside = set_masks_aside(photos)
     frames, damaged = _frames_of(videos, context)
-    files = photos | frames
-    skipped += damaged
+    files, views, unsplit = _split_panoramas(photos | frames, context)
+    skipped += damaged + unsplit
     paths = sorted(files)
     poses = read_poses(context.sources["poses"]) if "poses" in context.sources else None
     if poses is not None:
@@ -82,7 +86,7 @@ def run(context: StageContext[IngestParams]) -> dict[str, Any]:
         skipped += [SkippedImage(path, f"has no pose in {poses.origin.name}") for path in paths if path not in cameras]
         paths = list(cameras)
         _tell_unused(poses, {camera.name for camera in cameras.values()})
-    unseen = {path for path in paths if any(fnmatchcase(path, pattern) for pattern in params.leave_out)}
+    unseen = {path for path in paths if _left_out(path, params)}
     skipped += [SkippedImage(path, LEFT_OUT) for path in paths if path in unseen]
     paths = [path for path in paths if path not in unseen]
 
@@ -101,7 +105,9 @@ def run(context: StageContext[IngestParams]) -> dict[str, Any]:
     def take(path: str) -> tuple[ImageRecord, Appearance, MaskLook | None, str] | SkippedImage:
         nonlocal done
         try:
-            return _take_photo(files[path], path, unique[path], mask_files.get(path), make_mask, names, context)
+            mask_file = mask_files.get(path)
+            taken = _take_photo(files[path], path, unique[path], mask_file, make_mask, names, context)
+            return (_as_view(taken[0], *views[path]), *taken[1:]) if path in views else taken
         except UnusableError as reason:
             return SkippedImage(path, str(reason))
         finally:
@@ -112,15 +118,16 @@ def run(context: StageContext[IngestParams]) -> dict[str, Any]:
     taken = [o for o in outcomes if not isinstance(o, SkippedImage)]
     images = sorted((record for record, *_ in taken), key=lambda record: record.name)
     skipped += [o for o in outcomes if isinstance(o, SkippedImage)]
-    if params.auto_mask == "plain":
-        images, without = _before_plain_backgrounds(images, context)
+    if params.auto_mask in ("plain", "object"):
+        images, without = _with_masks(images, context)
         skipped += without
     skipped.sort(key=lambda item: item.source)
     looks = [look for _, _, look, _ in taken if look is not None]
     _judge_masks(looks, skipped, params)
 
-    if len(images) < params.min_images:
-        raise _too_few(source, len(images), params.min_images, skipped)
+    places = len({record.frame or record.name for record in images})
+    if places < params.min_images:
+        raise _too_few(source, places, params.min_images, skipped)
     if some := missing_masks([record.source for record in images], mask_files, masks_folder):
         raise some
     for expected, level in ((True, logging.INFO), (False, logging.WARNING)):
@@ -129,8 +136,8 @@ def run(context: StageContext[IngestParams]) -> dict[str, Any]:
     doubtful = [SkippedImage(record.source, problem) for record, *_, problem in taken if problem]
     for problem, sources in by_reason(doubtful).items():
         log.warning("%s: %s", name_some(sources), problem)
-    # a video's frames are the sharpest of their stretch and near each other by choice
-    odd = find_oddities([seen for _, seen, *_ in taken if seen.source not in frames])
+    # a video's frames are the sharpest of their stretch and near each other by choice, views may show the sky
+    odd = find_oddities([seen for _, seen, *_ in taken if seen.source not in frames.keys() | views.keys()])
     for warning in odd.warnings:
         log.warning("%s", warning)
     masked = sum(record.has_mask for record in images)
@@ -144,6 +151,7 @@ def run(context: StageContext[IngestParams]) -> dict[str, Any]:
         "skipped": sum(not item.expected for item in skipped),
         **({"companions": companions} if (companions := sum(item.expected for item in skipped)) else {}),
         **({"videos": len(videos) - len(damaged)} if videos else {}),
+        **({"panoramas": len({path for path, _ in views.values()})} if views else {}),
         "masks": masked,
         "cameras": len({record.camera for record in images}),
         "with_focal": sum(record.focal_px is not None for record in images),
@@ -177,6 +185,81 @@ def _frames_of(
         log.info("%s: %d frames", video, len(frames))
         found |= {f"{video}/{frame.name}": frame for frame in frames}
     return found, damaged
+
+
+def _split_panoramas(
+    files: dict[str, Path], context: StageContext[IngestParams]
+) -> tuple[dict[str, Path], dict[str, tuple[str, View]], list[SkippedImage]]:
+    """The files with views in place of 360-degree pictures; each view's panorama; and panoramas of other kinds.
+
+    Views are named as frames of a video are: `pano.jpg/045.jpg`.
+    """
+    spheres, others = find_spheres(
+        {path: file for path, file in files.items() if not _left_out(path, context.params)}, context.params.panoramas
+    )
+    folder = context.scratch / "views"
+    shutil.rmtree(folder, ignore_errors=True)
+    done = 0
+
+    numbers = {path: str(number) for number, path in enumerate(spheres)}  # names may be too long
+
+    def split_one(path: str) -> dict[str, tuple[Path, View]] | SkippedImage:
+        nonlocal done
+        try:
+            found = _write_views(files[path], spheres[path], folder / numbers[path], context.params.max_side)
+        except UnusableError as reason:
+            return SkippedImage(path, str(reason))
+        done += 1
+        context.progress(done, len(spheres), f"views of {path}")
+        return {f"{path}/{file.name}": (file, view) for file, view in found}
+
+    kept = {path: file for path, file in files.items() if path not in spheres.keys() | others.keys()}
+    views: dict[str, tuple[str, View]] = {}
+    skipped = [SkippedImage(path, reason) for path, reason in others.items()]
+    for path, found in zip(spheres, _in_threads(split_one, spheres, context.workers), strict=True):
+        if isinstance(found, SkippedImage):
+            skipped.append(found)
+            continue
+        kept |= {name: file for name, (file, _) in found.items()}
+        views |= {name: (path, view) for name, (_, view) in found.items()}
+    if views:
+        log.info("%d 360-degree pictures were split into %d views", len(spheres), len(views))
+    return kept, views, skipped
+
+
+def _write_views(file: Path, sphere: Sphere, folder: Path, max_side: int) -> list[tuple[Path, View]]:
+    """Write the views of a panorama, with its GPS position.
+
+    Raises:
+        UnusableError: it cannot be read.
+    """
+    from PIL import Image
+
+    photo = read_photo(file, max(sphere.size))
+    metadata = Image.Exif()
+    metadata[GPS_IFD] = photo.exif.get_ifd(GPS_IFD)
+    folder.mkdir(parents=True)
+    written = []
+    for view, pixels in split(np.asarray(photo.rgb), sphere, min(sphere.side, max_side)):
+        target = folder / f"{view.name}{'.jpg' if photo.lossy else '.png'}"
+        _encode(Image.fromarray(pixels), target, photo.lossy, metadata)
+        written.append((target, view))
+    return written
+
+
+def _as_view(record: ImageRecord, panorama: str, view: View) -> ImageRecord:
+    """The record of a view: its intrinsics are known, and how it is turned against the others of its panorama."""
+    return replace(
+        record,
+        focal_px=view_focal_px(record.width),
+        camera=f"view {view.name} of 360-degree pictures | {record.width} x {record.height}",
+        frame=panorama,
+        cam_from_frame=tuple(map(tuple, view.cam_from_panorama.tolist())),
+    )
+
+
+def _left_out(path: str, params: IngestParams) -> bool:
+    return any(fnmatchcase(path, pattern) for pattern in params.leave_out)
 
 
 def _without_copies(
@@ -317,25 +400,26 @@ def _in_threads(function: Callable[[Item], Result], items: Iterable[Item], worke
 def _mask_maker(params: IngestParams) -> MaskMaker | None:
     """What makes the masks of photos that come without; None where nothing is to.
 
-    Raises:
-        SystemRequirementError: the network is wanted and not installed.
+    It raises SystemRequirementError where the network is wanted and not installed.
     """
-    if params.auto_mask == "salient":
-        return SalientNetwork().mask
+    if params.auto_mask in ("salient", "object"):
+        network = cache(SalientNetwork)  # not needed where all photos bring their masks
+        return lambda rgb: network().mask(rgb)
     return plain_mask if params.auto_mask == "plain" else None
 
 
-def _before_plain_backgrounds(
+def _with_masks(
     images: list[ImageRecord], context: StageContext[IngestParams]
 ) -> tuple[list[ImageRecord], list[SkippedImage]]:
-    """The photos with a mask; the few whose background is not plain, so that none could be made, are left out.
+    """The photos with a mask; the few of which none could be made are left out.
 
     Raises:
-        InputError: those are not few.
+        InputError: they should have a plain background, and those that have not are not few.
     """
     bare = [record for record in images if record.made_mask or not record.has_mask]
     left_out = [record for record in bare if not record.has_mask]
-    if len(left_out) > (1 - PLAIN_PHOTOS) * len(bare):
+    plain = context.params.auto_mask == "plain"
+    if plain and len(left_out) > (1 - PLAIN_PHOTOS) * len(bare):
         raise InputError(
             f"The background is plain in {len(bare) - len(left_out)} of {len(bare)} photos (need "
             f"{math.ceil(PLAIN_PHOTOS * len(bare))}), for example not in {left_out[0].source}.",
@@ -344,7 +428,8 @@ def _before_plain_backgrounds(
     for record in left_out:
         context.to_write(PHOTOS).path(record.name).unlink()
     kept = [record for record in images if record.has_mask]
-    return kept, [SkippedImage(record.source, "its background is not plain") for record in left_out]
+    reason = "its background is not plain" if plain else "nothing stands out in it, so it has no mask"
+    return kept, [SkippedImage(record.source, reason) for record in left_out]
 
 
 # ---------------------------------------------------------------- one photo
@@ -440,7 +525,7 @@ def _encode(rgb: Any, target: Path, lossy: bool, exif: Any) -> None:
 
 INGEST: Stage[IngestParams] = Stage(
     name="ingest",
-    version=5,
+    version=6,
     settings=lambda config: config.ingest,
     run=run,
     writes=(PHOTOS, IMAGE_SET),

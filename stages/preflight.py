@@ -18,6 +18,7 @@ from stages.capture.inspection import Inspection, MasksWanted, inspect
 from stages.capture.listing import NAMED, by_reason, name_some
 from stages.capture.mask_doubts import find_doubts, nothing_kept
 from stages.capture.masks import ASIDE, EMPTY, missing_masks, tell_masks
+from stages.capture.panoramas import split_size
 from stages.capture.salient import INSTALL, find_weights
 from stages.ingest import pairs_of, read_mask_file
 from stages.limits import available_memory, nearest_existing
@@ -99,6 +100,7 @@ class Preflight:
         return {
             "verdict": self.verdict,
             "photos": len(seen.photos),
+            "panoramas": sorted(seen.spheres),
             "videos": [asdict(video) for video in seen.videos],
             "left_out": [asdict(item) for item in seen.skipped],
             "sizes": [[*size, count] for size, count in Counter(seen.sizes).most_common()],
@@ -141,13 +143,15 @@ def preflight(
     params = config.ingest
     pairs = pairs_of(read_poses(poses) if decode and poses is not None and masks is not None else None)
     wanted = MasksWanted(masks, params.own_masks, params.masks_keep == "black", pairs, read_mask_file)
-    seen = inspect(source, masks, params.video_frames, params.max_side, workers, decode, wanted)
+    seen = inspect(
+        source, masks, params.video_frames, params.max_side, workers, decode, wanted, panoramas=params.panoramas
+    )
     needs = estimate(seen, config, device, workers)
     folder = nearest_existing(folder)
     memory, disk = available_memory() / GIB, shutil.disk_usage(folder).free / 1e9
     refusals, shortages = [], []
-    if len(seen.sizes) < config.ingest.min_images:
-        refusals.append(f"{len(seen.sizes)} usable photos, {config.ingest.min_images} are needed.")
+    if seen.places < config.ingest.min_images:
+        refusals.append(f"{seen.places} usable photos, {config.ingest.min_images} are needed.")
     warnings = _warnings(seen, config)
     if control is None:
         warnings += _unused_control(seen, source)
@@ -165,6 +169,13 @@ def preflight(
         shortages.append(f"{folder} cannot be written: try `--workspace DIR`.")
     if needs.disk_gb > disk:
         shortages.append(f"It may take {needs.disk_gb:.1f} GB of disk, {disk:.1f} are free: try `--workspace DIR`.")
+    if config.ingest.auto_mask in ("salient", "object") and find_weights() is None:
+        shortages.append(f"`ingest.auto_mask={config.ingest.auto_mask}` needs a network that is missing: `{INSTALL}`.")
+    if config.sfm.masks == "always" and masks is None and config.ingest.auto_mask == "off":
+        warnings.append(
+            "Only what masks show is to be matched, and there are none, unless all photos bring theirs: give "
+            "`--masks FOLDER`, or have them made with `--set ingest.auto_mask=object`."
+        )
     doubts, impossible = _of_masks(seen, config, masks if decode or poses is None else None)
     warnings += doubts
     refusals += impossible
@@ -270,6 +281,9 @@ def facts(done: Preflight) -> list[tuple[str, str]]:
     """What was found, line by line: a word and a text."""
     seen, needs = done.inspection, done.needs
     lines = [("photos", str(len(seen.photos)))]
+    if seen.spheres:
+        views = sum(split_size(sphere)[0] for sphere in seen.spheres.values())
+        lines.append(("360 degrees", f"{len(seen.spheres)} of them, which are split into {views} pinhole views"))
     lines += [("video", f"{clip.source}: up to {clip.frames} frames") for clip in seen.videos]
     sizes = Counter(seen.sizes).most_common()
     lines.append(("sizes", "; ".join(f"{count} x {width} x {height}" for (width, height), count in sizes[:NAMED])))

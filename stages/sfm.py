@@ -42,11 +42,12 @@ from stages.errors import InputError, ReconstructionError
 from stages.posing.adding import STAYED, KnownPhotos, known_lenses, put_back
 from stages.posing.adjustment import LastAdjustment, adjust_last
 from stages.posing.evidence import MIN_VERIFIED, Evidence
+from stages.posing.joining import view_distance
 from stages.posing.known import match_photos
 from stages.posing.ladder import Solution, Step, climb, describe, photos_wanted
 from stages.posing.reading import read_poses
-from stages.posing.triangulation import triangulate
-from stages.posing.turning import from_one_place, parallaxes
+from stages.posing.triangulation import DATABASE, triangulate
+from stages.posing.turning import MIN_PARALLAX, Depth, from_one_place, judge_depth, refuse_one_place, relief, two_places
 from stages.posing.workbench import ADDED, RELAXED, Workbench, learned_available
 
 log = logging.getLogger(__name__)
@@ -54,6 +55,12 @@ log = logging.getLogger(__name__)
 FEW_POINTS = 10  # fewer points than this a photo are worth a warning where the poses are known
 DOUBTFUL_ERROR_PX = 2.0  # COLMAP's own models are below one
 MIN_CONNECTED = 0.5  # of new photos must be placed beside the known ones, or poses are found anew from all
+MIN_PLACES, TWO_PLACES = 5, 0.8  # part of more photos than so many that were taken from two places: no walk is
+SECOND_PASS = 0.25  # part of the photos: a model of so many beside the largest is no accident
+# Points this far off one plane, in the distance they are seen from, are no flat thing, whatever pairs of photos show.
+FLAT_RELIEF = 0.01
+# Of the focal length. Of flat things it was 0.02 % seen at many angles, 4 % and more (and wrong by 21 %) straight on.
+DOUBTFUL_FOCAL_ERROR = 0.01
 FEATURES_EXTRA = "pip install 'hineus[features]'"
 
 
@@ -93,11 +100,13 @@ def run(context: StageContext[SfmParams]) -> dict[str, Any]:
         best, steps = _solve(bench, wanted, max(needed, len(names) // 2), params)
         evidence = Evidence(bench.database())
         # of the same matches as at first, where nothing else was tried
-        still = from_one_place(bench.parallaxes if len(steps) == 1 else parallaxes(bench.database()))
+        depth = bench.depth if len(steps) == 1 else judge_depth(bench.database())
         if best is not None and not best.base.corners:
             _keep_features(bench.database(best.base), context.to_write(FEATURES))
 
     if best is None:
+        if bench.stands_still:
+            raise _nothing_moved(len(names), steps)
         raise _nothing_matched(evidence, names, steps, params, _masks_advice(image_set, params))
     unregistered = tuple(
         Unregistered(
@@ -116,6 +125,12 @@ def run(context: StageContext[SfmParams]) -> dict[str, Any]:
         )
     for item in unregistered:
         log.warning("not registered: %s: %s", item.name, item.reason)
+    if params.masks != "always" and max(map(len, best.others), default=0) >= SECOND_PASS * len(names):
+        log.warning(
+            "%d photos make a model of their own. If the object was moved in between, as turned over for a second "
+            "pass, try `hineus run PHOTOS --moving-object`, with `--masks FOLDER` or without",
+            max(map(len, best.others)),
+        )
     for prior, found in bench.contradicted(best):
         log.warning("the EXIF focal length, %.0f px, is wrong: the poses say %.0f px", prior, found)
     if steps[-1].kept and steps[-1].rung == RELAXED:
@@ -128,7 +143,12 @@ def run(context: StageContext[SfmParams]) -> dict[str, Any]:
     lineage, since = _since(context, last.model, known)
     numbers = _publish(context, last, best.registered, unregistered, params.mapper, bench.matcher, others, steps)
     _keep_contents(context, contents, lineage)
-    return {**numbers, **since, "warnings": _place_warnings(still, len(names))}
+    warnings = [
+        *_place_warnings(from_one_place(depth.parallaxes), len(names), last.model),
+        *_flat_warnings(depth, last, bench),
+        *_still_warnings(bench.stands_still, image_set),
+    ]
+    return {**numbers, **since, "warnings": warnings}
 
 
 # ---------------------------------------------------------------- photos that came or went
@@ -150,7 +170,8 @@ def _known_photos(
     import pycolmap
 
     before, folder = context.read_previous(PHOTO_CONTENTS), context.read_previous(FEATURES)
-    if before is None or folder is None or not folder.exists():
+    rigs = any(record.frame for record in image_set.images)  # whose frames a known model would have to keep
+    if before is None or folder is None or not folder.exists() or rigs:
         return None
     names = _names_then(before.contents, contents)
     registration = context.read_previous(REGISTRATION)
@@ -251,16 +272,58 @@ def _adjusted(context: StageContext[SfmParams], model: Any, threads: int, known:
     return last
 
 
-def _place_warnings(still: Sequence[str], total: int) -> list[dict[str, str]]:
-    """For the report and the log: that most photos were taken from one place (`still`), if they were."""
-    if 2 * len(still) <= total:
+def _place_warnings(still: Sequence[str], total: int, model: Any) -> list[dict[str, str]]:
+    """For the report and the log: that most photos were taken from one place (`still`), or nearly all from two."""
+    first, second = two_places(model)
+    if 2 * len(still) > total:
+        sentence = (
+            f"{len(still)} of {total} photos were taken from one place ({still[0]} to {still[-1]}) and tell no more of "
+            f"the shape than one does: {total - len(still)} are left, 20 or more from all sides give a whole object."
+        )
+    elif total > MIN_PLACES and len(first) + len(second) >= TWO_PLACES * total:
+        sentence = (
+            f"{len(first) + len(second)} of {total} photos were taken from two places ({first[0]} to {first[-1]}, "
+            f"{second[0]} to {second[-1]}): how far things are follows from one step only, and what is hidden from "
+            "both places is missing."
+        )
+    else:
         return []
-    sentence = (
-        f"{len(still)} of {total} photos were taken from one place ({still[0]} to {still[-1]}) and tell no more of the "
-        f"shape than one does: {total - len(still)} are left, 20 or more from all sides give a whole object."
-    )
     log.warning("%s Add photos from other places.", sentence)
     return [{"sentence": sentence}]
+
+
+def _still_warnings(stands_still: bool, image_set: ImageSet) -> list[dict[str, str]]:
+    """For the report and the log: that a background stood still while the object turned, where no masks hide it."""
+    bare = sum(not record.has_mask for record in image_set.images)
+    if not stands_still or not bare:
+        return []
+    sentence = (
+        f"The background stands still while the object turns. The poses do without it, but it is in {bare} photos "
+        "without a mask, where training would find it at many places: `hineus run PHOTOS --moving-object` masks it."
+    )
+    log.warning("%s", sentence)
+    return [{"sentence": sentence}]
+
+
+def _flat_warnings(depth: Depth, last: LastAdjustment, bench: Workbench) -> list[dict[str, str]]:
+    """For the report and the log: that the photos show one flat thing only, if they do and are no survey flight."""
+    if not depth.is_flat or relief(last.model) > FLAT_RELIEF:
+        return []
+    sentence = "The photos show one flat thing and nothing beside it: a homography explains the matches of each pair."
+    doubtful = [lens for lens in last.lenses if not lens.focal_error < DOUBTFUL_FOCAL_ERROR * lens.focal]
+    if doubtful and set(last.model.cameras) - set(bench.priors):
+        lens = doubtful[0]
+        sentence += (
+            f" So they do not tell the focal length, for which there is no EXIF: {lens.focal:.0f} px with a standard "
+            f"error of {lens.focal_error:.0f} px. How far away the thing is may be as wrong, and it may come out bent."
+        )
+        advice = "Add photos tilted by 30 degrees and more, with something that stands out of the plane, or with EXIF."
+    elif 2 * bench.located > len(bench.names):
+        return []
+    else:
+        advice = "If it is not meant to be flat, add photos from the side, with something that stands out of the plane."
+    log.warning("%s %s", sentence, advice)
+    return [{"sentence": f"{sentence} {advice}"}]
 
 
 def _publish(
@@ -351,6 +414,7 @@ def _from_known_poses(context: StageContext[SfmParams]) -> dict[str, Any]:
             cuda=pycolmap.has_cuda and context.device == "cuda",
             progress=context.progress,
         )
+    _check_given_places(model, work / DATABASE)
     contents = _contents(context.read(PHOTOS), [record.name for record in image_set.images])
     context.write(GIVEN_POSES, GivenPoses(origin=poses.origin.name, region=poses.region))
     given = LastAdjustment(model, lenses=(), pose_error=None)
@@ -367,6 +431,17 @@ def _from_known_poses(context: StageContext[SfmParams]) -> dict[str, Any]:
     if error > DOUBTFUL_ERROR_PX:
         log.warning("the known poses fit the photos badly: a mean reprojection error of %.1f px", error)
     return {**numbers, "poses_from": poses.origin.name}
+
+
+def _check_given_places(model: Any, database: Path) -> None:
+    """Refuse photos that were all taken from one place, by the given poses or where these give no points.
+
+    Raises:
+        ReconstructionError: their matches say so, too.
+    """
+    centers = np.array([image.projection_center() for image in model.images.values()])
+    if not model.num_points3D() or np.ptp(centers, axis=0).max() < MIN_PARALLAX * view_distance(model):
+        refuse_one_place(judge_depth(database))
 
 
 def _lineage_of_given(context: StageContext[SfmParams], model: Any, contents: dict[str, str]) -> str | None:
@@ -389,7 +464,8 @@ def _check_masks(image_set: ImageSet, params: SfmParams) -> None:
     if params.masks == "always" and bare:
         raise InputError(
             f"{len(bare)} of {len(image_set.images)} photos have no mask, e.g. {bare[0]}; sfm.masks=always needs all.",
-            "Try `--set sfm.masks=auto`, or give `--masks FOLDER` with one mask a photo.",
+            "Give `--masks FOLDER` with one mask a photo, or have them made: `--set ingest.auto_mask=object`. "
+            "If the object was not moved, try `--set sfm.masks=auto`.",
         )
 
 
@@ -467,6 +543,15 @@ def _nothing_matched(
     return ReconstructionError(message, _hint(steps, params) + advice)
 
 
+def _nothing_moved(total: int, steps: Sequence[Step]) -> ReconstructionError:
+    return ReconstructionError(
+        f"None of the {total} photos could be registered: what matches lies at one and the same place of the frame, so "
+        f"the camera stood still, and nothing that can be matched moved before it. {_tried(steps)}",
+        "Walk around the subject, a step to the side for each photo. If it stood on a turntable, it is too plain to be "
+        "matched: let something printed turn with it, e.g. newspaper, and keep that in the frame.",
+    )
+
+
 def _needed(total: int, params: SfmParams) -> int:
     """Photos without whose poses the stage has failed."""
     return max(params.min_registered, round(params.min_registered_ratio * total))
@@ -483,7 +568,7 @@ def _too_few(
 
 SFM: Stage[SfmParams] = Stage(
     name="sfm",
-    version=7,
+    version=8,
     settings=lambda config: config.sfm,
     run=run,
     reads=(PHOTOS, IMAGE_SET),

@@ -17,7 +17,7 @@ from configs.params import IngestParams
 from stages import artifacts
 from stages.artifacts import ImageSet
 from stages.capture.exif import DIAGONAL_35MM
-from stages.capture.photo_reading import UnusableError, read_head
+from stages.capture.photo_reading import UnusableError, read_head, read_preview
 from stages.engine.stage import StageContext
 from stages.errors import InputError
 from stages.ingest import INGEST
@@ -156,6 +156,7 @@ def test_photos_are_upright_for_every_reader(photos: Path, suffix: str, orientat
     assert (record.width, record.height) == SIZE
     assert record.focal_px == pytest.approx(160)
     assert read_head(photos / f"0{suffix}", "0", 3200).width == SIZE[0]
+    assert np.abs(read_preview(photos / f"0{suffix}").astype(int) - np.asarray(upright)).mean() < 5
     path = artifacts.Pictures(out).path(record.name)
     with Image.open(path) as written:
         seen = [np.asarray(written.convert("RGB"))]

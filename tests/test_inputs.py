@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import unicodedata
@@ -11,9 +12,12 @@ import numpy as np
 import pytest
 from PIL import Image
 from test_ingest import ingest, picture, reasons, write_photos
+from typer.testing import CliRunner
 
+from hineus_cli.app import app
 from stages.artifacts import Pictures
 from stages.capture.listing import list_captures
+from stages.capture.video import extract_frames
 from stages.engine.fingerprint import SourceDigests
 from stages.errors import InputError
 from stages.inputs.folders import MOST_BYTES, named_files, readable, short_name, unique_name
@@ -310,6 +314,19 @@ def test_damaged_exif_is_no_reason_to_lose_a_photo(photos: Path):
 def test_case_17(cases_dir: Path, tmp_path: Path):
     (tmp_path / "photos").symlink_to(cases_dir / "17-hif" / "photos")
     assert ingest(tmp_path / "photos")[2]["images"] == 6
+
+
+@pytest.mark.slow
+def test_case_11_names_that_are_not_utf_8_get_poses(cases_dir: Path, photos: Path, tmp_path: Path):
+    frames = extract_frames(cases_dir / "13-mediarecorder-webm" / "capture.webm", tmp_path / "frames", 80)
+    for i, frame in enumerate(frames):
+        name = f"f\xfcr{i:02d}.jpg".encode("latin-1" if i % 2 else "utf-8")
+        frame.rename(photos / os.fsdecode(name))
+    arguments = ["sfm", str(photos), "-w", str(tmp_path / "ws"), "--preset", "tiny", "--json"]
+    result = CliRunner().invoke(app, arguments)
+    assert result.exit_code == 0, result.stderr
+    placed = json.loads(result.stdout)["stages"][-1]["numbers"]
+    assert (placed["registered"], placed["images"]) == (24, 24)
 
 
 # ---------------------------------------------------------------- texts

@@ -12,7 +12,7 @@ import pytest
 from configs.params import SfmParams
 from stages.artifacts import ImageSet
 from stages.posing.ladder import Rung, Solution, Step, better, climb, describe, photos_wanted
-from stages.posing.workbench import Base, forget_focal_priors, has_still_background
+from stages.posing.workbench import Base, Workbench, forget_focal_priors, has_still_background
 
 
 def solution(count: int, error: float = 0.5) -> Solution:
@@ -279,3 +279,14 @@ def test_a_focal_length_that_the_poses_contradict_is_noticed(tmp_path: Path):
     assert bench.priors_are_doubtful(found(360.0, 3))
     assert bench.priors_are_doubtful(found(180.0, 1))
     assert not bench.priors_are_doubtful(found(180.0, 2))
+
+
+@pytest.mark.parametrize(("wrong", "kept"), [(1, "ab"), (0, "abc")])
+def test_a_photo_that_matches_nothing_from_its_own_pose_is_given_up(wrong: int, kept: str):
+    bench = object.__new__(Workbench)
+    outcomes = iter([(Solution(frozenset("ab"), 9, 0.5), wrong), (None, 0)])
+    bench._corners_and_matches = lambda base: None
+    bench._solve = lambda base, mapper: Solution(frozenset("abc"), 9, 0.5)
+    bench._matched_by_poses = lambda *arguments: next(outcomes)
+    found = bench._by_corners(Base(corners=True))
+    assert found.registered == frozenset(kept)

@@ -87,6 +87,7 @@ def test_a_background_that_stands_still_behind_a_turntable_does_not_matter(tmp_p
     numbers, _ = run_sfm(ingested(tmp_path / "ingest", photos, FOCAL), tmp_path, wanted=0)
     assert numbers["registered"] == len(poses)
     assert abs(numbers["focal_px"][0] / FOCAL - 1) < 0.1
+    assert "--moving-object" in numbers["warnings"][-1]["sentence"]
 
 
 @pytest.mark.slow

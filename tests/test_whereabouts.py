@@ -229,7 +229,6 @@ def test_everything_moved_together(masked: Path) -> None:
         "photos": f"{masked}/elsewhere/images",
         "masks": f"{masked}/elsewhere/masks",
         "poses": f"{masked}/elsewhere/poses/transforms.json",
-        "control points": None,
     }
     assert "are no longer" not in answer["said"]
     (masked / "elsewhere").rename(masked / "again")

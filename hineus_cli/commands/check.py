@@ -14,6 +14,7 @@ from hineus_cli.options import (
     Device,
     Json,
     Masks,
+    MovingObject,
     NoMasks,
     Poses,
     Preset,
@@ -43,6 +44,7 @@ def check(
     device: Device = "auto",
     workers: Workers = None,
     time: Time = None,
+    moving_object: MovingObject = False,
     as_json: Json = False,
 ) -> None:
     """A quick look before a run: are these photos good, and what will they take? Exits with 0 unless it is no-go."""
@@ -57,7 +59,7 @@ def check(
         control=control,
         preset=preset,
         config=config,
-        sets=settings(sets, time, no_masks=no_masks, black_keeps=black_keeps),
+        sets=settings(sets, time, moving_object=moving_object, masks=masks, no_masks=no_masks, black_keeps=black_keeps),
         device=device,
         workers=workers,
     )

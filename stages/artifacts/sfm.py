@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -48,6 +49,16 @@ class Lens(Record):
     params: dict[str, float]
     standard_errors: dict[str, float]
     trials: tuple[LensTrial, ...] = ()
+
+    @property
+    def focal(self) -> float:
+        """Pixels; the horizontal one, where there are two."""
+        return next(value for name, value in self.params.items() if name in ("f", "fx"))
+
+    @property
+    def focal_error(self) -> float:
+        """Its standard error; infinite where it cannot be told."""
+        return next((value for name, value in self.standard_errors.items() if name in ("f", "fx")), math.inf)
 
     @property
     def freed(self) -> tuple[str, ...]:

@@ -26,6 +26,7 @@ from stages.capture.masks import (
     unused_folder,
     unused_masks,
 )
+from stages.capture.panoramas import Mode, Sphere, find_spheres, split_size
 from stages.capture.photo_reading import PhotoFile, UnusableError, read_alpha, read_head, read_preview
 from stages.capture.quality import Appearance, Oddities, appearance, find_oddities
 from stages.capture.video import video_size
@@ -85,6 +86,7 @@ class Inspection:
         num_bytes: size of all the files.
         oddities: none where the photos were not decoded.
         plain_share: part of the photos whose background is plain; 0 where the photos were not decoded.
+        spheres: those of the photos that are 360-degree pictures.
     """
 
     photos: tuple[PhotoFile, ...]
@@ -93,6 +95,7 @@ class Inspection:
     num_bytes: int
     oddities: Oddities = field(default_factory=Oddities)
     plain_share: float = 0.0
+    spheres: Mapping[str, Sphere] = field(default_factory=dict)
     masks: MasksSeen = field(default_factory=MasksSeen)
 
     @property
@@ -101,10 +104,17 @@ class Inspection:
         return self.plain_share >= PLAIN_PHOTOS
 
     @property
+    def places(self) -> int:
+        """Pictures and frames that a video may give; a 360-degree picture is one, however many views it gives."""
+        return len(self.photos) + sum(video.frames for video in self.videos)
+
+    @property
     def sizes(self) -> list[tuple[int, int]]:
-        """Width and height of each photo and of each frame that a video may give."""
+        """Width and height of each photo, view of a 360-degree picture and frame that a video may give."""
         frames = [(video.width, video.height) for video in self.videos for _ in range(video.frames)]
-        return [(photo.width, photo.height) for photo in self.photos] + frames
+        photos = [(photo.width, photo.height) for photo in self.photos if photo.source not in self.spheres]
+        views = [(side, side) for count, side in map(split_size, self.spheres.values()) for _ in range(count)]
+        return photos + views + frames
 
 
 @dataclass(frozen=True)
@@ -125,6 +135,7 @@ def inspect(
     workers: int,
     decode: bool,
     masks: MasksWanted | None = None,
+    panoramas: Mode = "auto",
 ) -> Inspection:
     """Look at all photos of `source` (see `list_captures`).
 
@@ -132,6 +143,7 @@ def inspect(
         video_frames: how many a video gives at most. max_side: what photos are reduced to, pixels.
         decode: also look at their pixels, of reduced copies, and at their masks. Damage behind a sound head shows only
             then.
+        panoramas: which pictures are 360-degree ones, see `find_spheres`.
 
     Raises:
         InputError: see `list_captures`, and `MasksWanted.pair`.
@@ -139,6 +151,9 @@ def inspect(
     wanted = masks or MasksWanted(masks_folder)
     photos, videos, skipped = list_captures(source, masks_folder)
     photos, own, aside = set_masks_aside(photos)
+    spheres, others = find_spheres(photos, panoramas)
+    skipped += [SkippedImage(path, reason) for path, reason in others.items()]
+    photos = {path: file for path, file in photos.items() if path not in others}
     files = choose_masks(photos, own, masks_folder, wanted.own, wanted.pair)
     skipped += unused_masks(aside, files.values(), wanted.own, masks_folder)
 
@@ -159,6 +174,7 @@ def inspect(
         photos=tuple(item.head for item in seen),
         videos=tuple(item for item in outcomes if isinstance(item, Video)),
         skipped=tuple([*skipped, *(item for item in outcomes if isinstance(item, SkippedImage))]),
+        spheres=spheres,
         num_bytes=sum(file.stat().st_size for file in [*photos.values(), *videos.values()]),
         oddities=find_oddities([item.appearance for item in seen if item.appearance is not None]),
         plain_share=sum(item.is_plain for item in seen) / max(len(seen), 1),

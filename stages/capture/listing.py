@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path, PurePosixPath
 
 from stages.artifacts import SkippedImage
+from stages.capture.panoramas import STITCH, UNSTITCHED
 from stages.errors import InputError
 from stages.inputs.folders import named_files, readable
 from stages.inputs.formats import (
@@ -26,8 +27,6 @@ NAMED = 4  # this many files are named in a sentence
 EDITED = re.compile(r"(?P<start>.*/|)(?:img_e(?P<number>\d{4})|(?P<rest>[^/]+?)[-_ ](?:edited|bearbeitet)(?:\(\d+\))?)")
 # Pictures of one shot of Google's phones: PXL_1.RAW-01.COVER.jpg and PXL_1.RAW-02.ORIGINAL.dng.
 PART_OF_SHOT = re.compile(r"\.[a-z_]+-\d\d\.(?:cover|original|main)$")
-# Of two fisheye lenses side by side, as Insta360 writes them.
-UNSTITCHED = {".insp": "photo", ".insv": "video"}
 
 Files = dict[str, Path]
 
@@ -72,8 +71,7 @@ def list_captures(source: Path, masks_folder: Path | None = None) -> tuple[Files
             continue
         suffix = path.suffix.lower()
         if suffix in UNSTITCHED:
-            what = f"a {UNSTITCHED[suffix]} of two fisheye lenses"
-            skipped.append(SkippedImage(name, f"{what}: stitch and export it with the camera's program first"))
+            skipped.append(SkippedImage(name, f"{UNSTITCHED[suffix]}: {STITCH}"))
         elif kind in (Kind.PHOTO, Kind.RAW):
             photos[name] = path
         elif kind is Kind.VIDEO:

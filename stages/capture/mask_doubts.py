@@ -19,7 +19,7 @@ BORDER = 0.02  # width of the border that is looked at, as part of the longest s
 KEPT_BORDER = 0.9
 MUCH_OF_BORDER, MORE_THAN_MIDDLE = 0.4, 0.2
 MOST = 0.7  # this part of the masks says what the set is like
-FITTING = 0.4  # fewer masks than this that fit their photos: by chance it is 0 to 0.06, see `mask_fit`
+FITTING = 0.25  # fewer masks than this that fit their photos: by chance it is 0 to 0.06, see `mask_fit`
 MIN_SET = 3  # fewer masks than this say nothing of their set
 COARSE = 0.25  # a mask this small beside its photo has edges of several pixels
 BLACK, WHITE = 40, 215  # a photo has more than a few pixels between these
@@ -174,7 +174,11 @@ def _not_of_these(seen: Sequence[MaskLook]) -> Doubt | None:
     turn, count = Counter(fit.turn for _, fit in off).most_common(1)[0]
     if turn in TURNS and count >= MOST * len(off):
         return Doubt(message + f" They would fit {turn}.", "Make them again from these photos, or `--no-masks`.")
-    return Doubt(message, "Look at one beside its photo; name the right folder with `--masks`, or use `--no-masks`.")
+    return Doubt(
+        message,
+        "Look at one beside its photo (are they drawn far around the object?); name the right folder with `--masks`, "
+        "or use `--no-masks`.",
+    )
 
 
 def _coarse(seen: Sequence[MaskLook]) -> Doubt | None:

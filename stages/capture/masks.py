@@ -88,7 +88,7 @@ def choose_masks(
 def unused_masks(
     aside: Mapping[str, Path], used: Iterable[Path], use_own: bool, masks_folder: Path | None
 ) -> list[SkippedImage]:
-    """Those of the masks among the photos that are not used, and why; `files`: path -> file."""
+    """Those of the masks among the photos that are not used, and why."""
     taken = {file.resolve() for file in used}
     reason = f"{ASIDE} that are of none of them, or one for all, which is no object's outline"
     if masks_folder is not None:

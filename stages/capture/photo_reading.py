@@ -116,7 +116,7 @@ def read_photo(file: Path, max_side: int) -> Photo:
         UnusableError: it is damaged, an animation, too small, too large for the memory that is free, or a raw file
             without rawpy.
     """
-    with _telling_damage():
+    with telling_damage():
         photo = _develop(file, max_side) if _is_raw(file) else _decode(file, max_side)
     _check_side(photo.size)
     return photo
@@ -132,7 +132,7 @@ def read_head(file: Path, source: str, max_side: int) -> PhotoFile:
     from PIL import Image
 
     colours = Colours()
-    with _telling_damage():
+    with telling_damage():
         if _is_raw(file):
             with import_rawpy().imread(str(file)) as raw:
                 exif, stored_size = _raw_exif(file, raw), (raw.sizes.width, raw.sizes.height)
@@ -167,7 +167,7 @@ def read_preview(file: Path) -> np.ndarray:
     """
     from PIL import ImageOps
 
-    with _telling_damage():
+    with telling_damage():
         if _is_raw(file):  # half a second each; the previews in raw files have any size, or are not there
             return np.asarray(_develop(file, PREVIEW_SIDE).rgb)
         with open_image(file) as stored, _memory_for(stored, PREVIEW_SIDE):
@@ -208,7 +208,7 @@ def _check_side(size: tuple[int, int]) -> None:
 
 
 @contextmanager
-def _telling_damage() -> Iterator[None]:
+def telling_damage() -> Iterator[None]:
     """What a decoder says of a file, without the file's name: that is told beside it."""
     from PIL import UnidentifiedImageError
 

@@ -25,6 +25,7 @@ import numpy as np
 from stages.artifacts import Lens, LensTrial, PoseError
 from stages.posing.joining import view_distance
 from stages.posing.precision import Observations, Precision, estimate_precision, free_parameters, observations_of
+from stages.posing.rigs import has_rigs
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -81,6 +82,9 @@ def adjust_last(model: Any, params: Any, threads: int, known: Mapping[int, Lens]
     """
     if model.num_reg_images() > MOST_PHOTOS:
         log.info("the lens stays as it is: the last adjustment is for up to %d photos", MOST_PHOTOS)
+        return LastAdjustment(model, lenses=(), pose_error=None)
+    if has_rigs(model):
+        log.info("the lenses stay as they are: views of 360-degree pictures have none")
         return LastAdjustment(model, lenses=(), pose_error=None)
     freed: Freed = {camera_id: frozenset() for camera_id in _photo_counts(model)}
     trials: dict[int, list[LensTrial]] = {}

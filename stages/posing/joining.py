@@ -185,8 +185,9 @@ def put_together(first: Any, second: Any, first_from_second: Any, same: np.ndarr
         image = moved.images[i]
         if image.camera_id not in known:
             joint.cameras[image.camera_id].params = list(moved.cameras[image.camera_id].params)
-        joint.frames[image.frame_id].rig_from_world = moved.frames[image.frame_id].rig_from_world
-        joint.register_frame(image.frame_id)
+    for frame_id in sorted({moved.images[i].frame_id for i in added}):
+        joint.frames[frame_id].rig_from_world = moved.frames[frame_id].rig_from_world
+        joint.register_frame(frame_id)
     new_id = {}
     for point_id, point in moved.points3D.items():
         elements = [element for element in point.track.elements if element.image_id in added]

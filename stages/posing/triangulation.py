@@ -18,6 +18,7 @@ log = logging.getLogger(__name__)
 
 # Parts of the progress bar.
 PART_FEATURES, PART_MATCHES = 0.3, 0.9
+DATABASE = "database.db"
 # Photos are matched with this many nearest ones where there are too many for all pairs.
 NEIGHBOURS = 40
 
@@ -69,7 +70,7 @@ def triangulate(
     """
     import pycolmap
 
-    database_path = work / "database.db"
+    database_path = work / DATABASE
     model = _posed_model(database_path, images_folder, cameras)
     progress(0.02, 1, "features")
     pycolmap.extract_features(database_path, images_folder, **feature_options(params, workers, cuda))

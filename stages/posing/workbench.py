@@ -9,7 +9,8 @@ from __future__ import annotations
 import logging
 import shutil
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections import Counter
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
@@ -26,6 +27,7 @@ from stages.posing.adding import KnownPhotos, copy_features, known_model, rename
 from stages.posing.evidence import MIN_PNP, MIN_VERIFIED
 from stages.posing.joining import join_models
 from stages.posing.ladder import Rung, Solution, better
+from stages.posing.rigs import write_rigs
 from stages.posing.settings import (
     STATIONARY_PX,
     expect_corners,
@@ -34,7 +36,7 @@ from stages.posing.settings import (
     match_options,
     verification_options,
 )
-from stages.posing.turning import check_parallax, parallaxes
+from stages.posing.turning import judge_depth, refuse_one_place
 
 log = logging.getLogger(__name__)
 
@@ -47,6 +49,7 @@ DOUBTFUL_FOCAL = 1.25
 # the camera moves, only photos that are nearly the same have such matches.
 STATIONARY_SHARE = 0.5
 RELAXED = "relaxed thresholds"
+VIEW_MODEL = "SIMPLE_PINHOLE"  # of views that were made, as of 360-degree pictures
 ADDED = "beside the known photos"
 # Relaxed thresholds, with COLMAP's defaults: matches of a pair, 3D points that agree on a photo's position and their
 # share, matches and angle of the first pair.
@@ -127,16 +130,28 @@ class Workbench:
         self._other = "global" if params.mapper == "incremental" else "incremental"
         self._guided = self._relaxed = self._stationary = False
         self._first = self._latest = Base(masked=params.masks == "always")
+        # the most views that were taken at once, as of a 360-degree picture; 1 where all are photos
+        self._at_once = max(Counter(record.frame or record.name for record in image_set.images).values())
+        self._known: frozenset[int] = frozenset()  # cameras of rigs, whose intrinsics are known
         self._import(self._latest)
         with pycolmap.Database.open(self.database(self._latest)) as database:
             self.located = count_located([prior.position for prior in database.read_all_pose_priors()])
-            cameras = [camera for camera in database.read_all_cameras() if camera.has_prior_focal_length]
+            cameras = [
+                camera
+                for camera in database.read_all_cameras()
+                if camera.has_prior_focal_length and camera.camera_id not in self._known
+            ]
             self.priors = {camera.camera_id: camera.mean_focal_length() for camera in cameras}
         self.matcher = choose_matcher(params, self.located, len(self.names))
 
     def database(self, base: Base | None = None) -> Path:
         """The file of one base; of the latest one without."""
         return self.work / (base or self._latest).file
+
+    @property
+    def stands_still(self) -> bool:
+        """Whether most of what matched did so at the same place of the frame, and is left out."""
+        return self._stationary
 
     def rungs(self) -> list[Rung]:
         """All attempts, the cheap and likely ones first."""
@@ -160,7 +175,7 @@ class Workbench:
             *((affine, inside) if guessed else (inside, affine)),
             # A plain plaster part before black: 38 of 47 photos, 1 % off in the median. Affine features place none, and
             # relaxed thresholds 29, 5.6 % off.
-            self._rung_of(LEARNED, self.learned_corners, lambda best: learned_available()),
+            self._rung_of(LEARNED, self.learned_corners, lambda best: learned_available() and self._at_once == 1),
             self._rung_of("guided matching", self.guided_matching, self.matched_on_sift),
             self._rung_of(f"{self._other} mapper", self.other_mapper, self.matched_on_sift),
             self._rung_of(RELAXED, self.relaxed_thresholds, self.matched_on_sift),
@@ -190,9 +205,9 @@ class Workbench:
         if not self.database(base).exists():
             self._import(base)
         if not base.focal_priors:
-            forget_focal_priors(self.database(base), self.params.camera_model)
+            forget_focal_priors(self.database(base), self.params.camera_model, self._known)
         self._features_and_matches(base, best)
-        self.parallaxes = parallaxes(self.database())
+        self.depth = judge_depth(self.database())
         if not self.known.changed:
             return self._solution_of(base, [renamed_model(self.known)])
         start = known_model(self.known, self.database(base), self._mapping().min_num_matches)
@@ -201,7 +216,8 @@ class Workbench:
     def first(self, best: Solution | None) -> Solution | None:
         """The chosen matcher and mapper."""
         self._features_and_matches(self._first, best)
-        self.parallaxes = check_parallax(self.database())
+        self.depth = judge_depth(self.database())
+        refuse_one_place(self.depth)
         return self._solve(self._first, self.params.mapper)
 
     def all_pairs(self, best: Solution | None) -> Solution | None:
@@ -215,7 +231,7 @@ class Workbench:
         source = self._base_of(best)
         base = replace(source, focal_priors=False)
         shutil.copyfile(self.database(source), self.database(base))
-        forget_focal_priors(self.database(base), self.params.camera_model)
+        forget_focal_priors(self.database(base), self.params.camera_model, self._known)
         self._verify_again(base)
         return self._solve(base, self.params.mapper)
 
@@ -243,8 +259,8 @@ class Workbench:
         for _ in range(CORNER_ROUNDS):
             if found is None:
                 break
-            again = self._matched_by_poses(base, found.model, descriptors)
-            if again is None or len(again.registered) < len(found.registered):
+            again, wrong = self._matched_by_poses(base, found.model, descriptors)
+            if again is None or len(again.registered) < len(found.registered) - wrong:
                 break
             found = again
         return found
@@ -303,8 +319,11 @@ class Workbench:
             self._match_pairs(base, self._pairs_to_try(base, best))
         self._tell(PART_MATCHES, "poses")
 
-    def _matched_by_poses(self, base: Base, model: Any, descriptors: Any) -> Solution | None:
-        """Match again where the poses found allow it, and go on from them."""
+    def _matched_by_poses(self, base: Base, model: Any, descriptors: Any) -> tuple[Solution | None, int]:
+        """Match again where the poses found allow it, and go on from them; how many photos then match nothing.
+
+        The poses of these were wrong: a mirrored photo finds a place by corners, and no more corners from there.
+        """
         import pycolmap
 
         from stages.posing.learned import write_guided_matches
@@ -321,7 +340,11 @@ class Workbench:
             options=self._mapping(),
             refine_intrinsics=False,
         )
-        return self._solution_of(base, self._map_incremental(base, start))
+        placed = start.num_reg_images()
+        drop_unsupported(start, 1)
+        wrong = placed - start.num_reg_images()
+        start.tear_down()  # the mapper, to whom they are unknown, would break
+        return self._solution_of(base, self._map_incremental(base, start)), wrong
 
     def _corners_and_matches(self, base: Base) -> Any:
         from stages.posing.learned import likely_pairs, write_corners, write_matches
@@ -385,12 +408,12 @@ class Workbench:
             groups.setdefault(record.camera, []).append(record)
         for records in groups.values():
             options = pycolmap.ImageReaderOptions()
-            options.camera_model = self.params.camera_model
+            options.camera_model = VIEW_MODEL if records[0].frame else self.params.camera_model
             priors = sorted(record.focal_px for record in records if record.focal_px is not None)
             if priors:
                 # giving the parameters also marks the focal length as a prior that may be trusted
                 options.camera_params = camera_params(
-                    self.params.camera_model, priors[len(priors) // 2], records[0].width, records[0].height
+                    options.camera_model, priors[len(priors) // 2], records[0].width, records[0].height
                 )
             options.default_focal_length_factor = DEFAULT_FOCAL_FACTOR
             pycolmap.import_images(
@@ -400,6 +423,7 @@ class Workbench:
                 image_names=[record.name for record in records],
                 options=options,
             )
+        self._known = write_rigs(path, self.image_set.images)
         if self.known is not None and self.known.features.name == base.file:
             copy_features(self.known.features, path, self.known.names)
 
@@ -418,7 +442,10 @@ class Workbench:
         )
 
     def _matching(self) -> dict[str, Any]:
-        return match_options(self.params, self.threads, self.cuda, self._guided, self.verified, self._stationary)
+        options = match_options(self.params, self.threads, self.cuda, self._guided, self.verified, self._stationary)
+        # views of one place tell nothing of depth, and their poses against each other are known
+        options["matching_options"].skip_image_pairs_in_same_frame = self._at_once > 1
+        return options
 
     @property
     def verified(self) -> int:
@@ -437,7 +464,15 @@ class Workbench:
     def _match(self, base: Base) -> None:
         import pycolmap
 
-        getattr(pycolmap, f"match_{self.matcher}")(self.database(base), **self._matching())
+        options = self._matching()
+        if self._at_once > 1 and self.matcher == "sequential":
+            options["pairing_options"] = pairing = pycolmap.SequentialPairingOptions()
+            pairing.overlap *= self._at_once
+            pairing.quadratic_overlap = False  # 2 to the power of so many would be too much
+        if self._at_once > 1 and self.matcher == "spatial":
+            options["pairing_options"] = near = pycolmap.SpatialPairingOptions()
+            near.max_num_neighbors *= self._at_once
+        getattr(pycolmap, f"match_{self.matcher}")(self.database(base), **options)
 
     def _match_pairs(self, base: Base, pairs: Iterable[tuple[int, int]]) -> None:
         """Match and verify pairs of image ids; those that are verified already are left as they are."""
@@ -520,12 +555,19 @@ class Workbench:
             pycolmap.calibrate_view_graph(path)
         options = pycolmap.GlobalPipelineOptions()
         options.num_threads, options.random_seed = self.threads, self.params.seed
+        if self._known:
+            mapper = options.mapper
+            for part in (mapper, mapper.rotation_averaging, mapper.global_positioning, mapper.bundle_adjustment):
+                part.refine_sensor_from_rig = False
+            mapper.bundle_adjustment.refine_focal_length = False  # of all cameras or of none
         return list(pycolmap.global_mapping(path, self.images_folder, out, options).values())
 
     def _mapping(self) -> Any:
         options = mapping_options(self.params, self.threads)
         options.min_model_size = 3  # small captures are captures too
         options.mapper.abs_pose_min_num_inliers = self.agreeing
+        options.constant_cameras = set(self._known)
+        options.ba_refine_sensor_from_rig = False
         if self._latest.corners:
             expect_corners(options, self.verified)
         elif self._relaxed:
@@ -567,9 +609,12 @@ class Workbench:
 
 def drop_unsupported(model: Any, least: int) -> None:
     """Take photos out of a model that see fewer than so many of its points: their poses were wrong."""
-    for image in [model.images[i] for i in model.reg_image_ids()]:
-        if image.num_points3D < least:
-            model.deregister_frame(image.frame_id)
+    seen: Counter[int] = Counter()
+    for image in (model.images[i] for i in model.reg_image_ids()):
+        seen[image.frame_id] += image.num_points3D
+    for frame_id, points in seen.items():
+        if points < least:
+            model.deregister_frame(frame_id)
 
 
 @contextmanager
@@ -628,12 +673,14 @@ def camera_params(model: str, focal: float, width: int, height: int) -> str:
     return ",".join(f"{value:.8g}" for value in camera.params)
 
 
-def forget_focal_priors(path: Path, model: str) -> None:
-    """Set all cameras of a database to COLMAP's guess of the focal length, as one that is not known."""
+def forget_focal_priors(path: Path, model: str, known: Collection[int] = ()) -> None:
+    """Set all cameras of a database but the `known` to COLMAP's guess of the focal length, as one that is not known."""
     import pycolmap
 
     with pycolmap.Database.open(path) as database:
         for camera in database.read_all_cameras():
+            if camera.camera_id in known:
+                continue
             focal = DEFAULT_FOCAL_FACTOR * max(camera.width, camera.height)
             camera.set_params_from_string(camera_params(model, focal, camera.width, camera.height))
             camera.has_prior_focal_length = False
