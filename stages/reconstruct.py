@@ -205,7 +205,7 @@ def choose_photos(request: Request, workspace: Workspace) -> Path:
     if photos is None:
         raise InputError(
             f"The workspace {workspace.root} does not know its photos yet.",
-            f"Name them: `hineus run PHOTOS --workspace {workspace.root}`.",
+            f"Name them: `hineus run PHOTOS --workspace {shlex.quote(str(workspace.root))}`.",
         )
     if workspace.root == photos or photos in workspace.root.parents:
         raise InputError(
