@@ -296,6 +296,7 @@ def _last_scene(context: StageContext[TrainParams], scene: PosedScene) -> PosedS
     """The scene of the last training, where this one goes on from that; and if not, why, in the log."""
     before = context.read_previous(SCENE)
     if before is None:
+        log.info("training starts from the beginning: there is none with these settings to go on from")
         return None
     if not scene.lineage or before.lineage != scene.lineage:
         log.info("training starts anew: the poses, or the settings that made the scene, are others than before")

@@ -20,7 +20,7 @@ from stages.engine.stage import StageContext
 from stages.geometry.similarity import align_points
 from stages.posing.adding import KnownPhotos, copy_features, known_model, put_back
 from stages.posing.ladder import Step
-from stages.posing.workbench import ADDED, Base
+from stages.posing.workbench import ADDED, RELAXED, Base
 from stages.sfm import SFM, _is_relaxed, _same_cameras, _saw_left_out
 
 CENTERS = [
@@ -259,7 +259,8 @@ def test_photos_once_seen_are_told_when_they_are_left_out() -> None:
 
 
 @pytest.mark.parametrize(
-    ("rung", "before", "relaxed"), [(ADDED, True, True), (ADDED, False, False), ("x", True, False)]
+    ("rung", "before", "relaxed"),
+    [(RELAXED, False, True), (ADDED, True, True), (ADDED, False, False), ("x", True, False)],
 )
 def test_rough_poses_stay_rough_while_others_are_placed_beside_them(
     tmp_path: Path, rung: str, before: bool, relaxed: bool
