@@ -86,9 +86,11 @@ def run(context: StageContext[IngestParams]) -> dict[str, Any]:
         skipped += [SkippedImage(path, f"has no pose in {poses.origin.name}") for path in paths if path not in cameras]
         paths = list(cameras)
         _tell_unused(poses, {camera.name for camera in cameras.values()})
-    unseen = {path for path in paths if _left_out(path, params)}
-    skipped += [SkippedImage(path, LEFT_OUT) for path in paths if path in unseen]
-    paths = [path for path in paths if path not in unseen]
+    left_out = {path for path in paths if _left_out(path, params)}
+    unseen = sorted(left_out)
+    digests = _digests(unseen, files, context)
+    skipped += [SkippedImage(path, LEFT_OUT, sha256=digest) for path, digest in zip(unseen, digests, strict=True)]
+    paths = [path for path in paths if path not in left_out]
 
     unique, copies = _without_copies(paths, files, context)
     skipped += copies
@@ -262,12 +264,17 @@ def _left_out(path: str, params: IngestParams) -> bool:
     return any(fnmatchcase(path, pattern) for pattern in params.leave_out)
 
 
+def _digests(paths: list[str], files: dict[str, Path], context: StageContext[IngestParams]) -> list[str]:
+    """sha256 of each file."""
+    known = context.digests.get("photos", {})
+    return _in_threads(lambda path: known.get(path) or file_sha256(files[path]), paths, context.workers)
+
+
 def _without_copies(
     paths: list[str], files: dict[str, Path], context: StageContext[IngestParams]
 ) -> tuple[dict[str, str], list[SkippedImage]]:
     """Photo -> sha256 of its file, in the order of `paths`; and those that are the same file as an earlier one."""
-    known = context.digests.get("photos", {})
-    digests = _in_threads(lambda path: known.get(path) or file_sha256(files[path]), paths, context.workers)
+    digests = _digests(paths, files, context)
     first_with: dict[str, str] = {}
     copies = []
     for path, digest in zip(paths, digests, strict=True):
@@ -525,7 +532,7 @@ def _encode(rgb: Any, target: Path, lossy: bool, exif: Any) -> None:
 
 INGEST: Stage[IngestParams] = Stage(
     name="ingest",
-    version=6,
+    version=7,
     settings=lambda config: config.ingest,
     run=run,
     writes=(PHOTOS, IMAGE_SET),

@@ -35,6 +35,8 @@ def what_is_kept(workspace: Workspace, config: Config, now: FileDigests, forced:
     if not before or not now:  # photos that are nowhere to be found are not removed
         return ""
     then, today = _captures(before), _captures(now)
+    if then == today:
+        return _of_a_stopped_run(workspace, config, forced)
     known, new, gone = then & today, today - then, then - today
     if not known or not (new or gone):
         return ""
@@ -48,17 +50,44 @@ def _of_poses_and_training(
 ) -> str:
     """What is kept where the contents of these photos and videos are `left`, by their names then."""
     posed = workspace.stage_folder(SFM.name)
-    if SFM.name in forced or previous_to_continue(SFM, workspace, config) is None:
+    if SFM.name in forced or previous_to_continue(SFM, workspace, config, hashes=False) is None:
         return "poses are found anew from all"
     records = artifacts.IMAGE_SET.load(workspace.stage_folder(INGEST.name)).images
     placed = set(artifacts.REGISTRATION.load(posed).registered)
     still = [record for record in records if {record.source, str(PurePosixPath(record.source).parent)} & left]
     kept = sum(record.name in placed for record in still)
-    if not (artifacts.FEATURES.load(posed).exists() and enough_placed(kept, len(still) + new)):
+    return _of_counts(workspace, config, kept, len(still), new, gone, forced)
+
+
+def _of_a_stopped_run(workspace: Workspace, config: Config, forced: Collection[str]) -> str:
+    """The sentence where photos were taken in already and poses are still of those before; else empty."""
+    if SFM.name in forced or previous_to_continue(SFM, workspace, config, hashes=False) is None:
+        return ""
+    posed = workspace.stage_folder(SFM.name)
+    files = artifacts.PHOTO_CONTENTS.load(posed).files
+    now = {record.sha256 for record in artifacts.IMAGE_SET.load(workspace.stage_folder(INGEST.name)).images}
+    then = {file.sha256 for file in files.values()}
+    known, new, gone = len(then & now), len(now - then), len(then - now)
+    if not known or not (new or gone):
+        return ""
+    placed = set(artifacts.REGISTRATION.load(posed).registered)
+    kept = sum(file.sha256 in now and name in placed for name, file in files.items())
+    said = _of_counts(workspace, config, kept, known, new, gone, forced)
+    return f"{known} photos known, {new} new, {gone} gone: {said}"
+
+
+def _of_counts(
+    workspace: Workspace, config: Config, kept: int, still: int, new: int, gone: int, forced: Collection[str]
+) -> str:
+    """What is kept where `kept` of the photos that are `still` there have a pose."""
+    posed = workspace.stage_folder(SFM.name)
+    if not (artifacts.FEATURES.load(posed).exists() and enough_placed(kept, still + new)):
         return f"poses are found anew from all, since {kept} of them have one"
     poses = f"the poses of {kept} stay"
-    if TRAIN.name in forced or previous_to_continue(TRAIN, workspace, config) is None:
+    if not workspace.stage_folder(TRAIN.name).exists():
         return poses
+    if TRAIN.name in forced or previous_to_continue(TRAIN, workspace, config, hashes=False) is None:
+        return f"{poses}, training starts anew"
     trained = len(artifacts.SCENE.load(workspace.stage_folder(TRAIN.name)).cameras)
     goes_on = little_changed(new + gone, trained) and not config.train.hold_out
     return f"{poses}, training {'goes on from what it has learned' if goes_on else 'starts anew'}"

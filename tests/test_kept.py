@@ -51,12 +51,16 @@ def test_photos_that_came_and_went_are_told_and_the_rest_is_kept(tmp_path: Path,
 
     write_photo(photos, 8)
     (photos / "0.png").unlink()
-    (photos / "a").mkdir()
-    (photos / "1.png").rename(photos / "a" / "one.png")
+    (photos / "1.png").rename(photos / "one.png")
     (photos / "notes.txt").write_text("none of these")
     (photos / "copy.png").write_bytes((photos / "2.png").read_bytes())
     said = "7 photos known, 1 new, 1 gone: the poses of 7 stay, training goes on from what it has learned"
     # of eight photos two are a quarter
+    assert check_photos(request).kept == said
+    other = Request(photos, workspace, preset="tiny", sets=(*COARSE, "train.steps=41"), device="cpu")
+    assert check_photos(other).kept == said.replace("goes on from what it has learned", "starts anew")
+    # a run that was stopped when it had taken the photos in says what it keeps, too
+    reconstruct(Request(photos, workspace, until="ingest", device="cpu"), PIPELINE)
     assert check_photos(request).kept == said
     made = run()
     assert said in caplog.text
