@@ -183,7 +183,7 @@ def test_lack_of_room_is_a_no_go(photos: Path, monkeypatch, memory: float, disk:
 def test_missing_folder(photos: Path):
     result = check(str(photos / "nowhere"))
     assert result.exit_code == 3
-    assert "does not exist" in result.stderr
+    assert "There is no photos folder" in result.stderr
 
 
 # ---------------------------------------------------------------- what it needs

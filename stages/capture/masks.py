@@ -17,7 +17,7 @@ from stages.capture.mask_fit import outline_fit
 from stages.capture.mask_names import is_mask_folder, pair
 from stages.capture.photo_reading import Photo, PhotoFile, UnusableError
 from stages.errors import InputError
-from stages.inputs.depth import DEPTH, read_depth_mask
+from stages.inputs.depth import DEPTH, read_depth
 from stages.inputs.folders import named_files, readable
 from stages.inputs.formats import PHOTO_SUFFIXES, open_image
 
@@ -210,9 +210,7 @@ def load_mask(
     from PIL import Image
 
     if file.name.endswith(DEPTH):
-        near = read_depth_mask(file)
-        check_size(file, photo, (near.shape[1], near.shape[0]), size)
-        return Mask(near, size)
+        return _near(file, photo, size)
     try:
         with open_image(file) as stored:
             stored.load()
@@ -231,6 +229,16 @@ def load_mask(
         kept = _better_turned(kept, turned(Image.fromarray(kept), orientation), pixels)
     found = kept.shape[1], kept.shape[0]
     return Mask(kept if found == size else resized(kept, size), found)
+
+
+def _near(file: Path, photo: str, size: tuple[int, int]) -> Mask:
+    """What a depth image shows of the object; raises InputError as `load_mask`."""
+    try:
+        kept = np.isfinite(read_depth(file))
+    except (OSError, ValueError) as error:
+        raise InputError(f"{error}.", "Leave depth out with `--no-masks`.") from error
+    check_size(file, photo, (kept.shape[1], kept.shape[0]), size)
+    return Mask(kept, size)
 
 
 def turned(image: Any, orientation: int | None) -> Any:

@@ -6,27 +6,16 @@ from pathlib import Path
 
 import numpy as np
 
-from stages.errors import InputError
-
 DEPTH = "-depth.png"
 # Depth is stored in 16 bits from 0 to 15; what is nearer than 14.5 is the object.
 DEPTH_RANGE, DEPTH_OBJECT = 15.0, 14.5
-
-
-def read_depth_mask(file: Path) -> np.ndarray:
-    """[H, W] bool, true on the object, of a 16-bit depth image.
-
-    Raises:
-        InputError: it is none.
-    """
-    return np.isfinite(read_depth(file))
 
 
 def read_depth(file: Path) -> np.ndarray:
     """[H, W] float64 depth along the axis of a 16-bit depth image, infinite off the object.
 
     Raises:
-        InputError: it is none.
+        ValueError: it is none.
     """
     import cv2
 
@@ -34,6 +23,6 @@ def read_depth(file: Path) -> np.ndarray:
     stored = cv2.imdecode(np.fromfile(file, np.uint8), cv2.IMREAD_UNCHANGED)
     if stored is None or stored.dtype != np.uint16:
         found = "it cannot be read" if stored is None else f"it has {8 * stored.itemsize} bits"
-        raise InputError(f"{file} is no 16-bit depth image: {found}.", "Leave depth out with `--no-masks`.")
+        raise ValueError(f"{file} is no 16-bit depth image: {found}")
     depth = (stored if stored.ndim == 2 else stored[..., 0]) / 65535 * DEPTH_RANGE
     return np.where(depth < DEPTH_OBJECT, depth, np.inf)

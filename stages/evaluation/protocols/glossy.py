@@ -21,6 +21,7 @@ from stages.evaluation.thinning import one_a_cube
 from stages.geometry.cameras import PinholeCameras
 from stages.inputs.depth import DEPTH, read_depth
 from stages.posing import nero
+from stages.posing.known import reading
 
 VOXEL = 0.01
 
@@ -145,4 +146,5 @@ def read_glossy(data: Path, split: Path | None) -> tuple[PinholeCameras, list[np
             "Unpack GlossySynthetic again, or name the split that belongs to it.",
         )
     cameras = found.select([stems.index(stem) for stem in wanted])
-    return cameras, [read_depth(data / f"{stem}{DEPTH}") for stem in wanted]
+    with reading(f"A depth image in {data}", "16 bits a pixel"):
+        return cameras, [read_depth(data / f"{stem}{DEPTH}") for stem in wanted]
