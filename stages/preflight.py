@@ -23,6 +23,7 @@ from stages.capture.panoramas import split_size
 from stages.capture.salient import INSTALL, find_weights
 from stages.capture.selection import Sources
 from stages.engine.fingerprint import file_sha256
+from stages.errors import InputError
 from stages.limits import available_memory, nearest_existing
 from stages.posing.control_files import read_control
 from stages.posing.marks import foresee
@@ -148,7 +149,12 @@ def preflight(
     def digest(path: str, file: Path) -> str:
         return (digests or {}).get(path) or file_sha256(file)
 
-    known = read_poses(poses) if poses is not None else None
+    try:
+        known = read_poses(poses) if poses is not None else None
+    except InputError:
+        if decode:
+            raise
+        known = None  # the run that follows reads them, too, and says what is wrong
     seen = inspect(Sources(source, masks, digest, known), config.ingest, workers, decode)
     needs = estimate(seen, config, device, workers)
     folder = nearest_existing(folder)
