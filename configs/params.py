@@ -38,8 +38,8 @@ class IngestParams(Section):
     )
     masks_keep: Literal["auto", "white", "black"] = Field(
         "auto",
-        description="colour of the object in masks (opaque is white); auto: white, and masks that seem inverted are an "
-        "error",
+        description="colour of the object in mask files; auto: white, and masks that seem inverted are an error. Alpha "
+        "channels of photos keep what is opaque",
     )
     own_masks: bool = Field(
         True,

@@ -11,10 +11,9 @@ import logging
 import math
 import shutil
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from fnmatch import fnmatchcase
 from functools import cache
 from pathlib import Path, PurePosixPath
 from typing import Any, TypeVar
@@ -22,41 +21,25 @@ from typing import Any, TypeVar
 import numpy as np
 
 from configs.params import IngestParams
-from stages.artifacts import IMAGE_SET, LEFT_OUT, PHOTOS, ImageRecord, ImageSet, SkippedImage
+from stages.artifacts import IMAGE_SET, PHOTOS, ImageRecord, ImageSet, SkippedImage
 from stages.capture.background import PLAIN_PHOTOS, plain_mask
 from stages.capture.exif import GPS_IFD, ORIENTATION, camera_key, focal_px, read_gps
-from stages.capture.listing import NAMED, by_reason, list_captures, name_some
-from stages.capture.mask_doubts import MaskLook, find_doubts, is_black_and_white, nothing_kept
-from stages.capture.mask_names import set_masks_aside
-from stages.capture.masks import (
-    EMPTY,
-    MASK_NOT_PHOTO,
-    Mask,
-    PairMasks,
-    alpha_of,
-    check_size,
-    choose_masks,
-    load_mask,
-    look_at_mask,
-    match_masks,
-    missing_masks,
-    tell_masks,
-    unused_masks,
-    write_mask,
-)
-from stages.capture.panoramas import Sphere, View, find_spheres, split
+from stages.capture.listing import NAMED, by_reason, name_some
+from stages.capture.mask_doubts import MaskLook, find_doubts, nothing_kept
+from stages.capture.masks import EMPTY, given_mask, missing_masks, of_sphere, tell_masks, write_mask
+from stages.capture.panoramas import Sphere, View, split
 from stages.capture.panoramas import focal_px as view_focal_px
 from stages.capture.photo_reading import Photo, UnusableError, read_photo
 from stages.capture.quality import Appearance, appearance, find_oddities
 from stages.capture.salient import SalientNetwork
+from stages.capture.selection import Sources, select
 from stages.capture.video import extract_frames
 from stages.engine.fingerprint import file_sha256
 from stages.engine.stage import Stage, StageContext
 from stages.errors import InputError
-from stages.inputs.folders import readable, short_name, unique_name
+from stages.inputs.folders import short_name, unique_name
 from stages.inputs.formats import PHOTO_SUFFIXES, RAW_SUFFIXES
-from stages.posing.known import KnownPoses, check_masks, match_photos
-from stages.posing.nero import DEPTH, read_depth_mask
+from stages.posing.known import KnownPoses
 from stages.posing.reading import read_poses
 
 log = logging.getLogger(__name__)
@@ -73,50 +56,35 @@ Result = TypeVar("Result")
 def run(context: StageContext[IngestParams]) -> dict[str, Any]:
     """Read every photo once, write images/, masks/ and images.json."""
     params, source = context.params, context.sources["photos"]
-    masks_folder = context.sources.get("masks")
-    photos, videos, skipped = list_captures(source, masks_folder)
-    photos, own_masks, aside = set_masks_aside(photos)
-    frames, damaged = _frames_of(videos, context)
-    files, views, unsplit = _split_panoramas(photos | frames, context)
-    skipped += damaged + unsplit
-    paths = sorted(files)
     poses = read_poses(context.sources["poses"]) if "poses" in context.sources else None
+    masks_folder, known = context.sources.get("masks"), context.digests.get("photos", {})
+
+    def digest(path: str, file: Path) -> str:
+        return known.get(path) or file_sha256(file)
+
+    made = _Expansion(context)
+    selection = select(Sources(source, masks_folder, digest, poses), params, made)
+    photos, mask_files, skipped = selection.photos, selection.masks, selection.skipped
     if poses is not None:
-        cameras = match_photos(poses, paths)
-        skipped += [SkippedImage(path, f"has no pose in {poses.origin.name}") for path in paths if path not in cameras]
-        paths = list(cameras)
-        _tell_unused(poses, {camera.name for camera in cameras.values()})
-    left_out = {path for path in paths if _left_out(path, params)}
-    unseen = sorted(left_out)
-    digests = _digests(unseen, files, context)
-    skipped += [SkippedImage(path, LEFT_OUT, sha256=digest) for path, digest in zip(unseen, digests, strict=True)]
-    paths = [path for path in paths if path not in left_out]
-
-    unique, copies = _without_copies(paths, files, context)
-    skipped += copies
-
-    mask_files = choose_masks(
-        {path: files[path] for path in unique}, own_masks, masks_folder, params.own_masks, pairs_of(poses)
-    )
-    skipped += unused_masks(aside, mask_files.values(), params.own_masks, masks_folder)
-    if not mask_files and (none := missing_masks(list(unique), mask_files, masks_folder)):
+        _tell_unused(poses, selection.poses)
+    if not mask_files and (none := missing_masks(list(photos), mask_files, masks_folder)):
         raise none
-    names, make_mask = _Names(unique), _mask_maker(params)
+    names, make_mask = _Names(photos), _mask_maker(params)
     done = 0
 
     def take(path: str) -> tuple[ImageRecord, Appearance, MaskLook | None, str] | SkippedImage:
         nonlocal done
         try:
-            mask_file = mask_files.get(path)
-            taken = _take_photo(files[path], path, unique[path], mask_file, make_mask, names, context)
-            return (_as_view(taken[0], *views[path]), *taken[1:]) if path in views else taken
+            sha256 = digest(path, photos[path])
+            taken = _take_photo(photos[path], path, sha256, mask_files.get(path), make_mask, names, context)
+            return (_as_view(taken[0], *made.made_views[path]), *taken[1:]) if path in made.made_views else taken
         except UnusableError as reason:
             return SkippedImage(path, str(reason))
         finally:
             done += 1
-            context.progress(done, len(unique), path)
+            context.progress(done, len(photos), path)
 
-    outcomes = _in_threads(take, unique, context.workers)
+    outcomes = _in_threads(take, photos, context.workers)
     taken = [o for o in outcomes if not isinstance(o, SkippedImage)]
     images = sorted((record for record, *_ in taken), key=lambda record: record.name)
     skipped += [o for o in outcomes if isinstance(o, SkippedImage)]
@@ -139,7 +107,7 @@ def run(context: StageContext[IngestParams]) -> dict[str, Any]:
     for problem, sources in by_reason(doubtful).items():
         log.warning("%s: %s", name_some(sources), problem)
     # a video's frames are the sharpest of their stretch and near each other by choice, views may show the sky
-    odd = find_oddities([seen for _, seen, *_ in taken if seen.source not in frames.keys() | views.keys()])
+    odd = find_oddities([seen for _, seen, *_ in taken if seen.source not in made.names])
     for warning in odd.warnings:
         log.warning("%s", warning)
     masked = sum(record.has_mask for record in images)
@@ -152,8 +120,8 @@ def run(context: StageContext[IngestParams]) -> dict[str, Any]:
         "images": len(images),
         "skipped": sum(not item.expected for item in skipped),
         **({"companions": companions} if (companions := sum(item.expected for item in skipped)) else {}),
-        **({"videos": len(videos) - len(damaged)} if videos else {}),
-        **({"panoramas": len({path for path, _ in views.values()})} if views else {}),
+        **({"videos": made.read_videos} if selection.videos else {}),
+        **({"panoramas": len({path for path, _ in made.made_views.values()})} if made.made_views else {}),
         "masks": masked,
         "cameras": len({record.camera for record in images}),
         "with_focal": sum(record.focal_px is not None for record in images),
@@ -166,83 +134,94 @@ def run(context: StageContext[IngestParams]) -> dict[str, Any]:
 
 
 # ---------------------------------------------------------------- which files
-def _frames_of(
-    videos: dict[str, Path], context: StageContext[IngestParams]
-) -> tuple[dict[str, Path], list[SkippedImage]]:
-    """Frames of each video, as `clip.mp4/000120.jpg` -> file, so that no photo can have that name; and bad videos."""
-    found: dict[str, Path] = {}
-    damaged = []
-    shutil.rmtree(context.scratch / "frames", ignore_errors=True)
-    for done, (video, file) in enumerate(videos.items()):
+class _Expansion:
+    """Makes photos of videos and of 360-degree pictures.
 
-        def tell(part: float, done: int = done, video: str = video) -> None:
-            context.progress(done + part, len(videos), f"frames of {video}")
-
-        try:
-            folder = context.scratch / "frames" / str(done)  # a video's name may be too long
-            frames = extract_frames(file, folder, context.params.video_frames, tell)
-        except UnusableError as reason:
-            damaged.append(SkippedImage(video, str(reason)))
-            continue
-        log.info("%s: %d frames", video, len(frames))
-        found |= {f"{video}/{frame.name}": frame for frame in frames}
-    return found, damaged
-
-
-def _split_panoramas(
-    files: dict[str, Path], context: StageContext[IngestParams]
-) -> tuple[dict[str, Path], dict[str, tuple[str, View]], list[SkippedImage]]:
-    """The files with views in place of 360-degree pictures; each view's panorama; and panoramas of other kinds.
-
-    Views are named as frames of a video are: `pano.jpg/045.jpg`.
+    Attributes:
+        names: of all that was made.
+        made_views: view -> its panorama and how it looks.
+        read_videos: how many could be read.
     """
-    spheres, others = find_spheres(
-        {path: file for path, file in files.items() if not _left_out(path, context.params)}, context.params.panoramas
-    )
-    folder = context.scratch / "views"
-    shutil.rmtree(folder, ignore_errors=True)
-    done = 0
 
-    numbers = {path: str(number) for number, path in enumerate(spheres)}  # names may be too long
+    def __init__(self, context: StageContext[IngestParams]) -> None:
+        self._context = context
+        self.names: set[str] = set()
+        self.made_views: dict[str, tuple[str, View]] = {}
+        self.read_videos = 0
 
-    def split_one(path: str) -> dict[str, tuple[Path, View]] | SkippedImage:
-        nonlocal done
-        try:
-            found = _write_views(files[path], spheres[path], folder / numbers[path], context.params.max_side)
-        except UnusableError as reason:
-            return SkippedImage(path, str(reason))
-        done += 1
-        context.progress(done, len(spheres), f"views of {path}")
-        return {f"{path}/{file.name}": (file, view) for file, view in found}
+    def frames(self, videos: dict[str, Path]) -> tuple[dict[str, Path], list[SkippedImage]]:
+        """Of each video, as `clip.mp4/000120.jpg` -> file, so that no photo can have that name; and bad videos."""
+        found: dict[str, Path] = {}
+        damaged = []
+        context = self._context
+        shutil.rmtree(context.scratch / "frames", ignore_errors=True)
+        for done, (video, file) in enumerate(videos.items()):
 
-    kept = {path: file for path, file in files.items() if path not in spheres.keys() | others.keys()}
-    views: dict[str, tuple[str, View]] = {}
-    skipped = [SkippedImage(path, reason) for path, reason in others.items()]
-    for path, found in zip(spheres, _in_threads(split_one, spheres, context.workers), strict=True):
-        if isinstance(found, SkippedImage):
-            skipped.append(found)
-            continue
-        kept |= {name: file for name, (file, _) in found.items()}
-        views |= {name: (path, view) for name, (_, view) in found.items()}
-    if views:
-        log.info("%d 360-degree pictures were split into %d views", len(spheres), len(views))
-    return kept, views, skipped
+            def tell(part: float, done: int = done, video: str = video) -> None:
+                context.progress(done + part, len(videos), f"frames of {video}")
+
+            try:
+                folder = context.scratch / "frames" / str(done)  # a video's name may be too long
+                frames = extract_frames(file, folder, context.params.video_frames, tell)
+            except UnusableError as reason:
+                damaged.append(SkippedImage(video, str(reason)))
+                continue
+            log.info("%s: %d frames", video, len(frames))
+            found |= {f"{video}/{frame.name}": frame for frame in frames}
+        self.names |= found.keys()
+        self.read_videos = len(videos) - len(damaged)
+        return found, damaged
+
+    def views(
+        self, files: dict[str, Path], spheres: Mapping[str, Sphere]
+    ) -> tuple[dict[str, Path], list[SkippedImage]]:
+        """Of 360-degree pictures, named as frames of a video are: `pano.jpg/045.jpg`; and what cannot be read."""
+        context, done = self._context, 0
+        folder = context.scratch / "views"
+        shutil.rmtree(folder, ignore_errors=True)
+        numbers = {path: str(number) for number, path in enumerate(spheres)}  # names may be too long
+
+        def split_one(path: str) -> dict[str, tuple[Path, View]] | SkippedImage:
+            nonlocal done
+            try:
+                found = _write_views(path, files[path], spheres[path], folder / numbers[path], context.params)
+            except UnusableError as reason:
+                return SkippedImage(path, str(reason))
+            done += 1
+            context.progress(done, len(spheres), f"views of {path}")
+            return {f"{path}/{file.name}": (file, view) for file, view in found}
+
+        made: dict[str, Path] = {}
+        skipped = []
+        for path, found in zip(spheres, _in_threads(split_one, spheres, context.workers), strict=True):
+            if isinstance(found, SkippedImage):
+                skipped.append(found)
+                continue
+            made |= {name: file for name, (file, _) in found.items()}
+            self.made_views |= {name: (path, view) for name, (_, view) in found.items()}
+        if made:
+            log.info("%d 360-degree pictures were split into %d views", len(spheres), len(made))
+        self.names |= made.keys()
+        return made, skipped
 
 
-def _write_views(file: Path, sphere: Sphere, folder: Path, max_side: int) -> list[tuple[Path, View]]:
+def _write_views(path: str, file: Path, sphere: Sphere, folder: Path, params: IngestParams) -> list[tuple[Path, View]]:
     """Write the views of a panorama, with its GPS position.
 
     Raises:
         UnusableError: it cannot be read.
+        InputError: it has an alpha channel that is to be used.
     """
     from PIL import Image
 
     photo = read_photo(file, max(sphere.size))
+    if photo.alpha is not None and params.own_masks:
+        raise of_sphere(path)
     metadata = Image.Exif()
     metadata[GPS_IFD] = photo.exif.get_ifd(GPS_IFD)
     folder.mkdir(parents=True)
     written = []
-    for view, pixels in split(np.asarray(photo.rgb), sphere, min(sphere.side, max_side)):
+    for view, pixels in split(np.asarray(photo.rgb), sphere, min(sphere.side, params.max_side)):
         target = folder / f"{view.name}{'.jpg' if photo.lossy else '.png'}"
         _encode(Image.fromarray(pixels), target, photo.lossy, metadata)
         written.append((target, view))
@@ -260,30 +239,6 @@ def _as_view(record: ImageRecord, panorama: str, view: View) -> ImageRecord:
     )
 
 
-def _left_out(path: str, params: IngestParams) -> bool:
-    return any(fnmatchcase(path, pattern) for pattern in params.leave_out)
-
-
-def _digests(paths: list[str], files: dict[str, Path], context: StageContext[IngestParams]) -> list[str]:
-    """sha256 of each file."""
-    known = context.digests.get("photos", {})
-    return _in_threads(lambda path: known.get(path) or file_sha256(files[path]), paths, context.workers)
-
-
-def _without_copies(
-    paths: list[str], files: dict[str, Path], context: StageContext[IngestParams]
-) -> tuple[dict[str, str], list[SkippedImage]]:
-    """Photo -> sha256 of its file, in the order of `paths`; and those that are the same file as an earlier one."""
-    digests = _digests(paths, files, context)
-    first_with: dict[str, str] = {}
-    copies = []
-    for path, digest in zip(paths, digests, strict=True):
-        first = first_with.setdefault(digest, path)
-        if first != path:
-            copies.append(SkippedImage(path, f"same file as {first}"))
-    return {path: digest for digest, path in first_with.items()}, copies
-
-
 def _too_few(folder: Path, found: int, needed: int, skipped: list[SkippedImage]) -> InputError:
     hint = (
         f"Photograph the object from all sides: 30 to 100 sharp photos that overlap by two thirds. "
@@ -299,53 +254,11 @@ def _too_few(folder: Path, found: int, needed: int, skipped: list[SkippedImage])
     return InputError(message, hint)
 
 
-def _tell_unused(poses: KnownPoses, used: set[str]) -> None:
+def _tell_unused(poses: KnownPoses, used: Collection[str]) -> None:
     unused = [camera.name for camera in poses.cameras if camera.name not in used]
     if unused:
         total, file = len(poses.cameras), poses.origin.name
         log.warning("%d of %d poses in %s have no photo: %s", len(unused), total, file, name_some(unused))
-
-
-def pairs_of(poses: KnownPoses | None) -> PairMasks:
-    """`find_masks` with these poses."""
-    return lambda photos, folder, not_masks: find_masks(photos, folder, poses, not_masks)
-
-
-def find_masks(
-    photos: list[str], folder: Path, poses: KnownPoses | None, not_masks: Collection[Path] = ()
-) -> dict[str, Path]:
-    """Photo -> its mask file in `folder`; as the poses' file pairs them where it is the folder of that file's masks.
-
-    Raises:
-        InputError: the poses name masks that are not there.
-    """
-    own = poses.masks if poses is not None else {}
-    if poses is None or not own or not all(file.resolve().is_relative_to(folder.resolve()) for file in own.values()):
-        return match_masks(photos, folder, not_masks)
-    check_masks(own, poses.origin)
-    cameras = match_photos(poses, photos)
-    return {photo: own[camera.name] for photo, camera in cameras.items() if camera.name in own}
-
-
-def read_mask_file(
-    file: Path,
-    photo: str,
-    size: tuple[int, int],
-    stored_size: tuple[int, int],
-    orientation: int,
-    black_keeps: bool = False,
-    pixels: np.ndarray | None = None,
-) -> Mask:
-    """Mask of the upright photo, of a picture (see `load_mask`) or of a depth image.
-
-    Raises:
-        InputError: it cannot be read, or is not of the upright photo's size (width, height).
-    """
-    if not file.name.endswith(DEPTH):
-        return load_mask(file, photo, size, stored_size, orientation, black_keeps, pixels)
-    mask = read_depth_mask(file)
-    check_size(file, photo, (mask.shape[1], mask.shape[0]), size)
-    return Mask(mask, size)
 
 
 def _judge_masks(looks: list[MaskLook], skipped: list[SkippedImage], params: IngestParams) -> None:
@@ -359,7 +272,7 @@ def _judge_masks(looks: list[MaskLook], skipped: list[SkippedImage], params: Ing
         raise InputError(*nothing_kept(len(empty), empty[0]))
     if looks:
         log.info("masks: %s", tell_masks(looks))
-    for doubt in find_doubts(looks, params.masks_keep != "auto"):
+    for doubt in find_doubts(looks, params.masks_keep):
         if doubt.impossible:
             raise InputError(doubt.message, doubt.hint)
         log.warning("%s %s", doubt.message, doubt.hint)
@@ -453,7 +366,11 @@ def _take_photo(
     max_side = context.params.max_side
     photo = read_photo(file, max_side)
     rgb = photo.rgb
-    mask, look = _given_mask(photo, source, mask_file, context.params)
+    scale = min(1.0, LOOK_SIDE / max(rgb.size))
+    preview = np.asarray(rgb.resize([max(1, round(side * scale)) for side in rgb.size], resample=NEAREST))
+    alpha = photo.alpha if context.params.own_masks else None
+    given = given_mask(source, mask_file, alpha, photo, context.params.masks_keep == "black", preview)
+    mask, look = (given[0].kept, given[1]) if given else (None, None)
 
     made_mask = ""
     if mask is None and make_mask is not None:
@@ -488,28 +405,6 @@ def _take_photo(
         taken=photo.size,
     )
     return record, seen, look, photo.colours.problem
-
-
-def _given_mask(
-    photo: Photo, source: str, mask_file: Path | None, params: IngestParams
-) -> tuple[np.ndarray | None, MaskLook | None]:
-    """The mask [H, W] bool that comes with a photo, as its file or its alpha channel, and a look at it.
-
-    Raises:
-        UnusableError: the mask keeps nothing, or the photo is a mask itself.
-    """
-    black_keeps = params.masks_keep == "black"
-    scale = min(1.0, LOOK_SIDE / max(photo.rgb.size))
-    preview = np.asarray(photo.rgb.resize([max(1, round(side * scale)) for side in photo.rgb.size], resample=NEAREST))
-    if is_black_and_white(preview):
-        raise UnusableError(MASK_NOT_PHOTO)
-    if mask_file is not None:
-        mask = read_mask_file(mask_file, source, photo.size, photo.stored_size, photo.orientation, black_keeps, preview)
-    elif photo.alpha is not None and params.own_masks:
-        mask = Mask(photo.alpha ^ black_keeps, photo.size)
-    else:
-        return None, None
-    return mask.kept, look_at_mask(source, readable(mask_file.name) if mask_file else alpha_of(source), mask, preview)
 
 
 def _encoded_suffixes(photo: Photo) -> tuple[str, ...]:

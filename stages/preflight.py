@@ -7,6 +7,7 @@ import re
 import shlex
 import shutil
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -14,13 +15,15 @@ from typing import Any, Literal
 from configs.params import Config
 from stages.artifacts import SkippedImage
 from stages.capture.gps import gps_warnings
-from stages.capture.inspection import Inspection, MasksWanted, inspect
+from stages.capture.inspection import Inspection, inspect
 from stages.capture.listing import NAMED, by_reason, name_some
 from stages.capture.mask_doubts import find_doubts, nothing_kept
 from stages.capture.masks import ASIDE, EMPTY, missing_masks, tell_masks
 from stages.capture.panoramas import split_size
 from stages.capture.salient import INSTALL, find_weights
-from stages.ingest import pairs_of, read_mask_file
+from stages.capture.selection import Sources
+from stages.engine.fingerprint import file_sha256
+from stages.errors import InputError
 from stages.limits import available_memory, nearest_existing
 from stages.posing.control_files import read_control
 from stages.posing.marks import foresee
@@ -130,22 +133,29 @@ def preflight(
     decode: bool,
     poses: Path | None = None,
     control: Path | None = None,
+    digests: Mapping[str, str] | None = None,
 ) -> Preflight:
     """Look at the photos, and at the memory and the disk of `folder`, where the workspace will lie.
 
     `decode`: whether to judge the photos' pixels, too; before a run that is left to ingest, which decodes them anyway.
-    `poses`, `control`: files or folders of known poses and of ground control points.
+    `poses`, `control`: files or folders of known poses and of ground control points. `digests`: of photos whose sha256
+    is known.
 
     Raises:
         InputError: there is no such folder or video, or the poses or control points cannot be used.
         ConfigError, SystemRequirementError: the points' coordinates cannot be converted.
     """
-    params = config.ingest
-    pairs = pairs_of(read_poses(poses) if decode and poses is not None and masks is not None else None)
-    wanted = MasksWanted(masks, params.own_masks, params.masks_keep == "black", pairs, read_mask_file)
-    seen = inspect(
-        source, masks, params.video_frames, params.max_side, workers, decode, wanted, panoramas=params.panoramas
-    )
+
+    def digest(path: str, file: Path) -> str:
+        return (digests or {}).get(path) or file_sha256(file)
+
+    try:
+        known = read_poses(poses) if poses is not None else None
+    except InputError:
+        if decode:
+            raise
+        known = None  # the run that follows reads them, too, and says what is wrong
+    seen = inspect(Sources(source, masks, digest, known), config.ingest, workers, decode)
     needs = estimate(seen, config, device, workers)
     folder = nearest_existing(folder)
     memory, disk = available_memory() / GIB, shutil.disk_usage(folder).free / 1e9
@@ -171,12 +181,13 @@ def preflight(
         shortages.append(f"It may take {needs.disk_gb:.1f} GB of disk, {disk:.1f} are free: try `--workspace DIR`.")
     if config.ingest.auto_mask in ("salient", "object") and find_weights() is None:
         shortages.append(f"`ingest.auto_mask={config.ingest.auto_mask}` needs a network that is missing: `{INSTALL}`.")
-    if config.sfm.masks == "always" and masks is None and config.ingest.auto_mask == "off":
+    has_masks = seen.masks.looks or seen.masks.files
+    if config.sfm.masks == "always" and not has_masks and config.ingest.auto_mask == "off":
         warnings.append(
             "Only what masks show is to be matched, and there are none, unless all photos bring theirs: give "
             "`--masks FOLDER`, or have them made with `--set ingest.auto_mask=object`."
         )
-    doubts, impossible = _of_masks(seen, config, masks if decode or poses is None else None)
+    doubts, impossible = _of_masks(seen, config, masks)
     warnings += doubts
     refusals += impossible
     if memory / MEMORY_MARGIN < needs.memory_gib <= memory:
@@ -245,7 +256,7 @@ def _unused_control(seen: Inspection, source: Path) -> list[str]:
 def _of_masks(seen: Inspection, config: Config, folder: Path | None) -> tuple[list[str], list[str]]:
     """Warnings and refusals."""
     photos = [photo.source for photo in seen.photos]
-    doubts = find_doubts(seen.masks.looks, config.ingest.masks_keep != "auto")
+    doubts = find_doubts(seen.masks.looks, config.ingest.masks_keep)
     refusals = [f"{doubt.message} {doubt.hint}" for doubt in doubts if doubt.impossible]
     warnings = [f"{doubt.message} {doubt.hint}" for doubt in doubts if not doubt.impossible]
     if error := missing_masks(photos, seen.masks.files, folder):
@@ -257,7 +268,7 @@ def _of_masks(seen: Inspection, config: Config, folder: Path | None) -> tuple[li
     if empty and not seen.masks.looks:
         refusals.append(" ".join(nothing_kept(len(empty), empty[0])))
     masked = len(seen.masks.looks or seen.masks.files)
-    if folder is None and 0 < masked < len(photos):
+    if folder is None and 0 < masked < len(photos) and config.ingest.auto_mask not in ("plain", "object"):
         warnings.append(
             f"Only {masked} of {len(photos)} photos have a mask, so that training goes without masks. Add the others', "
             "or leave all out with `--no-masks`."

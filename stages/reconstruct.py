@@ -86,10 +86,10 @@ def reconstruct(request: Request, pipeline: Sequence[Stage], listener: Listener 
         digests.save()
         _tell_sources(request, workspace, sources)
         photos = sources["photos"]
+        now = (digests.files("photos") if digests.available("photos") else None) or {}
         if photos is not None and not workspace.stage_folder("ingest").exists():
-            _tell_preflight(_preflight(sources, workspace.root, config, device, workers, decode=False))
-        now = digests.files("photos") if digests.available("photos") else None
-        if kept := what_is_kept(workspace, config, now or {}, _forced(request, pipeline)):
+            _tell_preflight(_preflight(sources, workspace.root, config, device, workers, decode=False, digests=now))
+        if kept := what_is_kept(workspace, config, now, _forced(request, pipeline)):
             log.info("%s", kept)
         log.debug("preset %s, device %s, %d workers, %s", preset, device, workers, sources)
         outcomes = run_pipeline(
@@ -114,42 +114,35 @@ def check_photos(request: Request) -> Preflight:
     Raises:
         HineusError: a child by what the user can do.
     """
-    photos = request.photos
-    assert photos is not None, "the command line demands it"
-    config = load_config(request.preset or default_preset(), request.config, request.sets)
-    workers, folder = request.workers or available_cores(), choose_folder(request)
-    device = choose_device(request.device)
-    poses = locate_poses(request.poses) if request.poses else None
-    masks = request.masks or _masks_of(poses, request.no_masks)
-    sources = {"photos": photos, "masks": masks, "poses": poses, CONTROL: request.control}
-    done = _preflight(sources, folder, config, device, workers, decode=True)
-    done = replace(done, refusals=(*done.refusals, *_workspace_refusals(request)))
-    if not (folder / "workspace.json").exists():
-        return done
-    workspace = Workspace.open(folder)
-    digests = SourceDigests({"photos": photos.resolve()}, workspace.digest_cache)
-    _, config = choose_config(request, workspace)
-    return replace(done, kept=what_is_kept(workspace, config, digests.files("photos") or {}))
-
-
-def _workspace_refusals(request: Request) -> list[str]:
-    """Why a run would not use the workspace."""
+    workers, device = request.workers or available_cores(), choose_device(request.device)
+    workspace = Workspace.open(choose_folder(request), create=True)
+    digests = SourceDigests({"photos": choose_photos(request, workspace)}, workspace.digest_cache)
+    refused = []
     try:
-        workspace = Workspace.open(choose_folder(request), create=True)
-        digests = SourceDigests({"photos": choose_photos(request, workspace)}, workspace.digest_cache)
-        choose_sources(request, workspace, digests)
-    except WorkspaceError as error:
-        return [f"{error.message} {error.hint}"]
-    return []
+        sources = choose_sources(request, workspace, digests)
+    except WorkspaceError as error:  # other photos' workspace; the photos are looked at all the same
+        refused = [f"{error.message} {error.hint}"]
+        sources = choose_sources(replace(request, other_photos=True), workspace, digests)
+    _, config = choose_config(request, workspace)
+    known = (digests.files("photos") or {}) if workspace.config_path.exists() else {}
+    done = _preflight(sources, workspace.root, config, device, workers, decode=True, digests=known)
+    kept = what_is_kept(workspace, config, known) if known else ""
+    return replace(done, refusals=(*done.refusals, *refused), kept=kept)
 
 
 def _preflight(
-    sources: Mapping[str, Path | None], folder: Path, config: Config, device: str, workers: int, decode: bool
+    sources: Mapping[str, Path | None],
+    folder: Path,
+    config: Config,
+    device: str,
+    workers: int,
+    decode: bool,
+    digests: Mapping[str, str],
 ) -> Preflight:
     photos = sources["photos"]
     assert photos is not None, "there is nothing to look at"
     given = sources["poses"], sources[CONTROL]
-    return preflight(photos, sources["masks"], folder, config, device, workers, decode, *given)
+    return preflight(photos, sources["masks"], folder, config, device, workers, decode, *given, digests=digests)
 
 
 def _tell_preflight(done: Preflight) -> None:
@@ -222,10 +215,13 @@ def choose_sources(request: Request, workspace: Workspace, digests: SourceDigest
 
     Raises:
         InputError: the masks, poses or control points that are given are not there.
+        ConfigError: masks are given and not wanted.
         WorkspaceError: the workspace was made of other photos.
     """
     photos = digests.sources["photos"]
     assert photos is not None
+    if request.masks is not None and request.no_masks:
+        raise ConfigError("Both `--masks` and `--no-masks` are given.", "Leave one of them away.")
     if request.masks is not None and not request.masks.exists():
         raise InputError(f"There is no masks folder {request.masks}.", "Check the path with `ls`.")
     if request.masks is not None and not request.masks.is_dir():

@@ -14,12 +14,14 @@ from PIL import Image, ImageFile, ImageFilter
 from typer.testing import CliRunner, Result
 
 from configs.load import load_config
+from configs.params import IngestParams
 from hineus_cli.app import app
 from stages import preflight as module
 from stages import reconstruct
 from stages.capture.colour import ADOBE_RGB, matrix_profile
 from stages.capture.inspection import Inspection, Video, inspect
 from stages.capture.photo_reading import read_head
+from stages.capture.selection import Sources
 from stages.errors import InputError
 from stages.preflight import GIB, estimate, preflight
 
@@ -58,7 +60,9 @@ def check(*arguments: str) -> Result:
 
 
 def look(folder: Path) -> Inspection:
-    return inspect(folder, None, video_frames=80, max_side=3200, workers=2, decode=True)
+    return inspect(
+        Sources(folder, None, lambda path, file: file.read_bytes().hex()), IngestParams(), workers=2, decode=True
+    )
 
 
 # ---------------------------------------------------------------- what is noticed
@@ -179,7 +183,7 @@ def test_lack_of_room_is_a_no_go(photos: Path, monkeypatch, memory: float, disk:
 def test_missing_folder(photos: Path):
     result = check(str(photos / "nowhere"))
     assert result.exit_code == 3
-    assert "does not exist" in result.stderr
+    assert "There is no photos folder" in result.stderr
 
 
 # ---------------------------------------------------------------- what it needs

@@ -2,36 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import numpy as np
-
+from configs.params import IngestParams
 from stages.artifacts import SkippedImage
 from stages.capture.background import PLAIN_PHOTOS, find_background
-from stages.capture.listing import list_captures
-from stages.capture.mask_doubts import MaskLook, is_black_and_white
-from stages.capture.mask_names import set_masks_aside
-from stages.capture.masks import (
-    MASK_NOT_PHOTO,
-    Mask,
-    PairMasks,
-    alpha_of,
-    choose_masks,
-    load_mask,
-    look_at_mask,
-    match_masks,
-    unused_folder,
-    unused_masks,
-)
-from stages.capture.panoramas import Mode, Sphere, find_spheres, split_size
+from stages.capture.mask_doubts import MaskLook
+from stages.capture.masks import given_mask, of_sphere, unused_folder
+from stages.capture.panoramas import Sphere, split_size
 from stages.capture.photo_reading import PhotoFile, UnusableError, read_alpha, read_head, read_preview
 from stages.capture.quality import Appearance, Oddities, appearance, find_oddities
+from stages.capture.selection import Sources, select
 from stages.capture.video import video_size
 from stages.errors import InputError
-from stages.inputs.folders import readable
 
 
 @dataclass(frozen=True)
@@ -42,23 +28,6 @@ class Video:
     frames: int
     width: int
     height: int
-
-
-@dataclass(frozen=True)
-class MasksWanted:
-    """Which masks are used, and how they are read.
-
-    Attributes:
-        folder: of the user's choice; None: those among the photos, if `own`.
-        black_keeps: whether black is the object.
-        pair, read: as `match_masks` and `load_mask`.
-    """
-
-    folder: Path | None = None
-    own: bool = True
-    black_keeps: bool = False
-    pair: PairMasks = match_masks
-    read: Callable[..., Mask] = load_mask
 
 
 @dataclass(frozen=True)
@@ -127,43 +96,28 @@ class _Seen:
     mask: MaskLook | InputError | None = None
 
 
-def inspect(
-    source: Path,
-    masks_folder: Path | None,
-    video_frames: int,
-    max_side: int,
-    workers: int,
-    decode: bool,
-    masks: MasksWanted | None = None,
-    panoramas: Mode = "auto",
-) -> Inspection:
-    """Look at all photos of `source` (see `list_captures`).
+def inspect(sources: Sources, params: IngestParams, workers: int, decode: bool) -> Inspection:
+    """Look at all photos that are used, see `select`.
 
     Args:
-        video_frames: how many a video gives at most. max_side: what photos are reduced to, pixels.
         decode: also look at their pixels, of reduced copies, and at their masks. Damage behind a sound head shows only
             then.
-        panoramas: which pictures are 360-degree ones, see `find_spheres`.
 
     Raises:
-        InputError: see `list_captures`, and `MasksWanted.pair`.
+        InputError: see `select`.
     """
-    wanted = masks or MasksWanted(masks_folder)
-    photos, videos, skipped = list_captures(source, masks_folder)
-    photos, own, aside = set_masks_aside(photos)
-    spheres, others = find_spheres(photos, panoramas)
-    skipped += [SkippedImage(path, reason) for path, reason in others.items()]
-    photos = {path: file for path, file in photos.items() if path not in others}
-    files = choose_masks(photos, own, masks_folder, wanted.own, wanted.pair)
-    skipped += unused_masks(aside, files.values(), wanted.own, masks_folder)
+    selection = select(sources, params)
+    photos, videos, spheres = selection.photos, selection.videos, selection.spheres
 
     def look(path: str) -> _Seen | Video | SkippedImage:
         try:
             if path in videos:
                 frames, width, height = video_size(videos[path])
-                return Video(path, min(frames, video_frames), width, height)
-            head = read_head(photos[path], path, max_side)
-            return _look_closer(head, photos[path], files.get(path), wanted) if decode else _Seen(head)
+                return Video(path, min(frames, params.video_frames), width, height)
+            head = read_head(photos[path], path, params.max_side)
+            if not decode:
+                return _Seen(head)
+            return _look_closer(head, photos[path], selection.masks.get(path), params, path in spheres)
         except UnusableError as reason:
             return SkippedImage(path, str(reason))
 
@@ -173,50 +127,34 @@ def inspect(
     return Inspection(
         photos=tuple(item.head for item in seen),
         videos=tuple(item for item in outcomes if isinstance(item, Video)),
-        skipped=tuple([*skipped, *(item for item in outcomes if isinstance(item, SkippedImage))]),
+        skipped=tuple([*selection.skipped, *(item for item in outcomes if isinstance(item, SkippedImage))]),
         spheres=spheres,
         num_bytes=sum(file.stat().st_size for file in [*photos.values(), *videos.values()]),
         oddities=find_oddities([item.appearance for item in seen if item.appearance is not None]),
         plain_share=sum(item.is_plain for item in seen) / max(len(seen), 1),
         masks=MasksSeen(
-            files,
+            selection.masks,
             tuple(item.mask for item in seen if isinstance(item.mask, MaskLook)),
             tuple(item.mask for item in seen if isinstance(item.mask, InputError)),
-            None if files or not source.is_dir() else unused_folder(source, list(photos)),
+            None if selection.masks or not sources.photos.is_dir() else unused_folder(sources.photos, list(photos)),
         ),
     )
 
 
-def _look_closer(head: PhotoFile, file: Path, mask_file: Path | None, wanted: MasksWanted) -> _Seen:
-    """
+def _look_closer(head: PhotoFile, file: Path, mask_file: Path | None, params: IngestParams, is_sphere: bool) -> _Seen:
+    """With what is wrong with its mask, if it has one.
+
     Raises:
         UnusableError: the photo or its mask shows that this is none.
     """
     pixels = read_preview(file)
-    if is_black_and_white(pixels):
-        raise UnusableError(MASK_NOT_PHOTO)
-    mask = _look_at_mask(head, file, mask_file, pixels, wanted)
+    alpha = read_alpha(file) if mask_file is None and params.own_masks else None
+    mask: MaskLook | InputError | None = None
+    try:
+        if is_sphere and alpha is not None:
+            raise of_sphere(head.source)
+        given = given_mask(head.source, mask_file, alpha, head, params.masks_keep == "black", pixels)
+        mask = None if given is None else given[1]
+    except InputError as error:
+        mask = error
     return _Seen(head, appearance(head.source, pixels), find_background(pixels).is_plain, mask)
-
-
-def _look_at_mask(
-    head: PhotoFile, file: Path, mask_file: Path | None, pixels: np.ndarray, wanted: MasksWanted
-) -> MaskLook | InputError | None:
-    """At the mask of a photo, or what is wrong with it; None where there is none.
-
-    Raises:
-        UnusableError: the mask keeps nothing.
-    """
-    size = head.width, head.height
-    if mask_file is not None:
-        try:
-            mask = wanted.read(
-                mask_file, head.source, size, head.stored_size, head.orientation, wanted.black_keeps, pixels
-            )
-        except InputError as error:
-            return error
-        return look_at_mask(head.source, readable(mask_file.name), mask, pixels)
-    alpha = read_alpha(file) if wanted.own and wanted.folder is None else None
-    if alpha is None:
-        return None
-    return look_at_mask(head.source, alpha_of(head.source), Mask(alpha ^ wanted.black_keeps, size), pixels)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path, PurePosixPath
 
 from stages.artifacts import SkippedImage
@@ -36,10 +36,13 @@ def is_video(path: Path) -> bool:
     return path.suffix.lower() in VIDEO_SUFFIXES or (path.is_file() and _kind(path)[0] is Kind.VIDEO)
 
 
-def list_captures(source: Path, masks_folder: Path | None = None) -> tuple[Files, Files, list[SkippedImage]]:
+def list_captures(
+    source: Path, masks_folder: Path | None = None, masks: Collection[Path] = ()
+) -> tuple[Files, Files, list[SkippedImage]]:
     """Photos and videos by readable posix path relative to the folder `source`, sorted; what is neither, and why.
 
-    A file is what its content says. `source` may also be one video: then its own name is the only path.
+    A file is what its content says. `source` may also be one video: then its own name is the only path. What lies in
+    `masks_folder` is left out; of a folder with other files, too, only the `masks` in it that are given.
 
     Raises:
         InputError: `source` is not there or is a file of another kind, or `masks_folder` is no folder.
@@ -54,15 +57,16 @@ def list_captures(source: Path, masks_folder: Path | None = None) -> tuple[Files
         raise InputError(f"{masks_folder} is a file; a folder of masks is needed.", f"--masks {masks_folder.parent}")
     if masks_folder is not None and not masks_folder.is_dir():
         raise InputError(f"The mask folder {masks_folder} does not exist.", "Check the path given to --masks.")
-    inside_masks = masks_folder.resolve() if masks_folder else None
+    inside_masks = masks_folder.resolve() if masks_folder and not masks else None
     if inside_masks and source.resolve() not in inside_masks.parents:  # the photos may lie in the masks' folder
         inside_masks = None
+    named = {mask.resolve() for mask in masks}
     photos: Files = {}
     videos: Files = {}
     files, left = named_files(source)
     skipped = [SkippedImage(item.name, item.reason, expected=not item.missed) for item in left]
     for name, path in files.items():
-        if inside_masks and inside_masks in path.resolve().parents:
+        if path.resolve() in named or (inside_masks and inside_masks in path.resolve().parents):
             continue
         try:
             kind, words = _kind(path)

@@ -6,11 +6,14 @@ import hashlib
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
 from stages.capture.listing import name_some
 from stages.capture.mask_fit import TURNS, OutlineFit, outline_fit
+
+MasksKeep = Literal["auto", "white", "black"]
 
 WHOLE = 0.999  # a mask that keeps more than this part of the photo cuts nothing out
 BORDER = 0.02  # width of the border that is looked at, as part of the longest side
@@ -85,15 +88,15 @@ def look(photo: str, file: str, mask: np.ndarray, size: tuple[int, int], rgb: np
     )
 
 
-def find_doubts(looks: Sequence[MaskLook], polarity_is_sure: bool = False) -> list[Doubt]:
-    """All that is wrong with these masks; `polarity_is_sure`: the user has said which colour keeps.
+def find_doubts(looks: Sequence[MaskLook], masks_keep: MasksKeep = "auto") -> list[Doubt]:
+    """All that is wrong with these masks; `masks_keep`: the colour that keeps, if the user has said which.
 
     Masks that keep nothing are not among them: their photos are left out one by one.
     """
     seen = [look for look in looks if look.kept > 0]
     if not seen:
         return []
-    doubts = [_whole(seen), _inverted(seen, polarity_is_sure), _same(seen) or _not_of_these(seen), _coarse(seen)]
+    doubts = [_whole(seen), _inverted(seen, masks_keep), _same(seen) or _not_of_these(seen), _coarse(seen)]
     return [doubt for doubt in doubts if doubt is not None]
 
 
@@ -130,7 +133,7 @@ def _whole(seen: Sequence[MaskLook]) -> Doubt | None:
     )
 
 
-def _inverted(seen: Sequence[MaskLook], sure: bool) -> Doubt | None:
+def _inverted(seen: Sequence[MaskLook], masks_keep: MasksKeep) -> Doubt | None:
     inverted = [look.file for look in seen if look.seems_inverted]
     cutting = sum(look.kept <= WHOLE for look in seen)
     if not inverted:
@@ -143,10 +146,10 @@ def _inverted(seen: Sequence[MaskLook], sure: bool) -> Doubt | None:
     return Doubt(
         f"The masks seem inverted: in {len(inverted)} of {len(seen)} the photo's border is kept and something in its "
         f"middle cut out, e.g. {inverted[0]}.",
-        "Try the other colour: `--masks-white-keeps` or `--masks-black-keeps`."
-        if sure
+        f"Try the other colour: `--masks-{'white' if masks_keep == 'black' else 'black'}-keeps`."
+        if masks_keep != "auto"
         else "Say which colour is the object: `--masks-black-keeps`, or `--masks-white-keeps` if they are right.",
-        impossible=not sure,
+        impossible=masks_keep == "auto",
     )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,12 +12,13 @@ import numpy as np
 from stages.artifacts import SkippedImage
 from stages.capture.exif import ORIENTATION
 from stages.capture.listing import name_some
-from stages.capture.mask_doubts import MaskLook, look
+from stages.capture.mask_doubts import MaskLook, is_black_and_white, look
 from stages.capture.mask_fit import outline_fit
 from stages.capture.mask_names import is_mask_folder, pair
-from stages.capture.photo_reading import UnusableError
+from stages.capture.photo_reading import Photo, PhotoFile, UnusableError
 from stages.errors import InputError
-from stages.inputs.folders import named_files
+from stages.inputs.depth import DEPTH, read_depth
+from stages.inputs.folders import named_files, readable
 from stages.inputs.formats import PHOTO_SUFFIXES, open_image
 
 # A mask's edges may be soft: this much of its range from black or white counts as neither, and as many such pixels as
@@ -51,12 +52,22 @@ def match_masks(photos: list[str], folder: Path, not_masks: Collection[Path] = (
     return {photo: files[name] for photo, name in pair(photos, names).items()}
 
 
+def pair_masks(
+    photos: list[str], folder: Path, of_poses: Mapping[str, Path], not_masks: Collection[Path] = ()
+) -> dict[str, Path]:
+    """As `match_masks`; or as a file of poses pairs photos and masks, where `folder` is that of its masks."""
+    if of_poses and lie_in(folder, of_poses.values()):
+        return {photo: of_poses[photo] for photo in photos if photo in of_poses}
+    return match_masks(photos, folder, not_masks)
+
+
+def lie_in(folder: Path, files: Iterable[Path]) -> bool:
+    return all(file.resolve().is_relative_to(folder.resolve()) for file in files)
+
+
 def _pictures(folder: Path) -> dict[str, Path]:
     """By readable path, see `named_files`."""
     return {name: path for name, path in named_files(folder)[0].items() if path.suffix.lower() in PHOTO_SUFFIXES}
-
-
-PairMasks = Callable[[list[str], Path, list[Path]], Mapping[str, Path]]
 
 
 def unused_folder(source: Path, photos: list[str]) -> Path | None:
@@ -73,15 +84,16 @@ def choose_masks(
     own: Mapping[str, Path],
     masks_folder: Path | None,
     use_own: bool,
-    pair: PairMasks = match_masks,
+    of_poses: Mapping[str, Path],
 ) -> dict[str, Path]:
     """Photo -> its mask file: of `masks_folder` if that is given, else of those among the photos.
 
     Args:
         photos: photo -> its file. own: photo -> the file of its mask, as `set_masks_aside` found them.
+        of_poses: the same, as a file of poses names them; see `pair_masks`.
     """
     if masks_folder is not None:
-        return dict(pair(list(photos), masks_folder, list(photos.values())))
+        return pair_masks(list(photos), masks_folder, of_poses, list(photos.values()))
     return {photo: mask for photo, mask in own.items() if use_own and photo in photos}
 
 
@@ -125,20 +137,43 @@ def tell_masks(looks: Sequence[MaskLook]) -> str:
     return said
 
 
-def alpha_of(photo: str) -> str:
-    """What the mask in a photo's alpha channel is called."""
-    return f"alpha channel of {photo}"
+def of_sphere(panorama: str) -> InputError:
+    """What to say where a 360-degree picture has a mask, or one is wanted."""
+    return InputError(
+        f"{panorama} is a 360-degree picture: masks of those cannot be used, nor their alpha channels.",
+        "Run without: `--no-masks`; or leave those pictures out: `--set 'ingest.leave_out=[NAME, ...]'`.",
+    )
 
 
-def look_at_mask(photo: str, called: str, mask: Mask, rgb: np.ndarray) -> MaskLook:
-    """A look at the mask of the upright photo `rgb` [h, w, 3] uint8 of any size.
+def given_mask(
+    photo: str,
+    file: Path | None,
+    alpha: np.ndarray | None,
+    shape: Photo | PhotoFile,
+    black_keeps: bool,
+    pixels: np.ndarray,
+) -> tuple[Mask, MaskLook] | None:
+    """The mask that comes with a photo, and a look at it: that of its `file`, else its `alpha` channel.
+
+    Args:
+        alpha: [H, W] bool, True where it is opaque. pixels: [h, w, 3] uint8, the upright photo at any size.
 
     Raises:
-        UnusableError: it keeps nothing.
+        UnusableError: the mask keeps nothing, or the photo is a mask itself.
+        InputError: see `load_mask`.
     """
+    if is_black_and_white(pixels):
+        raise UnusableError(MASK_NOT_PHOTO)
+    if file is not None:
+        mask = load_mask(file, photo, shape.size, shape.stored_size, shape.orientation, black_keeps, pixels)
+        called = readable(file.name)
+    elif alpha is not None:
+        mask, called = Mask(alpha, shape.size), f"alpha channel of {photo}"
+    else:
+        return None
     if not mask.kept.any():
         raise UnusableError(f"{EMPTY} ({called})")
-    return look(photo, called, mask.kept, mask.stored_size, rgb)
+    return mask, look(photo, called, mask.kept, mask.stored_size, pixels)
 
 
 def read_mask(
@@ -159,6 +194,8 @@ def load_mask(
 ) -> Mask:
     """Mask of the upright photo, scaled where it has the photo's shape. White (or opaque) is the object.
 
+    A depth image (see `stages.inputs.depth`) keeps what is near.
+
     A mask drawn on the photo as it is stored is turned with it, where the sizes tell, or the upright photo's
     `pixels` [h, w, 3] of any size do.
 
@@ -172,6 +209,8 @@ def load_mask(
     """
     from PIL import Image
 
+    if file.name.endswith(DEPTH):
+        return _near(file, photo, size)
     try:
         with open_image(file) as stored:
             stored.load()
@@ -190,6 +229,16 @@ def load_mask(
         kept = _better_turned(kept, turned(Image.fromarray(kept), orientation), pixels)
     found = kept.shape[1], kept.shape[0]
     return Mask(kept if found == size else resized(kept, size), found)
+
+
+def _near(file: Path, photo: str, size: tuple[int, int]) -> Mask:
+    """What a depth image shows of the object; raises InputError as `load_mask`."""
+    try:
+        kept = np.isfinite(read_depth(file))
+    except (OSError, ValueError) as error:
+        raise InputError(f"{error}.", "Leave depth out with `--no-masks`.") from error
+    check_size(file, photo, (kept.shape[1], kept.shape[0]), size)
+    return Mask(kept, size)
 
 
 def turned(image: Any, orientation: int | None) -> Any:

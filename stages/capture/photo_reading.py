@@ -77,6 +77,11 @@ class PhotoFile:
     orientation: int = 1
 
     @property
+    def size(self) -> tuple[int, int]:
+        """Width and height in pixels."""
+        return self.width, self.height
+
+    @property
     def stored_size(self) -> tuple[int, int]:
         """Width and height in pixels before it is turned upright."""
         return (self.height, self.width) if self.orientation in TURNED else (self.width, self.height)

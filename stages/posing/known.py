@@ -71,6 +71,14 @@ class KnownPoses:
         if not self.cameras:
             raise InputError(f"{self.origin} has no poses.", "Name another file with `--poses`.")
 
+    def names_of(self, photos: Iterable[str]) -> dict[str, str]:
+        """Name of the camera of each photo that has one; raises as `match_photos`."""
+        return {photo: camera.name for photo, camera in match_photos(self, photos).items()}
+
+    def masks_of(self, cameras: Mapping[str, KnownCamera]) -> dict[str, Path]:
+        """Mask of each photo whose camera has one; `cameras`: photo -> its camera."""
+        return {photo: self.masks[camera.name] for photo, camera in cameras.items() if camera.name in self.masks}
+
 
 # ---------------------------------------------------------------- photos and cameras
 def match_photos(poses: KnownPoses, photos: Iterable[str]) -> dict[str, KnownCamera]:

@@ -13,12 +13,10 @@ from typing import Any
 import numpy as np
 
 from stages.artifacts import KnownSphere
-from stages.errors import InputError
+from stages.inputs.depth import DEPTH
 from stages.posing.known import KnownPoses, pinhole, reading
 
-CAMERA, DEPTH = "-camera.pkl", "-depth.png"
-# Depth is stored in 16 bits from 0 to 15; what is nearer than 14.5 is the object.
-DEPTH_RANGE, DEPTH_OBJECT = 15.0, 14.5
+CAMERA = "-camera.pkl"
 # All that a pickled array needs.
 ALLOWED = {
     ("numpy", "ndarray"),
@@ -60,32 +58,6 @@ def read_nero(folder: Path) -> KnownPoses:
             masks[name] = folder / f"{stem}{DEPTH}"
     region = KnownSphere(center=np.zeros(3), radius=1.0, source="the unit sphere of GlossySynthetic")
     return KnownPoses(folder, tuple(cameras), region, masks)
-
-
-def read_depth_mask(file: Path) -> np.ndarray:
-    """[H, W] bool, true on the object, of a 16-bit depth image.
-
-    Raises:
-        InputError: it is none.
-    """
-    return np.isfinite(read_depth(file))
-
-
-def read_depth(file: Path) -> np.ndarray:
-    """[H, W] float64 depth along the axis of a 16-bit depth image, infinite off the object.
-
-    Raises:
-        InputError: it is none.
-    """
-    import cv2
-
-    # not by its path, which may be one that OpenCV cannot take
-    stored = cv2.imdecode(np.fromfile(file, np.uint8), cv2.IMREAD_UNCHANGED)
-    if stored is None or stored.dtype != np.uint16:
-        found = "it cannot be read" if stored is None else f"it has {8 * stored.itemsize} bits"
-        raise InputError(f"{file} is no 16-bit depth image: {found}.", "Leave depth out with `--no-masks`.")
-    depth = (stored if stored.ndim == 2 else stored[..., 0]) / 65535 * DEPTH_RANGE
-    return np.where(depth < DEPTH_OBJECT, depth, np.inf)
 
 
 def read_split(file: Path) -> list[str]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from stages.errors import InputError
+from stages.inputs.depth import DEPTH
 from stages.posing import colmap_model, meganerf, mvsnet, nero, neus, transforms
 from stages.posing.known import KnownPoses
 
@@ -50,7 +51,7 @@ def masks_beside(poses: Path) -> Path | None:
     if poses.suffix == ".npz":
         folder = poses.parent / neus.MASKS
         return folder if folder.is_dir() else None
-    if poses.is_dir() and nero.has_cameras(poses) and next(poses.glob(f"*{nero.DEPTH}"), None) is not None:
+    if poses.is_dir() and nero.has_cameras(poses) and next(poses.glob(f"*{DEPTH}"), None) is not None:
         return poses
     return transforms.masks_folder(poses) if poses.suffix == ".json" else None
 

@@ -8,10 +8,10 @@ from typing import Any, Literal
 
 import numpy as np
 
+from stages.capture.masks import pair_masks, read_mask
 from stages.evaluation.photos.regions import WHITE
 from stages.geometry.cameras import PinholeCameras, PosedScene
 from stages.geometry.normalisation import into_frame
-from stages.ingest import find_masks, read_mask_file
 from stages.inputs.formats import open_image
 from stages.posing.known import image_size, match_photos
 from stages.posing.reading import read_poses
@@ -53,7 +53,7 @@ class NovelPhotos:
         poses = read_poses(views.poses)
         matched = match_photos(poses, views.names)
         self._views = views
-        self._masks = find_masks(list(matched), masks, poses) if masks is not None else {}
+        self._masks = pair_masks(list(matched), masks, poses.masks_of(matched)) if masks is not None else {}
         # as large as training saw photos of this scene
         self._max_side = int(scene.cameras.sizes.max())
         self._lenses = {
@@ -75,7 +75,7 @@ class NovelPhotos:
         pixels, mask = _read(self._views.folder / name, self._views.background == "white")
         if name in self._masks:
             size = pixels.shape[1], pixels.shape[0]
-            mask = np.where(read_mask_file(self._masks[name], name, size, size, 1).kept, WHITE, 0).astype(np.uint8)
+            mask = np.where(read_mask(self._masks[name], name, size, size, 1), WHITE, 0).astype(np.uint8)
         pixels, mask = pinhole_photo(self._lenses[name], pixels, mask, self._max_side)
         return pixels, None if mask is None else mask > OPAQUE
 

@@ -19,7 +19,9 @@ from stages.evaluation.reading import read_cameras, read_prediction
 from stages.evaluation.surfaces import Surface, measure_points
 from stages.evaluation.thinning import one_a_cube
 from stages.geometry.cameras import PinholeCameras
+from stages.inputs.depth import DEPTH, read_depth
 from stages.posing import nero
+from stages.posing.known import reading
 
 VOXEL = 0.01
 
@@ -136,12 +138,13 @@ def read_glossy(data: Path, split: Path | None) -> tuple[PinholeCameras, list[np
     found = read_cameras(data).pinhole
     stems = [Path(name).stem for name in found.names]
     wanted = stems if split is None else nero.read_split(split)
-    missing = [stem for stem in wanted if stem not in stems or not (data / f"{stem}{nero.DEPTH}").is_file()]
+    missing = [stem for stem in wanted if stem not in stems or not (data / f"{stem}{DEPTH}").is_file()]
     if missing or not wanted:
         raise InputError(
             f"{len(missing)} of {len(wanted)} views have no camera or no depth in {data}, e.g. "
-            f"{(missing or ['-'])[0]}{nero.DEPTH}.",
+            f"{(missing or ['-'])[0]}{DEPTH}.",
             "Unpack GlossySynthetic again, or name the split that belongs to it.",
         )
     cameras = found.select([stems.index(stem) for stem in wanted])
-    return cameras, [nero.read_depth(data / f"{stem}{nero.DEPTH}") for stem in wanted]
+    with reading(f"A depth image in {data}", "16 bits a pixel"):
+        return cameras, [read_depth(data / f"{stem}{DEPTH}") for stem in wanted]

@@ -10,6 +10,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from stages.evaluation.suites.scene import SuiteScene, Truth, Wanted, every_nth, places_in
+from stages.inputs.depth import DEPTH
 from stages.posing import nero
 
 SPLIT = "synthetic_split_128.pkl"
@@ -23,11 +24,11 @@ def find_scenes(folder: Path, wanted: Wanted) -> list[SuiteScene]:
 def _scene(place: Path, wanted: Wanted) -> SuiteScene:
     cameras = sorted(place.glob(f"*{nero.CAMERA}"), key=lambda path: (len(path.name), path.name))
     names = [f"{path.name.removesuffix(nero.CAMERA)}.png" for path in cameras]
-    depth = all((place / name.replace(".png", nero.DEPTH)).is_file() for name in names)
+    depth = all((place / name.replace(".png", DEPTH)).is_file() for name in names)
     split = next((p / SPLIT for p in (wanted.truth, place.parent) if p is not None and (p / SPLIT).is_file()), None)
     lacking = []
     if not depth:
-        lacking.append(f"no distance: {place.name} lacks depth images ({names[0][:-4]}{nero.DEPTH}, ...)")
+        lacking.append(f"no distance: {place.name} lacks depth images ({names[0][:-4]}{DEPTH}, ...)")
     elif split is None:
         lacking.append(f"distance over all views: {SPLIT} of NeRO's code is not there; name its folder with --truth")
     return SuiteScene(
