@@ -124,7 +124,7 @@ def check_photos(request: Request) -> Preflight:
     sources = {"photos": photos, "masks": masks, "poses": poses, CONTROL: request.control}
     done = _preflight(sources, folder, config, device, workers, decode=True)
     done = replace(done, refusals=(*done.refusals, *_workspace_refusals(request)))
-    if not (folder / "workspace.json").exists():
+    if not artifacts.is_workspace(folder):
         return done
     workspace = Workspace.open(folder)
     digests = SourceDigests({"photos": photos.resolve()}, workspace.digest_cache)

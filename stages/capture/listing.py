@@ -42,7 +42,7 @@ def list_captures(source: Path, masks_folder: Path | None = None) -> tuple[Files
     A file is what its content says. `source` may also be one video: then its own name is the only path.
 
     Raises:
-        InputError: `source` is not there or is a file of another kind, or `masks_folder` is no folder.
+        InputError: `source` is not there, may not be read or is a file of another kind, or `masks_folder` is no folder.
     """
     if not source.exists():
         raise InputError(f"The photo folder {source} does not exist.", "Check the path: hineus run PHOTOS")
@@ -55,11 +55,16 @@ def list_captures(source: Path, masks_folder: Path | None = None) -> tuple[Files
     if masks_folder is not None and not masks_folder.is_dir():
         raise InputError(f"The mask folder {masks_folder} does not exist.", "Check the path given to --masks.")
     inside_masks = masks_folder.resolve() if masks_folder else None
-    if inside_masks and source.resolve() not in inside_masks.parents:  # the photos may lie in the masks' folder
+    if inside_masks and source.resolve().is_relative_to(inside_masks):  # the photos may lie in the masks' folder
         inside_masks = None
     photos: Files = {}
     videos: Files = {}
-    files, left = named_files(source)
+    try:
+        files, left = named_files(source)
+    except OSError as error:
+        raise InputError(
+            f"The photo folder {source} cannot be read ({error.strerror}).", f"Allow it: `chmod u+rx {source}`."
+        ) from error
     skipped = [SkippedImage(item.name, item.reason, expected=not item.missed) for item in left]
     for name, path in files.items():
         if inside_masks and inside_masks in path.resolve().parents:

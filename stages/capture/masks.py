@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -61,10 +62,11 @@ PairMasks = Callable[[list[str], Path, list[Path]], Mapping[str, Path]]
 
 def unused_folder(source: Path, photos: list[str]) -> Path | None:
     """A folder of masks of these photos near the folder `source` of photos, where nobody has named it."""
-    nearby = [source / ".mask", *sorted(path for path in source.resolve().parent.iterdir() if path != source.resolve())]
-    for folder in nearby:
-        if is_mask_folder(folder.name) and folder.is_dir() and match_masks(photos, folder):
-            return folder
+    with suppress(OSError):  # folders that may not be listed
+        beside = sorted(path for path in source.resolve().parent.iterdir() if path != source.resolve())
+        for folder in (source / ".mask", *beside):
+            if is_mask_folder(folder.name) and folder.is_dir() and match_masks(photos, folder):
+                return folder
     return None
 
 
@@ -139,13 +141,6 @@ def look_at_mask(photo: str, called: str, mask: Mask, rgb: np.ndarray) -> MaskLo
     if not mask.kept.any():
         raise UnusableError(f"{EMPTY} ({called})")
     return look(photo, called, mask.kept, mask.stored_size, rgb)
-
-
-def read_mask(
-    file: Path, photo: str, size: tuple[int, int], stored_size: tuple[int, int], orientation: int
-) -> np.ndarray:
-    """As `load_mask`, of a mask whose white keeps: [H, W] bool."""
-    return load_mask(file, photo, size, stored_size, orientation).kept
 
 
 def load_mask(
