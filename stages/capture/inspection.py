@@ -27,7 +27,7 @@ from stages.capture.masks import (
     unused_masks,
 )
 from stages.capture.panoramas import Mode, Sphere, find_spheres, split_size
-from stages.capture.photo_reading import PhotoFile, UnusableError, read_alpha, read_head, read_preview
+from stages.capture.photo_reading import PhotoFile, UnusableError, read_head, read_preview
 from stages.capture.quality import Appearance, Oddities, appearance, find_oddities
 from stages.capture.video import video_size
 from stages.errors import InputError
@@ -192,15 +192,15 @@ def _look_closer(head: PhotoFile, file: Path, mask_file: Path | None, wanted: Ma
     Raises:
         UnusableError: the photo or its mask shows that this is none.
     """
-    pixels = read_preview(file)
+    pixels, alpha = read_preview(file)
     if is_black_and_white(pixels):
         raise UnusableError(MASK_NOT_PHOTO)
-    mask = _look_at_mask(head, file, mask_file, pixels, wanted)
+    mask = _look_at_mask(head, alpha, mask_file, pixels, wanted)
     return _Seen(head, appearance(head.source, pixels), find_background(pixels).is_plain, mask)
 
 
 def _look_at_mask(
-    head: PhotoFile, file: Path, mask_file: Path | None, pixels: np.ndarray, wanted: MasksWanted
+    head: PhotoFile, alpha: np.ndarray | None, mask_file: Path | None, pixels: np.ndarray, wanted: MasksWanted
 ) -> MaskLook | InputError | None:
     """At the mask of a photo, or what is wrong with it; None where there is none.
 
@@ -216,7 +216,6 @@ def _look_at_mask(
         except InputError as error:
             return error
         return look_at_mask(head.source, readable(mask_file.name), mask, pixels)
-    alpha = read_alpha(file) if wanted.own and wanted.folder is None else None
-    if alpha is None:
+    if alpha is None or not wanted.own or wanted.folder is not None:
         return None
     return look_at_mask(head.source, alpha_of(head.source), Mask(alpha ^ wanted.black_keeps, size), pixels)
