@@ -89,7 +89,7 @@ def reconstruct(request: Request, pipeline: Sequence[Stage], listener: Listener 
         if photos is not None and not workspace.stage_folder("ingest").exists():
             _tell_preflight(_preflight(sources, workspace.root, config, device, workers, decode=False))
         now = digests.files("photos") if digests.available("photos") else None
-        if kept := what_is_kept(workspace, config, now or {}, _forced(request, pipeline)):
+        if kept := what_is_kept(workspace, config, photos, sources["masks"], now or {}, _forced(request, pipeline)):
             log.info("%s", kept)
         log.debug("preset %s, device %s, %d workers, %s", preset, device, workers, sources)
         outcomes = run_pipeline(
@@ -129,7 +129,7 @@ def check_photos(request: Request) -> Preflight:
     workspace = Workspace.open(folder)
     digests = SourceDigests({"photos": photos.resolve()}, workspace.digest_cache)
     _, config = choose_config(request, workspace)
-    return replace(done, kept=what_is_kept(workspace, config, digests.files("photos") or {}))
+    return replace(done, kept=what_is_kept(workspace, config, photos, masks, digests.files("photos") or {}))
 
 
 def _workspace_refusals(request: Request) -> list[str]:
