@@ -3,27 +3,36 @@
 from __future__ import annotations
 
 from collections.abc import Collection
-from pathlib import PurePosixPath
+from pathlib import Path, PurePosixPath
 
 from configs.params import Config
 from stages import artifacts
+from stages.capture.listing import list_captures
+from stages.capture.mask_names import set_masks_aside
 from stages.engine.fingerprint import FileDigests
 from stages.engine.manifest import ManifestDamaged
 from stages.engine.status import previous_to_continue
 from stages.engine.workspace import Workspace
 from stages.ingest import INGEST
-from stages.inputs.formats import PHOTO_SUFFIXES, RAW_SUFFIXES, VIDEO_SUFFIXES
 from stages.posing.adding import enough_placed
 from stages.sfm import SFM
 from stages.train import TRAIN, little_changed
 
 
-def what_is_kept(workspace: Workspace, config: Config, now: FileDigests, forced: Collection[str] = ()) -> str:
+def what_is_kept(
+    workspace: Workspace,
+    config: Config,
+    source: Path | None,
+    masks: Path | None,
+    now: FileDigests,
+    forced: Collection[str] = (),
+) -> str:
     """A sentence on known, new and gone photos, and what is kept of them; empty where none came or went.
 
     What the stages find may still be otherwise, and they say so: new photos that do not connect, or cannot be read.
 
     Args:
+        source, masks: the folder of photos (or a video), and of masks where one is given.
         now: the photos' files, see `SourceDigests.files`.
         forced: stages that run anew in any case.
     """
@@ -32,9 +41,9 @@ def what_is_kept(workspace: Workspace, config: Config, now: FileDigests, forced:
     except ManifestDamaged:
         return ""
     before = made.identity.sources.get("photos") if made else None
-    if not before or not now:  # photos that are nowhere to be found are not removed
+    if not before or not now or source is None:  # photos that are nowhere to be found are not removed
         return ""
-    then, today = _captures(before), _captures(now)
+    then, today = _taken(workspace, before), _captures(source, masks, now)
     if then == today:
         return _of_a_stopped_run(workspace, config, forced)
     known, new, gone = then & today, today - then, then - today
@@ -93,7 +102,17 @@ def _of_counts(
     return f"{poses}, training {'goes on from what it has learned' if goes_on else 'starts anew'}"
 
 
-def _captures(files: FileDigests) -> set[str]:
-    """Contents of the photos and videos."""
-    suffixes = PHOTO_SUFFIXES | RAW_SUFFIXES | VIDEO_SUFFIXES
-    return {digest for path, digest in files.items() if PurePosixPath(path).suffix.lower() in suffixes}
+def _taken(workspace: Workspace, before: FileDigests) -> set[str]:
+    """Contents of the photos and videos that were taken in, or left out as photos that are of no use."""
+    found = artifacts.IMAGE_SET.load(workspace.stage_folder(INGEST.name))
+    names = {item.source for item in found.skipped if not item.expected}
+    for record in found.images:  # frames and views lie in a folder with the name of their video or picture
+        names |= {record.source, *map(str, PurePosixPath(record.source).parents)}
+    return {digest for path, digest in before.items() if path in names}
+
+
+def _captures(source: Path, masks: Path | None, files: FileDigests) -> set[str]:
+    """Contents of the photos and videos that are there now."""
+    photos, videos, skipped = list_captures(source, masks if masks is not None and masks.is_dir() else None)
+    named = {*set_masks_aside(photos)[0], *videos, *(item.source for item in skipped if not item.expected)}
+    return {digest for path, digest in files.items() if path in named}

@@ -93,3 +93,21 @@ def test_photos_that_came_and_went_are_told_and_the_rest_is_kept(tmp_path: Path,
         write_photo(photos, index)
     said = "3 photos known, 4 new, 6 gone: poses are found anew from all, since 3 of them have one"
     assert check_photos(request).kept == said
+
+
+def test_photos_are_told_by_content_and_masks_are_none(tmp_path: Path):
+    photos, workspace = tmp_path / "photos", tmp_path / "workspace"
+    for index in range(4):
+        write_photo(photos, index)
+    (photos / "3.png").rename(photos / "3.photo")
+    request = Request(photos, workspace, preset="tiny", until="ingest", device="cpu")
+    reconstruct(request, PIPELINE)
+    write_photo(photos, 4)
+    (photos / "4.png").rename(photos / "4.photo")
+    cv2.imwrite(str(photos / "0_mask.png"), np.eye(64, dtype=np.uint8) * 255)
+    said = "4 photos known, 1 new, 0 gone: poses are found anew from all"
+    assert check_photos(request).kept == said
+    (photos / "0.png").unlink()
+    (photos / "3.photo").unlink()
+    (photos / "0_mask.png").unlink()
+    assert "2 photos known, 1 new, 2 gone" in check_photos(request).kept
