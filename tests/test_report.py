@@ -332,9 +332,9 @@ def test_what_was_kept_of_an_earlier_result_is_said() -> None:
     train = manifest("train", kept_of_budget=0.7, steps_in_all=1950)
     (sentence,) = describe_history({"sfm": sfm, "undistort": undistort, "train": train})
     assert sentence == (
-        "This result goes on from an earlier one: 40 photos were known, 7 are new, 1 gone; known poses stayed (they moved "
-        "by 0.019 % of the distance to what they see); the region stayed; training went on with 70 % of its budget counted "
-        "as spent, 1,950 steps in all."
+        "This result goes on from an earlier one: 40 photos were known, 7 are new, 1 gone; known poses stayed (they "
+        "moved by 0.019 % of the distance to what they see); the region stayed; training went on with 70 % of its "
+        "budget counted as spent, 1,950 steps in all."
     )
     (alone,) = describe_history({"undistort": undistort, "train": train})
     assert alone.startswith("This result goes on from an earlier one: the region stayed; training went on with 70 %")
