@@ -68,6 +68,7 @@ def test_photos_that_came_and_went_are_told_and_the_rest_is_kept(tmp_path: Path,
     assert (made["sfm"]["known"], made["sfm"]["new"], made["sfm"]["gone"]) == (7, 1, 1)
     assert made["undistort"]["region_kept"] in (True, False)
     assert made["train"]["kept_of_budget"] in (0.7, 0.2)
+    assert made["train"]["steps_in_all"] == 40 + round(40 * (1 - made["train"]["kept_of_budget"]))
     assert made["train"]["photos"] == 8
     assert run() == {}
     assert "known" not in caplog.text
