@@ -37,9 +37,20 @@ def what_is_kept(
         forced: stages that run anew in any case.
     """
     try:
-        made = workspace.published(INGEST.name)
-    except ManifestDamaged:
+        return _what_is_kept(workspace, config, source, masks, now, forced)
+    except (ManifestDamaged, FileNotFoundError):  # a file of the workspace is gone: the stages tell which
         return ""
+
+
+def _what_is_kept(
+    workspace: Workspace,
+    config: Config,
+    source: Path | None,
+    masks: Path | None,
+    now: FileDigests,
+    forced: Collection[str],
+) -> str:
+    made = workspace.published(INGEST.name)
     before = made.identity.sources.get("photos") if made else None
     if not before or not now or source is None:  # photos that are nowhere to be found are not removed
         return ""

@@ -22,7 +22,7 @@ from stages.capture.video import extract_frames
 from stages.engine.fingerprint import SourceDigests
 from stages.errors import InputError
 from stages.inputs.folders import MOST_BYTES, named_files, readable, short_name, unique_name
-from stages.inputs.formats import Kind, kind_of, kind_of_head, register_formats
+from stages.inputs.formats import Kind, kind_of, kind_of_head, open_image, register_formats
 from stages.inputs.texts import read_text
 
 
@@ -406,3 +406,15 @@ def test_masks_behind_a_link_among_the_photos_are_no_photos(photos: Path):
     assert list(list_captures(photos, photos / "sil")[0]) == alone
     assert list(list_captures(photos)[0]) == sorted([*alone, "sil/other.png"])
     assert list(list_captures(photos, photos)[0]) == sorted([*alone, "sil/other.png"])
+
+
+@pytest.mark.parametrize("mode", ["L", "RGB", "RGBA"])
+def test_tiffs_that_exif_turns_keep_their_pixels(tmp_path: Path, mode: str) -> None:
+    shape = (30, 50) if mode == "L" else (30, 50, len(mode))
+    pixels = np.random.default_rng(0).integers(0, 255, shape, dtype=np.uint8)
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    Image.fromarray(pixels).save(tmp_path / "turned.tif", exif=exif)
+    with open_image(tmp_path / "turned.tif") as stored:
+        stored.load()
+        np.testing.assert_array_equal(np.asarray(stored), np.rot90(pixels, -1))

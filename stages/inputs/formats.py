@@ -125,7 +125,10 @@ def open_image(file: Any) -> Any:
     from PIL import Image
 
     register_formats()
-    return Image.open(file, formats=PHOTO_FORMATS)
+    image = Image.open(file, formats=PHOTO_FORMATS)
+    if image.format == "TIFF":
+        image.filename = ""  # or Pillow maps the file, and shuffles pixels that EXIF turns by 90 degrees
+    return image
 
 
 @lru_cache
