@@ -161,7 +161,10 @@ Watertight = Annotated[
 ]
 Deterministic = Annotated[
     bool,
-    typer.Option("--deterministic", help="The same poses every time, bit for bit, but slower: sfm.deterministic=true."),
+    typer.Option(
+        "--deterministic",
+        help="From scratch, the same poses every time, bit for bit, but slower: sfm.deterministic=true.",
+    ),
 ]
 MovingObject = Annotated[
     bool,

@@ -72,8 +72,8 @@ def run(context: StageContext[PlaceParams]) -> dict[str, Any]:
     if found is not None:
         place = _by_markers(place, found)
     if surveyed is not None:
-        place, more = _by_control(place, surveyed, seen, cameras.centers, gps)
-        warnings += more
+        place, more = _by_control(place, surveyed, seen, cameras.centers, gps if use_gps else {})
+        warnings = more if surveyed.fit.similarity is not None else warnings + more  # GPS is not believed then
     place = _by_distance(place, params.known_distance)
     place = _in_reach(place, cameras.centers, params.epsg)
     up_from = "" if place.up is None else "GPS" if place.control_residual is None else "the control points"

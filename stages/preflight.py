@@ -18,7 +18,7 @@ from stages.capture.gps import gps_warnings
 from stages.capture.inspection import Inspection, inspect
 from stages.capture.listing import NAMED, by_reason, name_some
 from stages.capture.mask_doubts import find_doubts, nothing_kept
-from stages.capture.masks import ASIDE, EMPTY, missing_masks, tell_masks
+from stages.capture.masks import ASIDE, EMPTY, bytes_to_read_masks, missing_masks, tell_masks
 from stages.capture.panoramas import split_size
 from stages.capture.salient import INSTALL, find_weights
 from stages.capture.selection import Sources
@@ -204,7 +204,8 @@ def estimate(seen: Inspection, config: Config, device: str, workers: int) -> Nee
     looked_at = pixels(min(config.ingest.max_side, config.sfm.max_image_size))
     trained_on = sum(pixels(min(config.ingest.max_side, config.undistort.max_side)))
     sfm_gib = SFM_BASE_GIB + workers * SFM_GIB_PER_THREAD_MP * max(looked_at, default=0) / 1e6
-    read_gib = max((photo.bytes_to_read for photo in seen.photos), default=0) / GIB
+    masks_bytes = bytes_to_read_masks(seen.masks.files.values())
+    read_gib = max([masks_bytes, *(photo.bytes_to_read for photo in seen.photos)]) / GIB
     later_gib = MEMORY_BASE_GIB + MEMORY_OF_PHOTOS * 3 * trained_on / GIB
     return Needs(
         memory_gib=max(read_gib, sfm_gib, later_gib),

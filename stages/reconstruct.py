@@ -89,7 +89,7 @@ def reconstruct(request: Request, pipeline: Sequence[Stage], listener: Listener 
         now = (digests.files("photos") if digests.available("photos") else None) or {}
         if photos is not None and not workspace.stage_folder("ingest").exists():
             _tell_preflight(_preflight(sources, workspace.root, config, device, workers, decode=False, digests=now))
-        if kept := what_is_kept(workspace, config, now, _forced(request, pipeline)):
+        if kept := what_is_kept(workspace, config, photos, sources["masks"], now, _forced(request, pipeline)):
             log.info("%s", kept)
         log.debug("preset %s, device %s, %d workers, %s", preset, device, workers, sources)
         outcomes = run_pipeline(
@@ -126,7 +126,7 @@ def check_photos(request: Request) -> Preflight:
     _, config = choose_config(request, workspace)
     known = (digests.files("photos") or {}) if workspace.config_path.exists() else {}
     done = _preflight(sources, workspace.root, config, device, workers, decode=True, digests=known)
-    kept = what_is_kept(workspace, config, known) if known else ""
+    kept = what_is_kept(workspace, config, sources["photos"], sources["masks"], known) if known else ""
     return replace(done, refusals=(*done.refusals, *refused), kept=kept)
 
 
@@ -198,7 +198,7 @@ def choose_photos(request: Request, workspace: Workspace) -> Path:
     if photos is None:
         raise InputError(
             f"The workspace {workspace.root} does not know its photos yet.",
-            f"Name them: `hineus run PHOTOS --workspace {workspace.root}`.",
+            f"Name them: `hineus run PHOTOS --workspace {shlex.quote(str(workspace.root))}`.",
         )
     if workspace.root == photos or photos in workspace.root.parents:
         raise InputError(

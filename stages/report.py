@@ -89,7 +89,7 @@ def run(context: StageContext[ReportParams]) -> dict[str, Any]:
         "warnings": numbers.warnings(manifests),
         "where": numbers.describe_where(scene, place, placed),
         "control": control.describe_control(place),
-        "poses": poses.describe_poses(registration, place),
+        "poses": [*numbers.describe_history(manifests), *poses.describe_poses(registration, place)],
         "charts": curves.training_charts(context.read(METRICS)),
         "previews": pictures.training_previews(context.read(PREVIEWS)),
         "stages": [numbers.stage_row(manifest) for manifest in manifests.values()],
@@ -171,7 +171,7 @@ def replay(context: StageContext[ReportParams]) -> str:
 
 REPORT: Stage[ReportParams] = Stage(
     name="report",
-    version=8,
+    version=9,
     settings=lambda config: config.report,
     run=run,
     reads=(

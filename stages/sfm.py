@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 import shutil
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -30,6 +30,7 @@ from stages.artifacts import (
     GivenPoses,
     ImageSet,
     PhotoContents,
+    PhotoFile,
     Pictures,
     Registration,
     Unregistered,
@@ -133,7 +134,8 @@ def run(context: StageContext[SfmParams]) -> dict[str, Any]:
         )
     for prior, found in bench.contradicted(best):
         log.warning("the EXIF focal length, %.0f px, is wrong: the poses say %.0f px", prior, found)
-    if steps[-1].kept and steps[-1].rung == RELAXED:
+    relaxed = _is_relaxed(context, steps[-1])
+    if relaxed:
         log.warning("poses were found with relaxed thresholds only: they are rough, and some may be wrong")
     if len(steps) > 1 and len(best.registered) < wanted and not learned_available():
         log.warning("`%s` adds a way to place photos of plain objects", FEATURES_EXTRA)
@@ -141,8 +143,10 @@ def run(context: StageContext[SfmParams]) -> dict[str, Any]:
     last = _adjusted(context, best.model, bench.threads, kept)
     others = len(best.others)
     lineage, since = _since(context, last.model, known)
-    numbers = _publish(context, last, best.registered, unregistered, params.mapper, bench.matcher, others, steps)
-    _keep_contents(context, contents, lineage)
+    numbers = _publish(
+        context, last, best.registered, unregistered, params.mapper, bench.matcher, others, steps, relaxed
+    )
+    _keep_contents(context, contents, image_set, lineage)
     warnings = [
         *_place_warnings(from_one_place(depth.parallaxes), len(names), last.model),
         *_flat_warnings(depth, last, bench),
@@ -183,14 +187,36 @@ def _known_photos(
         features=next(folder.iterdir()),
         lenses=registration.lenses if registration else (),
     )
-    if known.gone and any(item.reason == LEFT_OUT for item in image_set.skipped):
+    if _saw_left_out(before, image_set):
         log.info("%s: poses are found anew, since photos that are left out must not have been seen", known.describe())
+        return None
+    if not _same_cameras(before, image_set, names):
+        log.info("%s: poses are found anew, since photos share other cameras or focal lengths", known.describe())
         return None
     if not known.enough:
         log.info("%s, %d placed before: too few, poses are found anew", known.describe(), len(known.poses))
         return None
     log.info("%s: poses of the known stay%s", known.describe(), ", the new go beside them" if known.new else "")
     return known
+
+
+def _saw_left_out(before: PhotoContents, image_set: ImageSet) -> bool:
+    """Whether a photo that no stage may see now was seen."""
+    return any(item.reason == LEFT_OUT and item.sha256 in before.seen for item in image_set.skipped)
+
+
+def _same_cameras(before: PhotoContents, image_set: ImageSet, names: Mapping[str, str]) -> bool:
+    """Whether the photos in common (name now -> then) share cameras as they did, and have the same focal priors."""
+    pairs = [(record, before.files[names[record.name]]) for record in image_set.images if record.name in names]
+    cameras = {(now.camera, then.camera) for now, then in pairs}
+    one_to_one = len(cameras) == len({now for now, _ in cameras}) == len({then for _, then in cameras})
+    return one_to_one and all(now.focal_px == then.focal_px for now, then in pairs)
+
+
+def _is_relaxed(context: StageContext[SfmParams], last: Step) -> bool:
+    """Whether the poses are rough, or those that they go on from were."""
+    before = context.read_previous(REGISTRATION) if last.rung == ADDED else None
+    return (last.kept and last.rung == RELAXED) or (before is not None and before.relaxed)
 
 
 def _solve(bench: Workbench, wanted: int, enough: int, params: SfmParams) -> tuple[Solution | None, list[Step]]:
@@ -248,10 +274,24 @@ def _keep_features(database: Path, folder: Path) -> None:
     shutil.copyfile(database, folder / database.name)
 
 
-def _keep_contents(context: StageContext[SfmParams], contents: dict[str, str], lineage: str | None) -> None:
+def _keep_contents(
+    context: StageContext[SfmParams], contents: dict[str, str], image_set: ImageSet, lineage: str | None
+) -> None:
     """Write what the published model was made of; without a lineage to go on, it begins one."""
+    before, records = context.read_previous(PHOTO_CONTENTS), image_set.images
+    # what was there before and what is left out make one of its own, also where the same model was there once
+    unseen = sorted(item.sha256 for item in image_set.skipped if item.reason == LEFT_OUT)
     own = [file_sha256(path) for path in sorted(context.to_write(MODEL).iterdir())]
-    context.write(PHOTO_CONTENTS, PhotoContents(lineage=lineage or digest(own), contents=contents))
+    own += [*unseen, before.lineage if before else ""]
+    seen = {record.sha256 for record in records}
+    if before is not None and not _saw_left_out(before, image_set):
+        seen |= set(before.seen)
+    files = {
+        record.name: PhotoFile(sha256=record.sha256, camera=record.camera, focal_px=record.focal_px)
+        for record in records
+    }
+    made_of = PhotoContents(lineage=lineage or digest(own), contents=contents, files=files, seen=tuple(sorted(seen)))
+    context.write(PHOTO_CONTENTS, made_of)
 
 
 def _adjusted(context: StageContext[SfmParams], model: Any, threads: int, known: KnownPhotos | None) -> LastAdjustment:
@@ -335,6 +375,7 @@ def _publish(
     matcher: str,
     others: int = 0,
     steps: Sequence[Step] = (),
+    relaxed: bool = False,
 ) -> dict[str, Any]:
     """Write model and registration; returns the numbers of the manifest.
 
@@ -342,6 +383,7 @@ def _publish(
         adjusted: the model, and what is known of its exactness.
         others: models that mapping gave beside this one.
         steps: the attempts; none where the poses were given.
+        relaxed: see `Registration`.
     """
     import pycolmap
 
@@ -361,6 +403,7 @@ def _publish(
         mapper=mapper,
         matcher=matcher,
         kept=next((step.rung for step in reversed(steps) if step.kept), ""),
+        relaxed=relaxed,
         ladder=tuple(step.as_dict() for step in steps),
         lenses=adjusted.lenses,
         pose_error=adjusted.pose_error,
@@ -418,9 +461,9 @@ def _from_known_poses(context: StageContext[SfmParams]) -> dict[str, Any]:
     contents = _contents(context.read(PHOTOS), [record.name for record in image_set.images])
     context.write(GIVEN_POSES, GivenPoses(origin=poses.origin.name, region=poses.region))
     given = LastAdjustment(model, lenses=(), pose_error=None)
-    lineage = _lineage_of_given(context, model, contents)
+    lineage = _lineage_of_given(context, model, contents, image_set)
     numbers = _publish(context, given, cameras, unregistered, "known poses", matcher)
-    _keep_contents(context, contents, lineage)
+    _keep_contents(context, contents, image_set, lineage)
     points, error = numbers["points"], numbers["mean_reprojection_error_px"]
     if points < FEW_POINTS * len(cameras):
         log.warning(
@@ -444,19 +487,33 @@ def _check_given_places(model: Any, database: Path) -> None:
         refuse_one_place(judge_depth(database))
 
 
-def _lineage_of_given(context: StageContext[SfmParams], model: Any, contents: dict[str, str]) -> str | None:
-    """The lineage of the last publication, where given poses are those given then, as far as both have the photos."""
+def _lineage_of_given(
+    context: StageContext[SfmParams], model: Any, contents: dict[str, str], image_set: ImageSet
+) -> str | None:
+    """The lineage of the last publication, where given cameras are those given then, as far as both have the photos.
+
+    None, too, where it saw photos that are left out now.
+    """
     import pycolmap
 
     before = context.read_previous(PHOTO_CONTENTS)
-    if before is None or context.read_previous(GIVEN_POSES) is None:
+    if before is None or context.read_previous(GIVEN_POSES) is None or _saw_left_out(before, image_set):
         return None
     then = pycolmap.Reconstruction(str(context.read_previous(MODEL)))
-    poses = {image.name: image.cam_from_world().matrix() for image in then.images.values()}
+    earlier = {image.name: image for image in then.images.values()}
     names = _names_then(before.contents, contents)
-    images = [image for image in model.images.values() if names.get(image.name) in poses]
-    same = all(np.allclose(image.cam_from_world().matrix(), poses[names[image.name]]) for image in images)
-    return before.lineage if images and same else None
+    pairs = [(image, earlier[name]) for image in model.images.values() if (name := names.get(image.name)) in earlier]
+    return before.lineage if pairs and all(_same_view(now, was) for now, was in pairs) else None
+
+
+def _same_view(image: Any, other: Any) -> bool:
+    """Whether two images of COLMAP models have the same pose and intrinsics."""
+    camera, others = image.camera, other.camera
+    return (
+        np.allclose(image.cam_from_world().matrix(), other.cam_from_world().matrix())
+        and (camera.model, camera.width, camera.height) == (others.model, others.width, others.height)
+        and np.allclose(camera.params, others.params)
+    )
 
 
 def _check_masks(image_set: ImageSet, params: SfmParams) -> None:
@@ -568,7 +625,7 @@ def _too_few(
 
 SFM: Stage[SfmParams] = Stage(
     name="sfm",
-    version=8,
+    version=9,
     settings=lambda config: config.sfm,
     run=run,
     reads=(PHOTOS, IMAGE_SET),

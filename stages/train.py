@@ -21,6 +21,7 @@ import numpy as np
 from configs.training import TrainParams
 from stages import artifacts
 from stages.artifacts import CAMERAS, FIELD, FIRST_SCENE, HELD_OUT, METRICS, PINHOLE_PHOTOS, PREVIEWS, SCENE, Pictures
+from stages.engine.manifest import load_manifest
 from stages.engine.stage import Stage, StageContext
 from stages.errors import ConfigError, InputError, ReconstructionError
 from stages.geometry.cameras import PinholeCameras, PosedScene
@@ -77,7 +78,7 @@ def run(context: StageContext[TrainParams]) -> dict[str, Any]:
     seconds = training.seconds
     return {
         "steps": trainer.step_index,
-        **({"kept_of_budget": training.head_start} if training.head_start else {}),
+        **_since_before(training),
         "train_seconds": round(seconds, 1),
         "rays_per_second": round(training.steps_done * params.sampling.rays / max(seconds, 1e-9)),
         "photos": len(trainer.photos),
@@ -296,6 +297,7 @@ def _last_scene(context: StageContext[TrainParams], scene: PosedScene) -> PosedS
     """The scene of the last training, where this one goes on from that; and if not, why, in the log."""
     before = context.read_previous(SCENE)
     if before is None:
+        log.info("training starts from the beginning: there is none with these settings to go on from")
         return None
     if not scene.lineage or before.lineage != scene.lineage:
         log.info("training starts anew: the poses, or the settings that made the scene, are others than before")
@@ -309,6 +311,17 @@ def _last_scene(context: StageContext[TrainParams], scene: PosedScene) -> PosedS
         log.info("training starts anew: %d of %d photos are new or gone", changed, len(now | then))
         return None
     return before
+
+
+def _since_before(training: _Training) -> dict[str, Any]:
+    """Numbers of what was kept of the last training: the part of the budget, and the steps of all until now."""
+    if not training.head_start:
+        return {}
+    previous = training.context.previous
+    before = load_manifest(previous) if previous else None
+    numbers = before.numbers if before else {}
+    steps = training.steps_done + numbers.get("steps_in_all", numbers.get("steps", 0))
+    return {"kept_of_budget": training.head_start, "steps_in_all": steps}
 
 
 def little_changed(changed: int, before: int) -> bool:

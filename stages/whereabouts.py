@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
@@ -89,18 +90,21 @@ def refuse_other_photos(workspace: Workspace, photos: Path, since: PhotosSince) 
     """Raises WorkspaceError where the workspace was made of other photos: its results would be lost."""
     if since.kind != "other":
         return
+    before = workspace.record.sources.get("photos")
+    came_from = "" if before in (None, str(photos)) else f", from {before},"
     raise WorkspaceError(
         f"The workspace {workspace.root} was made of other photos: {len(since.kept)} of its "
-        f"{len(since.kept) + len(since.removed)} files, from {workspace.record.sources.get('photos')}, are among the "
+        f"{len(since.kept) + len(since.removed)} files{came_from} are among the "
         f"{len(since.kept) + len(since.added)} in {photos}.",
-        f"Keep it and use another one: `--workspace {_free(_beside(photos))}`; or replace its results: "
-        "`--other-photos`.",
+        f"Keep it and use another one: `--workspace {shlex.quote(str(_free(_beside(photos))))}`; or replace its "
+        "results: `--other-photos`.",
     )
 
 
 def _free(folder: Path) -> Path:
-    """The first of NAME_2_hineus, NAME_3_hineus, ... that is not there."""
-    stem, number = folder.name.removesuffix(WORKSPACE_SUFFIX), 2
-    while (free := folder.with_name(f"{stem}_{number}{WORKSPACE_SUFFIX}")).exists():
+    """The first of NAME_hineus, NAME_2_hineus, NAME_3_hineus, ... that is not there."""
+    stem, number, free = folder.name.removesuffix(WORKSPACE_SUFFIX), 1, folder
+    while free.exists():
         number += 1
+        free = folder.with_name(f"{stem}_{number}{WORKSPACE_SUFFIX}")
     return free

@@ -19,8 +19,9 @@ from stages.artifacts import ImageRecord, ImageSet, SkippedImage
 from stages.engine.stage import StageContext
 from stages.geometry.similarity import align_points
 from stages.posing.adding import KnownPhotos, copy_features, known_model, put_back
-from stages.posing.workbench import ADDED, Base
-from stages.sfm import SFM
+from stages.posing.ladder import Step
+from stages.posing.workbench import ADDED, RELAXED, Base
+from stages.sfm import SFM, _is_relaxed, _same_cameras, _saw_left_out
 
 CENTERS = [
     np.array([2.6 * np.cos(a), 2.6 * np.sin(a), 1.5 + 0.3 * (i % 2)])
@@ -175,7 +176,7 @@ def test_poses_are_found_anew_where_they_must(eight: Path, tmp_path: Path, caplo
     if why == "few known":
         photos = named(5, 6, 7, 8, 9, 10)
     elif why == "left out on purpose":
-        photos, skipped = named(*range(1, 8)), [SkippedImage("000.png", artifacts.LEFT_OUT)]
+        photos, skipped = named(*range(1, 8)), [SkippedImage("000.png", artifacts.LEFT_OUT, sha256="0")]
     else:
         previous = tmp_path / "without"
         previous.mkdir()
@@ -227,6 +228,46 @@ def test_known_poses_and_features_survive_a_change_of_ids(eight: Path, tmp_path:
     model.transform(shift)
     assert put_back(known, model) == pytest.approx(0, abs=1e-9)
     assert model.compute_mean_reprojection_error() == pytest.approx(earlier.compute_mean_reprojection_error(), rel=1e-6)
+
+
+def record(name: str, camera: str, focal: float | None = None) -> ImageRecord:
+    return ImageRecord(name, name, WIDTH, HEIGHT, focal, camera, 1.0, False, name)
+
+
+@pytest.mark.parametrize(
+    ("cameras", "focal", "same"),
+    [("aaaa", None, True), ("bbbb", None, True), ("aabb", None, False), ("aaaa", 300.0, False)],
+)
+def test_poses_stay_only_where_photos_share_cameras_as_before(cameras: str, focal: float | None, same: bool) -> None:
+    files = {f"{i}": artifacts.PhotoFile(sha256=f"{i}", camera="a", focal_px=None) for i in range(4)}
+    before = artifacts.PhotoContents(lineage="", contents={name: name for name in files}, files=files)
+    records = [record(f"{i}.png", camera, focal) for i, camera in enumerate(cameras)]
+    new = record("new.png", "another", 900.0)
+    names = {f"{i}.png": f"{i}" for i in range(4)}
+    assert _same_cameras(before, ImageSet((*records, new)), names) is same
+
+
+def test_photos_once_seen_are_told_when_they_are_left_out() -> None:
+    before = artifacts.PhotoContents(lineage="", contents={}, seen=("1", "2"))
+
+    def left_out(sha256: str, reason: str = artifacts.LEFT_OUT) -> ImageSet:
+        return ImageSet((), (SkippedImage("x.png", reason, sha256=sha256),))
+
+    assert _saw_left_out(before, left_out("2"))
+    assert not _saw_left_out(before, left_out("3"))
+    assert not _saw_left_out(before, left_out("2", "no photo"))
+
+
+@pytest.mark.parametrize(
+    ("rung", "before", "relaxed"),
+    [(RELAXED, False, True), (ADDED, True, True), (ADDED, False, False), ("x", True, False)],
+)
+def test_rough_poses_stay_rough_while_others_are_placed_beside_them(
+    tmp_path: Path, rung: str, before: bool, relaxed: bool
+) -> None:
+    artifacts.REGISTRATION.save(tmp_path, artifacts.Registration(relaxed=before))
+    context = StageContext({}, {}, tmp_path, tmp_path, SfmParams(), previous=tmp_path)
+    assert _is_relaxed(context, Step(rung, 3, 9, 1.0, 0.0, kept=True)) is relaxed
 
 
 @pytest.mark.parametrize("base", [Base(), Base(affine=True), Base(masked=True, focal_priors=False), Base(corners=True)])

@@ -138,6 +138,20 @@ UNDONE = {
 }
 
 
+@pytest.mark.parametrize("suffix", [".png", ".webp"])
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_alpha_channels_are_upright_in_previews(photos: Path, suffix: str, orientation: int):
+    upright, undo = picture(7), UNDONE[orientation]
+    opacity = np.zeros(upright.size[::-1], np.uint8)
+    opacity[:20, :50] = 255
+    upright.putalpha(Image.fromarray(opacity))
+    stored = upright if undo is None else upright.transpose(undo)
+    stored.save(photos / f"0{suffix}", exif=exif_of(orientation))
+    _, alpha = read_preview(photos / f"0{suffix}")
+    assert alpha is not None
+    assert np.array_equal(alpha, opacity > 127)
+
+
 @pytest.mark.parametrize("suffix", [".jpg", ".tif", ".png", ".webp"])
 @pytest.mark.parametrize("orientation", range(1, 9))
 def test_photos_are_upright_for_every_reader(photos: Path, suffix: str, orientation: int):
@@ -156,7 +170,7 @@ def test_photos_are_upright_for_every_reader(photos: Path, suffix: str, orientat
     assert (record.width, record.height) == SIZE
     assert record.focal_px == pytest.approx(160)
     assert read_head(photos / f"0{suffix}", "0", 3200).width == SIZE[0]
-    assert np.abs(read_preview(photos / f"0{suffix}").astype(int) - np.asarray(upright)).mean() < 5
+    assert np.abs(read_preview(photos / f"0{suffix}")[0].astype(int) - np.asarray(upright)).mean() < 5
     path = artifacts.Pictures(out).path(record.name)
     with Image.open(path) as written:
         seen = [np.asarray(written.convert("RGB"))]

@@ -17,6 +17,7 @@ from typer.testing import CliRunner
 from hineus_cli.app import app
 from stages.artifacts import Pictures
 from stages.capture.listing import list_captures
+from stages.capture.masks import unused_folder
 from stages.capture.video import extract_frames
 from stages.engine.fingerprint import SourceDigests
 from stages.errors import InputError
@@ -359,3 +360,49 @@ def test_a_folder_that_cannot_be_read_is_told_of(photos: Path, monkeypatch: pyte
     shutil.rmtree(photos)
     with pytest.raises(InputError, match="does not exist"):
         list_captures(photos)
+
+
+@pytest.mark.parametrize("place", [".", "photos"])
+def test_folders_whose_files_may_not_be_seen(photos: Path, monkeypatch: pytest.MonkeyPatch, place: str):
+    """One below the photos is left out; the photos' own is named."""
+    write_photos(photos)
+    locked = (photos / "locked" if place == "." else photos).resolve()
+    locked.mkdir(exist_ok=True)
+    stat, listed = Path.stat, Path.iterdir
+
+    def refuse(path: Path) -> None:
+        raise PermissionError(13, "Permission denied", str(path))
+
+    monkeypatch.setattr(Path, "stat", lambda path, **how: refuse(path) if path.parent == locked else stat(path, **how))
+    monkeypatch.setattr(Path, "iterdir", lambda path: refuse(path) if path == locked else listed(path))
+    if place == ".":
+        found, _, skipped = list_captures(photos)
+        assert found
+        assert [(item.source, item.reason) for item in skipped] == [("locked", "a folder that may not be read")]
+    else:
+        with pytest.raises(InputError, match=r"photos cannot be read \(Permission denied\)"):
+            list_captures(photos)
+
+
+def test_masks_are_not_looked_for_where_nothing_may_be_listed(photos: Path, monkeypatch: pytest.MonkeyPatch):
+    (photos.parent / "masks").mkdir()
+    Image.new("L", (8, 8)).save(photos.parent / "masks/a.png")
+    assert unused_folder(photos, ["a.jpg"]) == photos.parent.resolve() / "masks"
+
+    def refused(path: Path):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(Path, "iterdir", refused)
+    assert unused_folder(photos, ["a.jpg"]) is None
+
+
+def test_masks_behind_a_link_among_the_photos_are_no_photos(photos: Path):
+    write_photos(photos)
+    alone = list(list_captures(photos)[0])
+    real = photos.parent / "outlines"
+    real.mkdir()
+    Image.new("L", (80, 60)).save(real / "other.png")
+    (photos / "sil").symlink_to(real, target_is_directory=True)
+    assert list(list_captures(photos, photos / "sil")[0]) == alone
+    assert list(list_captures(photos)[0]) == sorted([*alone, "sil/other.png"])
+    assert list(list_captures(photos, photos)[0]) == sorted([*alone, "sil/other.png"])

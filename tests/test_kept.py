@@ -51,12 +51,16 @@ def test_photos_that_came_and_went_are_told_and_the_rest_is_kept(tmp_path: Path,
 
     write_photo(photos, 8)
     (photos / "0.png").unlink()
-    (photos / "a").mkdir()
-    (photos / "1.png").rename(photos / "a" / "one.png")
+    (photos / "1.png").rename(photos / "one.png")
     (photos / "notes.txt").write_text("none of these")
     (photos / "copy.png").write_bytes((photos / "2.png").read_bytes())
     said = "7 photos known, 1 new, 1 gone: the poses of 7 stay, training goes on from what it has learned"
     # of eight photos two are a quarter
+    assert check_photos(request).kept == said
+    other = Request(photos, workspace, preset="tiny", sets=(*COARSE, "train.steps=41"), device="cpu")
+    assert check_photos(other).kept == said.replace("goes on from what it has learned", "starts anew")
+    # a run that was stopped when it had taken the photos in says what it keeps, too
+    reconstruct(Request(photos, workspace, until="ingest", device="cpu"), PIPELINE)
     assert check_photos(request).kept == said
     made = run()
     assert said in caplog.text
@@ -64,6 +68,7 @@ def test_photos_that_came_and_went_are_told_and_the_rest_is_kept(tmp_path: Path,
     assert (made["sfm"]["known"], made["sfm"]["new"], made["sfm"]["gone"]) == (7, 1, 1)
     assert made["undistort"]["region_kept"] in (True, False)
     assert made["train"]["kept_of_budget"] in (0.7, 0.2)
+    assert made["train"]["steps_in_all"] == 40 + round(40 * (1 - made["train"]["kept_of_budget"]))
     assert made["train"]["photos"] == 8
     assert run() == {}
     assert "known" not in caplog.text
@@ -89,3 +94,21 @@ def test_photos_that_came_and_went_are_told_and_the_rest_is_kept(tmp_path: Path,
         write_photo(photos, index)
     said = "3 photos known, 4 new, 6 gone: poses are found anew from all, since 3 of them have one"
     assert check_photos(request).kept == said
+
+
+def test_photos_are_told_by_content_and_masks_are_none(tmp_path: Path):
+    photos, workspace = tmp_path / "photos", tmp_path / "workspace"
+    for index in range(4):
+        write_photo(photos, index)
+    (photos / "3.png").rename(photos / "3.photo")
+    request = Request(photos, workspace, preset="tiny", until="ingest", device="cpu")
+    reconstruct(request, PIPELINE)
+    write_photo(photos, 4)
+    (photos / "4.png").rename(photos / "4.photo")
+    cv2.imwrite(str(photos / "0_mask.png"), np.eye(64, dtype=np.uint8) * 255)
+    said = "4 photos known, 1 new, 0 gone: poses are found anew from all"
+    assert check_photos(request).kept == said
+    (photos / "0.png").unlink()
+    (photos / "3.photo").unlink()
+    (photos / "0_mask.png").unlink()
+    assert "2 photos known, 1 new, 2 gone" in check_photos(request).kept

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import tracemalloc
 import unicodedata
 from collections.abc import Callable
 from pathlib import Path
@@ -20,9 +21,11 @@ from configs.params import IngestParams
 from hineus_cli.app import app, build_app
 from stages import artifacts
 from stages.artifacts import ImageSet
+from stages.capture import photo_reading
 from stages.capture.mask_fit import outline_fit
 from stages.capture.mask_names import pair, set_masks_aside
-from stages.capture.masks import load_mask
+from stages.capture.masks import bytes_to_read_masks, load_mask
+from stages.capture.photo_reading import BYTES_PER_PIXEL
 from stages.engine.stage import StageContext
 from stages.errors import InputError
 from stages.ingest import INGEST
@@ -288,6 +291,29 @@ def test_masks_of_any_depth_are_black_and_white(tmp_path: Path, suffix: str, dra
     kept = load_mask(file, "photo", SIZE, SIZE, 1).kept
     assert (kept != mask).mean() < 0.005
     assert (load_mask(file, "photo", SIZE, SIZE, 1, black_keeps=True).kept == ~kept).all()
+
+
+def test_large_masks_are_read_within_the_memory_that_is_free(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    file = tmp_path / "large.png"
+    Image.new("1", (8000, 6000)).save(file)  # 48 MP; the photo is small
+    needed = bytes_to_read_masks([file, tmp_path / "none.png"])
+    assert needed == BYTES_PER_PIXEL * 48_000_000
+    monkeypatch.setattr(photo_reading, "available_memory", lambda: needed - 1)
+    with pytest.raises(InputError, match=r"large\.png cannot be read: 8000 x 6000 pixels take 0\.7 GiB"):
+        load_mask(file, "photo", (160, 120), (160, 120), 1)
+    monkeypatch.setattr(photo_reading, "available_memory", lambda: needed)
+    tracemalloc.start()
+    load_mask(file, "photo", (160, 120), (160, 120), 1)
+    assert tracemalloc.get_traced_memory()[1] < 5 * 48_000_000  # of numpy: no floats of 8 bytes
+    tracemalloc.stop()
+
+
+@pytest.mark.slow
+def test_the_largest_mask_counts_among_the_needs(tmp_path: Path):
+    photos = write_set(tmp_path, "masks/{stem}.png")
+    Image.new("1", (12000, 9000)).save(next((tmp_path / "masks").iterdir()))
+    result = check(photos, "--masks", tmp_path / "masks", "--json")
+    assert json.loads(result.stdout)["needs"]["memory_gib"] == pytest.approx(BYTES_PER_PIXEL * 108e6 / 2**30)
 
 
 @pytest.mark.parametrize("value", [0, 1, 255])

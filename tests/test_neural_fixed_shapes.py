@@ -205,3 +205,14 @@ def test_a_checkpoint_of_the_cpu_goes_on_on_cuda():
     assert torch.isfinite(numbers["loss"])
     assert not torch.equal(going_on.fields.sdf.table, before)
     assert all(isinstance(group["lr"], torch.Tensor) for group in going_on.optimizer.param_groups)
+
+
+def test_a_checkpoint_of_cuda_goes_on_on_the_cpu():
+    started, going_on = make_trainer(), make_trainer()
+    started.step(0.1)
+    state = started.state()
+    for group in state["optimizer"]["param_groups"]:  # as the GPU leaves them
+        group |= {"lr": torch.tensor(group["lr"]), "capturable": True}
+    going_on.load_state(state)
+    assert torch.isfinite(going_on.step(0.2)["loss"])
+    assert all(isinstance(group["lr"], float) for group in going_on.optimizer.param_groups)

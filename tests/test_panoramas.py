@@ -14,6 +14,7 @@ from typer.testing import CliRunner
 from hineus_cli.app import app
 from stages import artifacts
 from stages.artifacts import ImageRecord
+from stages.capture import panoramas, photo_reading
 from stages.capture.listing import list_captures
 from stages.capture.panoramas import VIEWS, Sphere, borders_meet, find_spheres, focal_px, is_dual_fisheye, split
 from stages.geometry.similarity import align_points
@@ -67,6 +68,19 @@ def test_two_circles_on_black_are_no_sphere(tmp_path: Path, sphere: np.ndarray):
     assert spheres == {}
     assert "two fisheye lenses" in others["R0010.jpg"]
     assert "equirectangular" in others["R0010.jpg"]
+
+
+def test_large_pictures_are_judged_within_the_memory_that_is_free(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    file = tmp_path / "large.png"
+    Image.new("P", (9000, 4500), 7).save(file)
+    seen = []
+    monkeypatch.setattr(panoramas, "is_dual_fisheye", lambda grey: seen.append(grey.shape))
+    monkeypatch.setattr(photo_reading, "available_memory", lambda: 1 << 29)
+    assert find_spheres({"large.png": file}, "auto") == ({}, {})  # whoever reads it says why not
+    assert seen == []
+    monkeypatch.setattr(photo_reading, "available_memory", lambda: 1 << 30)
+    find_spheres({"large.png": file}, "auto")
+    assert seen == [(500, 1000)]
 
 
 def gpano(**tags: object) -> bytes:

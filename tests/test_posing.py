@@ -505,6 +505,9 @@ def test_names_that_agree(cameras: list[str], photos: list[str], expected: dict[
 
 
 def test_names_that_do_not_agree():
+    with pytest.raises(InputError, match="There are no photos") as none:
+        match_photos(known("x.jpg"), [])
+    assert "x.jpg" in none.value.hint
     with pytest.raises(
         InputError, match=r"None of the 2 photos has a pose in poses.json: it names 1 images, e.g. x.jpg"
     ):

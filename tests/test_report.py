@@ -30,7 +30,7 @@ from stages.geometry.up import y_up_rotation
 from stages.report import THREE, region_corners
 from stages.reporting import view3d
 from stages.reporting.curves import line_chart
-from stages.reporting.numbers import describe_where, duration
+from stages.reporting.numbers import describe_history, describe_where, duration
 from stages.reporting.pictures import draw_stills
 from stages.reporting.view3d import NO_VALUE, light_enough, pack_mesh, pack_overlays, pack_region, pack_scene
 
@@ -324,3 +324,19 @@ def test_chart_of_a_constant_and_of_decades():
 
 def test_durations_are_readable():
     assert [duration(s) for s in (3.21, 61)] == ["3.2 s", "1 min 01 s"]
+
+
+def test_what_was_kept_of_an_earlier_result_is_said() -> None:
+    sfm = manifest("sfm", known=40, new=7, gone=1, poses_stayed=True, moved_percent=0.019)
+    undistort = manifest("undistort", region_kept=True)
+    train = manifest("train", kept_of_budget=0.7, steps_in_all=1950)
+    (sentence,) = describe_history({"sfm": sfm, "undistort": undistort, "train": train})
+    assert sentence == (
+        "This result goes on from an earlier one: 40 photos were known, 7 are new, 1 gone; known poses stayed (they "
+        "moved by 0.019 % of the distance to what they see); the region stayed; training went on with 70 % of its "
+        "budget counted as spent, 1,950 steps in all."
+    )
+    (alone,) = describe_history({"undistort": undistort, "train": train})
+    assert alone.startswith("This result goes on from an earlier one: the region stayed; training went on with 70 %")
+    unchanged = manifest("sfm", known=40, new=0, gone=0, poses_stayed=True, moved_percent=0.0)
+    assert describe_history({"sfm": unchanged, "undistort": undistort, "train": manifest("train", steps=9)}) == []

@@ -6,6 +6,7 @@ import fcntl
 import os
 import pty
 import re
+import signal
 import struct
 import subprocess
 import sys
@@ -201,6 +202,7 @@ def test_a_terminal_that_is_closed(folder: Path, before: str, code: int) -> None
     line = f"cd {folder}; {before} exec {sys.executable} program.py run photos"
     process, terminal = pty.fork()
     if process == 0:
+        signal.signal(signal.SIGHUP, signal.SIG_DFL)  # the tests may run under `nohup`
         os.execvpe("bash", ["bash", "-c", line], given)
     came = b""
     while b"sfm" not in came:

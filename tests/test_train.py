@@ -604,3 +604,6 @@ def test_training_starts_anew_where_what_was_learned_is_no_ground(tmp_path, monk
     scene = seen_by(tmp_path / "undistort", [0, 1, 2, 3, 4])
     artifacts.SCENE.save(previous, before)
     assert train._last_scene(replace(run_context, params=BALL), scene) is not None
+    with caplog.at_level("INFO"):
+        assert train._last_scene(replace(run_context, previous=None), scene) is None
+    assert "training starts from the beginning: there is none with these settings" in caplog.text

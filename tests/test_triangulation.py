@@ -14,6 +14,7 @@ from rigs import look_at
 
 from configs.params import SfmParams
 from stages import artifacts
+from stages.artifacts import ImageSet, SkippedImage
 from stages.engine.stage import StageContext
 from stages.errors import InputError
 from stages.posing.known import KnownCamera
@@ -86,14 +87,32 @@ def test_given_poses_are_of_one_lineage_while_photos_that_stay_keep_theirs(tmp_p
     photos = [np.full((HEIGHT, WIDTH), 100 + 10 * i, np.uint8) for i in range(len(POSES))]
     names = [f"{i:03d}.png" for i in range(len(POSES))]
 
-    def lineage(name: str, count: int, previous: Path | None = None) -> tuple[str, Path]:
+    def lineage(
+        name: str, count: int, previous: Path | None = None, left_out: int | None = None, focal: float = FOCAL
+    ) -> tuple[str, Path]:
         (tmp_path / name).mkdir()
         ingest = ingested(tmp_path / name / "ingest", photos[:count])
-        _, out = run_sfm(ingest, write_poses(tmp_path / name, names), tmp_path / name, previous)
+        if left_out is not None:
+            records = artifacts.IMAGE_SET.load(ingest).images
+            gone = SkippedImage(names[left_out], artifacts.LEFT_OUT, sha256=str(left_out))
+            rest = tuple(record for record in records if record.name != names[left_out])
+            artifacts.IMAGE_SET.save(ingest, ImageSet(rest, (gone,)))
+        _, out = run_sfm(ingest, write_poses(tmp_path / name, names, focal), tmp_path / name, previous)
         return artifacts.PHOTO_CONTENTS.load(out).lineage, out
 
     first, folder = lineage("five", 5)
-    assert lineage("six", 6, folder)[0] == first
+    assert lineage("four", 4, folder)[0] == first
+    _, six = lineage("six", 6, folder)
+    assert artifacts.PHOTO_CONTENTS.load(six).lineage == first
+    assert lineage("other lens", 6, folder, focal=1.1 * FOCAL)[0] != first
+    # photos that no stage may see: one that was seen, in the last run or before, and one that never was
+    assert lineage("left out", 6, six, left_out=5)[0] != first
+    _, removed = lineage("removed", 5, six)
+    assert artifacts.PHOTO_CONTENTS.load(removed).lineage == first
+    forgotten, without = lineage("left out later", 6, removed, left_out=5)
+    assert forgotten != first
+    assert lineage("once more", 6, without, left_out=5)[0] == forgotten
+    assert lineage("never seen", 6, folder, left_out=5)[0] == first
     assert lineage("alone", 6)[0] != first
     monkeypatch.setattr("test_triangulation.POSES", [POSES[0] + [[0, 0, 0, 0.01]], *POSES[1:]])
     assert lineage("moved", 6, folder)[0] != first

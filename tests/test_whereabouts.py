@@ -142,7 +142,7 @@ def test_a_workspace_of_other_photos_is_refused_unless_told(folder: Path) -> Non
     refused = hineus("run", "b/images", "-w", "ws")
     assert refused.exit_code == 5
     assert f"made of other photos: 0 of its 4 files, from {folder}/a/images, are among the 4 in" in refused.stderr
-    assert f"`--workspace {folder}/b/images_2_hineus`" in refused.stderr
+    assert f"`--workspace {folder}/b/images_hineus`" in refused.stderr
     assert model.read_bytes() == made
     assert Workspace.open(folder / "ws").record.sources["photos"] == f"{folder}/a/images"
 
@@ -283,3 +283,16 @@ def test_the_option_of_every_source() -> None:
     assert naming_command("photos", root) == "hineus run PHOTOS --workspace '/my ws'"
     assert naming_command(CONTROL, root) == "hineus run --control PATH --workspace '/my ws'"
     assert naming_command("poses", root) == "hineus run --poses PATH --workspace '/my ws'"
+
+
+def test_masks_that_follow_a_moved_workspace_later_are_found(masked: Path) -> None:
+    """The workspace goes first and is run there, photos and masks come after it to the places beside it."""
+    (masked / "later").mkdir()
+    (masked / "a/ws").rename(masked / "later/ws")
+    for name in ("images", "masks", "poses"):
+        (masked / "a" / name).rename(masked / f"away-{name}")
+    run("-w", "later/ws")
+    for name in ("images", "masks", "poses"):
+        (masked / f"away-{name}").rename(masked / "later" / name)
+    assert actions(run("-w", "later/ws")) == {"skipped"}
+    assert sources(masked / "later/ws")["masks"] == f"{masked}/later/masks"

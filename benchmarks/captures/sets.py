@@ -12,7 +12,7 @@ from benchmarks.captures.subject import MIN_PHOTOS, SAMPLES
 from benchmarks.captures.tracks import sight
 from configs.params import UndistortParams
 from stages import artifacts
-from stages.capture.masks import read_mask
+from stages.capture.masks import load_mask
 from stages.evaluation.alignment import by_cameras
 from stages.evaluation.protocols.known_object import file_stem, has_truth, load_known_object
 from stages.evaluation.surfaces import sample_faces
@@ -60,7 +60,7 @@ def load_posed(workspace: Path, masks: dict[str, Path] | None = None) -> Posed:
     for photo in photos:
         camera, warp = model.cameras[photo.camera_id], warps[photo.camera_id]
         size = camera.width, camera.height
-        mask = read_mask(masks[file_stem(photo.name)], photo.name, size, size, orientation=1)
+        mask = load_mask(masks[file_stem(photo.name)], photo.name, size, size, orientation=1).kept
         pixels = np.where(mask, 255, 0).astype(np.uint8)
         warped.append(warp_mask(pixels, warp, warp_maps(camera, warp), erode=0))
     return Posed(cameras, points, errors, observations, tuple(warped))

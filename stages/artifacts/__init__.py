@@ -33,6 +33,7 @@ from stages.artifacts.sfm import (
     Lens,
     LensTrial,
     PhotoContents,
+    PhotoFile,
     PoseError,
     Registration,
     Unregistered,

@@ -58,11 +58,13 @@ class SkippedImage:
 
     Attributes:
         expected: whether that is no news: it is what cameras and programs leave beside photos.
+        sha256: hash of a file that was left out as `LEFT_OUT` says; empty for others.
     """
 
     source: str
     reason: str
     expected: bool = False
+    sha256: str = ""
 
 
 @dataclass(frozen=True)

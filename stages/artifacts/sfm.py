@@ -6,6 +6,8 @@ import math
 from pathlib import Path
 from typing import Any
 
+from pydantic import Field
+
 from stages.artifacts.artifact import Artifact, place_artifact
 from stages.artifacts.json_files import Array, Record, read_record, record_artifact, write_record
 
@@ -91,6 +93,7 @@ class Registration(Record):
         mapper, matcher: how poses and pairs were found.
         kept: the attempt whose model this is; empty where the poses were given.
         ladder: the attempts, see `stages.posing.ladder.Step`.
+        relaxed: whether photos were placed with relaxed thresholds, in this run or one that it goes on from.
         lenses: of the cameras; none where the poses were given. pose_error: None there, and where it cannot be told.
     """
 
@@ -103,6 +106,7 @@ class Registration(Record):
     mapper: str = ""
     matcher: str = ""
     kept: str = ""
+    relaxed: bool = False
     ladder: tuple[dict[str, Any], ...] = ()
     lenses: tuple[Lens, ...] = ()
     pose_error: PoseError | None = None
@@ -123,6 +127,14 @@ class GivenPoses(Record):
     region: KnownSphere | None = None
 
 
+class PhotoFile(Record):
+    """A photo as ingest took it: see `ImageRecord`."""
+
+    sha256: str
+    camera: str
+    focal_px: float | None
+
+
 class PhotoContents(Record):
     """What photos the model was made of, for when some are added or removed.
 
@@ -130,10 +142,14 @@ class PhotoContents(Record):
         lineage: models with the same one hold the same photos at the same places, as far as they share them: each but
             the first went on from one before it.
         contents: name -> digest of the photo and its mask, of all photos, placed or not.
+        files: name -> what ingest said of it.
+        seen: sha256 of all photos that this model, or one that it goes on from, may have been made of.
     """
 
     lineage: str
     contents: dict[str, str]
+    files: dict[str, PhotoFile] = Field(default_factory=dict)
+    seen: tuple[str, ...] = ()
 
 
 def _save_given_poses(folder: Path, poses: GivenPoses | None) -> None:

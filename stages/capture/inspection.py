@@ -13,7 +13,7 @@ from stages.capture.background import PLAIN_PHOTOS, find_background
 from stages.capture.mask_doubts import MaskLook
 from stages.capture.masks import given_mask, of_sphere, unused_folder
 from stages.capture.panoramas import Sphere, split_size
-from stages.capture.photo_reading import PhotoFile, UnusableError, read_alpha, read_head, read_preview
+from stages.capture.photo_reading import PhotoFile, UnusableError, read_head, read_preview
 from stages.capture.quality import Appearance, Oddities, appearance, find_oddities
 from stages.capture.selection import Sources, select
 from stages.capture.video import video_size
@@ -147,8 +147,9 @@ def _look_closer(head: PhotoFile, file: Path, mask_file: Path | None, params: In
     Raises:
         UnusableError: the photo or its mask shows that this is none.
     """
-    pixels = read_preview(file)
-    alpha = read_alpha(file) if mask_file is None and params.own_masks else None
+    pixels, alpha = read_preview(file)
+    if mask_file is not None or not params.own_masks:
+        alpha = None
     mask: MaskLook | InputError | None = None
     try:
         if is_sphere and alpha is not None:

@@ -45,7 +45,7 @@ def list_captures(
     `masks_folder` is left out; of a folder with other files, too, only the `masks` in it that are given.
 
     Raises:
-        InputError: `source` is not there or is a file of another kind, or `masks_folder` is no folder.
+        InputError: `source` is not there, may not be read or is a file of another kind, or `masks_folder` is no folder.
     """
     if not source.exists():
         raise InputError(f"The photo folder {source} does not exist.", "Check the path: hineus run PHOTOS")
@@ -58,12 +58,17 @@ def list_captures(
     if masks_folder is not None and not masks_folder.is_dir():
         raise InputError(f"The mask folder {masks_folder} does not exist.", "Check the path given to --masks.")
     inside_masks = masks_folder.resolve() if masks_folder and not masks else None
-    if inside_masks and source.resolve() not in inside_masks.parents:  # the photos may lie in the masks' folder
+    if inside_masks and source.resolve().is_relative_to(inside_masks):  # the photos may lie in the masks' folder
         inside_masks = None
     named = {mask.resolve() for mask in masks}
     photos: Files = {}
     videos: Files = {}
-    files, left = named_files(source)
+    try:
+        files, left = named_files(source)
+    except OSError as error:
+        raise InputError(
+            f"The photo folder {source} cannot be read ({error.strerror}).", f"Allow it: `chmod u+rx {source}`."
+        ) from error
     skipped = [SkippedImage(item.name, item.reason, expected=not item.missed) for item in left]
     for name, path in files.items():
         if path.resolve() in named or (inside_masks and inside_masks in path.resolve().parents):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from stages.capture.listing import name_some
 from stages.capture.mask_doubts import MaskLook, is_black_and_white, look
 from stages.capture.mask_fit import outline_fit
 from stages.capture.mask_names import is_mask_folder, pair
-from stages.capture.photo_reading import Photo, PhotoFile, UnusableError
+from stages.capture.photo_reading import Photo, PhotoFile, UnusableError, bytes_to_read, memory_for, turned
 from stages.errors import InputError
 from stages.inputs.depth import DEPTH, read_depth
 from stages.inputs.folders import named_files, readable
@@ -72,10 +73,11 @@ def _pictures(folder: Path) -> dict[str, Path]:
 
 def unused_folder(source: Path, photos: list[str]) -> Path | None:
     """A folder of masks of these photos near the folder `source` of photos, where nobody has named it."""
-    nearby = [source / ".mask", *sorted(path for path in source.resolve().parent.iterdir() if path != source.resolve())]
-    for folder in nearby:
-        if is_mask_folder(folder.name) and folder.is_dir() and match_masks(photos, folder):
-            return folder
+    with suppress(OSError):  # folders that may not be listed
+        beside = sorted(path for path in source.resolve().parent.iterdir() if path != source.resolve())
+        for folder in (source / ".mask", *beside):
+            if is_mask_folder(folder.name) and folder.is_dir() and match_masks(photos, folder):
+                return folder
     return None
 
 
@@ -176,13 +178,6 @@ def given_mask(
     return mask, look(photo, called, mask.kept, mask.stored_size, pixels)
 
 
-def read_mask(
-    file: Path, photo: str, size: tuple[int, int], stored_size: tuple[int, int], orientation: int
-) -> np.ndarray:
-    """As `load_mask`, of a mask whose white keeps: [H, W] bool."""
-    return load_mask(file, photo, size, stored_size, orientation).kept
-
-
 def load_mask(
     file: Path,
     photo: str,
@@ -205,26 +200,46 @@ def load_mask(
         black_keeps: whether black is the object, as some programs have it.
 
     Raises:
-        InputError: it cannot be read, has another shape than the photo, or is not black and white.
+        InputError: it cannot be read, or not with the memory that is free, has another shape than the photo, or is not
+            black and white.
     """
-    from PIL import Image
-
     if file.name.endswith(DEPTH):
         return _near(file, photo, size)
     try:
-        with open_image(file) as stored:
-            stored.load()
-            image = stored.copy() if stored.mode != "P" else stored.convert("RGBA" if _sees_through(stored) else "RGB")
-            noisy = stored.format == "JPEG"
-            own_orientation = stored.getexif().get(ORIENTATION, 1)
-        candidates = [turned(image, own_orientation), image, turned(image, orientation)]
-        fitting = [found for found in candidates if found.size == size]
-        fitting = fitting or [found for found in candidates if _same_shape(found.size, size)] or [image]
-        values = _grey(fitting[0])
+        with open_image(file) as stored, memory_for(stored, max(stored.size)):
+            return _judged(stored, file, photo, size, orientation, black_keeps, pixels)
+    except InputError:
+        raise
+    except UnusableError as error:
+        raise InputError(
+            f"The mask {file} cannot be read: {error}.", "Write it smaller: its shape is enough."
+        ) from error
     except Exception as error:  # Pillow's decoders raise nearly anything on a damaged file
         raise InputError(f"The mask {file} cannot be read ({error}).", "Write it again as an 8-bit PNG.") from error
+
+
+def _judged(
+    stored: Any,
+    file: Path,
+    photo: str,
+    size: tuple[int, int],
+    orientation: int,
+    black_keeps: bool,
+    pixels: np.ndarray | None,
+) -> Mask:
+    """As `load_mask`, of a picture that Pillow opened."""
+    from PIL import Image
+
+    stored.load()
+    own_orientation = stored.getexif().get(ORIENTATION, 1)
+    image = Image.fromarray(_grey(stored))
+    candidates = [turned(image, own_orientation), image, turned(image, orientation)]
+    fitting = [found for found in candidates if found.size == size]
+    fitting = fitting or [found for found in candidates if _same_shape(found.size, size)] or [image]
     check_size(file, photo, fitting[0].size, size)
-    kept = _black_and_white(values, noisy, file, photo) ^ black_keeps
+    kept = _black_and_white(np.asarray(fitting[0]), stored.format == "JPEG", file, photo)
+    if black_keeps:
+        np.logical_not(kept, out=kept)
     if own_orientation in (None, 0, 1) and len(fitting) > 2 and pixels is not None:  # as large either way
         kept = _better_turned(kept, turned(Image.fromarray(kept), orientation), pixels)
     found = kept.shape[1], kept.shape[0]
@@ -241,18 +256,13 @@ def _near(file: Path, photo: str, size: tuple[int, int]) -> Mask:
     return Mask(kept, size)
 
 
-def turned(image: Any, orientation: int | None) -> Any:
-    """A Pillow image turned upright, as EXIF's orientation says."""
-    from PIL import Image, ImageOps
-
-    if orientation in (None, 0, 1):
-        return image
-    exif = Image.Exif()
-    exif[ORIENTATION] = orientation
-    tagged = image.copy()
-    tagged.info = {"exif": exif.tobytes()}
-    tagged._exif = None
-    return ImageOps.exif_transpose(tagged)
+def bytes_to_read_masks(files: Iterable[Path]) -> int:
+    """Memory that reading the largest of these masks takes; those that cannot be opened take none."""
+    most = 0
+    for file in files:
+        with suppress(Exception), open_image(file) as stored:  # Pillow raises nearly anything on a damaged file
+            most = max(most, bytes_to_read(stored, max(stored.size)))
+    return most
 
 
 def _sees_through(image: Any) -> bool:
@@ -261,12 +271,14 @@ def _sees_through(image: Any) -> bool:
 
 def _grey(image: Any) -> np.ndarray:
     """[H, W]: the alpha channel where it cuts anything out, else the brightness, of any number of bits."""
+    if image.mode == "P":
+        image = image.convert("RGBA" if _sees_through(image) else "RGB")
     if image.mode in ("RGBA", "LA", "PA", "RGBa", "La"):
         alpha = np.asarray(image.convert("RGBA").getchannel("A"))
         if alpha.min() != alpha.max():
             return alpha
     if image.mode.startswith(("I", "F")):  # 16 and 32 bits, which Pillow's own conversion would cut off at 255
-        return np.nan_to_num(np.asarray(image, dtype=np.float64))
+        return np.nan_to_num(np.array(image, dtype=np.float32), copy=False)
     return np.asarray(image.convert("L"))
 
 
@@ -281,8 +293,9 @@ def _black_and_white(values: np.ndarray, noisy: bool, file: Path, photo: str) ->
         return np.zeros(values.shape, bool)
     if brightest - darkest < MIN_CONTRAST * brightest:
         return np.ones(values.shape, bool)
-    scaled = (values - darkest) / max(brightest - darkest, 1e-9)
-    black, white = float((scaled < SOFT).mean()), float((scaled > 1 - SOFT).mean())
+    across = max(brightest - darkest, 1e-9)  # thresholds in the picture's own numbers: no copies of large pictures
+    black = float((values < darkest + SOFT * across).mean())
+    white = float((values > brightest - SOFT * across).mean())
     neither = 1 - black - white
     if neither > MAX_UNCLEAR * (neither + min(black, white)):
         raise InputError(
@@ -291,7 +304,7 @@ def _black_and_white(values: np.ndarray, noisy: bool, file: Path, photo: str) ->
             "It looks like a photo, a depth map or labels.",
             "Name the folder of the masks with `--masks FOLDER`, or run without: `--no-masks`.",
         )
-    return scaled > 0.5
+    return values > darkest + across / 2
 
 
 def _better_turned(kept: np.ndarray, other: Any, pixels: np.ndarray) -> np.ndarray:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from stages.capture.photo_reading import PREVIEW_SIDE, UnusableError, telling_damage
+from stages.capture.photo_reading import PREVIEW_SIDE, UnusableError, memory_for, telling_damage
 from stages.inputs.formats import RAW_SUFFIXES, open_image
 
 if TYPE_CHECKING:
@@ -137,12 +137,17 @@ def _look(file: Path, mode: Mode) -> tuple[Sphere | None, bool | None]:
 
 
 def _glance(file: Path) -> tuple[tuple[int, int], bytes, np.ndarray | None]:
-    """Size, XMP, and, where it is twice as wide as high, grey pixels [H, W] uint8, perhaps reduced."""
+    """Size, XMP, and, where it is twice as wide as high, grey pixels [H, W] uint8, perhaps reduced.
+
+    Raises:
+        UnusableError: it cannot be read, or not with the memory that is free.
+    """
     with telling_damage(), open_image(file) as stored:
         size, xmp, grey = stored.size, _xmp(stored), None
         if abs(size[0] / size[1] / 2 - 1) <= STRETCH:
-            stored.draft("L", (PREVIEW_SIDE, PREVIEW_SIDE // 2))
-            grey = np.asarray(stored.convert("L"))
+            with memory_for(stored, PREVIEW_SIDE):
+                stored.draft("L", (PREVIEW_SIDE, PREVIEW_SIDE // 2))
+                grey = np.asarray(stored.convert("L").reduce(max(1, stored.height // (PREVIEW_SIDE // 2))))
     return size, xmp, grey
 
 

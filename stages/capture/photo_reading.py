@@ -147,7 +147,7 @@ def read_head(file: Path, source: str, max_side: int) -> PhotoFile:
             with open_image(file) as stored:
                 exif = _exif_of(partial(Image.Image.getexif, stored))  # in front of the pixels
                 stored_size, size = _sizes(stored, exif)
-                needed = _bytes_to_read(stored, max_side)
+                needed = bytes_to_read(stored, max_side)
                 colours = colours_of(stored.info, exif, _flat_mode(stored.mode))
     _check_side(size)
     _check_memory(size, needed)
@@ -164,37 +164,40 @@ def read_head(file: Path, source: str, max_side: int) -> PhotoFile:
     )
 
 
-def read_preview(file: Path) -> np.ndarray:
-    """Pixels [H, W, 3] uint8 of the upright photo, reduced.
+def read_preview(file: Path) -> tuple[np.ndarray, np.ndarray | None]:
+    """Pixels [H, W, 3] uint8 of the upright photo, reduced; what its alpha channel keeps, see `Photo`.
 
     Raises:
         UnusableError: it cannot be decoded, or is a raw file without rawpy.
     """
-    from PIL import ImageOps
+    from PIL import Image, ImageOps
 
     with telling_damage():
         if _is_raw(file):  # half a second each; the previews in raw files have any size, or are not there
-            return np.asarray(_develop(file, PREVIEW_SIDE).rgb)
-        with open_image(file) as stored, _memory_for(stored, PREVIEW_SIDE):
+            return np.asarray(_develop(file, PREVIEW_SIDE).rgb), None
+        with open_image(file) as stored, memory_for(stored, PREVIEW_SIDE):
             stored.draft(None, (PREVIEW_SIDE, PREVIEW_SIDE))
-            image, _ = _flat_and_alpha(stored)
+            image, alpha = _flat_and_alpha(stored)
             image = in_srgb(image.reduce(max(1, min(image.size) // PREVIEW_SIDE)), Colours())
-            # Pillow has turned TIFF already
-            return np.asarray(image if stored.format == "TIFF" else ImageOps.exif_transpose(image))
+            if stored.format == "TIFF":  # Pillow has turned it already
+                return np.asarray(image), alpha
+            if alpha is not None:
+                alpha = np.asarray(turned(Image.fromarray(alpha), _exif_of(stored.getexif).get(ORIENTATION)))
+            return np.asarray(ImageOps.exif_transpose(image)), alpha
 
 
-def read_alpha(file: Path) -> np.ndarray | None:
-    """[H, W] bool of the upright photo, what its alpha channel keeps; None where it cuts nothing out.
+def turned(image: Any, orientation: int | None) -> Any:
+    """A Pillow image turned upright, as EXIF's orientation says."""
+    from PIL import Image, ImageOps
 
-    Raises:
-        UnusableError: it cannot be decoded.
-    """
-    if _is_raw(file):
-        return None
-    with open_image(file) as stored:
-        if not {"A", "a"} & set(stored.getbands()) and "transparency" not in stored.info:
-            return None
-    return read_photo(file, PREVIEW_SIDE).alpha
+    if orientation in (None, 0, 1):
+        return image
+    exif = Image.Exif()
+    exif[ORIENTATION] = orientation
+    tagged = image.copy()
+    tagged.info = {"exif": exif.tobytes()}
+    tagged._exif = None
+    return ImageOps.exif_transpose(tagged)
 
 
 def _is_raw(file: Path) -> bool:
@@ -230,7 +233,7 @@ def telling_damage() -> Iterator[None]:
 def _decode(file: Path, max_side: int) -> Photo:
     from PIL import Image, ImageOps
 
-    with open_image(file) as stored, _memory_for(stored, max_side):
+    with open_image(file) as stored, memory_for(stored, max_side):
         if getattr(stored, "n_frames", 1) > 1 and stored.format in ANIMATED_FORMATS:
             raise UnusableError("an animation")
         if stored.format == "JPEG":
@@ -317,13 +320,13 @@ def _flat_and_alpha(image: Any) -> tuple[Any, np.ndarray | None]:
 
 # ---------------------------------------------------------------- memory
 @contextmanager
-def _memory_for(stored: Any, max_side: int) -> Iterator[None]:
+def memory_for(stored: Any, max_side: int) -> Iterator[None]:
     """While a picture that Pillow opened is read: large ones take turns.
 
     Raises:
         UnusableError: the memory that is free is not enough.
     """
-    needed = _bytes_to_read(stored, max_side)
+    needed = bytes_to_read(stored, max_side)
     if needed < LARGE_BYTES:
         yield
         return
@@ -332,7 +335,7 @@ def _memory_for(stored: Any, max_side: int) -> Iterator[None]:
         yield
 
 
-def _bytes_to_read(stored: Any, max_side: int) -> int:
+def bytes_to_read(stored: Any, max_side: int) -> int:
     """Memory that reading a picture takes, reduced to `max_side` where its decoder can."""
     if stored.format not in ("JPEG", "MPO"):
         return _bytes_of(stored.size)

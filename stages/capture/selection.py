@@ -106,7 +106,11 @@ def select(sources: Sources, params: IngestParams, expansion: Expansion | None =
         reason = f"has no pose in {sources.poses.origin.name}"
         skipped += [SkippedImage(path, reason) for path in files if path not in names]
         files = {path: file for path, file in files.items() if path in names}
-    skipped += [SkippedImage(path, LEFT_OUT) for path in files if is_left_out(path, params)]
+    skipped += [
+        SkippedImage(path, LEFT_OUT, sha256=sources.digest(path, file))
+        for path, file in files.items()
+        if is_left_out(path, params)
+    ]
     files = {path: file for path, file in sorted(files.items()) if not is_left_out(path, params)}
 
     of_poses = {path: poses_masks[name] for path, name in names.items() if name in poses_masks}

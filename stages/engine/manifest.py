@@ -117,7 +117,7 @@ class Manifest:
                     data["params"],
                     data["inputs"],
                     data["sources"],
-                    data.get("previous"),  # none up to 0.2
+                    data.get("previous"),
                 ),
                 outputs={path: OutputFile(**file) for path, file in data["outputs"].items()},
                 numbers=data["numbers"],

@@ -56,7 +56,8 @@ def photos_since(workspace: Workspace, folder: Path, now: FileDigests) -> Photos
 def compare_photos(before: FileDigests, now: FileDigests, same_folder: bool) -> PhotosSince:
     """Two states of photos (path -> sha256), and whether they lie in one folder: there, names in common count, too."""
     kept = _same_contents(before, now)
-    added = tuple(path for path in now if path not in set(kept.values()))
+    still_there = set(kept.values())
+    added = tuple(path for path in now if path not in still_there)
     removed = tuple(path for path in before if path not in kept)
     if not added and not removed:
         renamed = any(old != new for old, new in kept.items())

@@ -86,10 +86,18 @@ def stage_status(
     return StageStatus(stage.name, state, tuple(reasons), manifest, known)
 
 
-def previous_to_continue(stage: Stage[Any], workspace: Workspace, config: BaseModel) -> Manifest | None:
-    """The publication that a run of the stage would go on from: whole, and of the same version and settings."""
-    made, damage = _publication(stage, workspace, hashes=True)
-    if not stage.continues or made is None or damage:
+def previous_to_continue(
+    stage: Stage[Any], workspace: Workspace, config: BaseModel, hashes: bool = True
+) -> Manifest | None:
+    """The publication that a run of the stage would go on from: whole, and of the same version and settings.
+
+    Args:
+        hashes: read every output back and compare its hash; sizes are always compared.
+    """
+    if not stage.continues:
+        return None
+    made, damage = _publication(stage, workspace, hashes)
+    if made is None or damage:
         return None
     before = made.identity
     alike = section_with_new_names(stage.name, before.params) == _params(stage, config)

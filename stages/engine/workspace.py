@@ -17,6 +17,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import shlex
 import shutil
 import socket
 from collections.abc import Iterator, Mapping
@@ -190,12 +191,17 @@ class Workspace:
             preset=preset,
             hineus=_hineus_version(),
             created=self.record.created or now(),
-            root=str(self.root),
+            root=self._root_of_sources(sources),
         )
         header = f"# The settings of the last run (preset: {preset or 'none'}). Use them again with --config.\n"
         with storage_errors(self.root, "keeping the settings"):
             _write(self.root / WORKSPACE_RECORD, json.dumps(asdict(self.record), indent=1) + "\n")
             _write(self.config_path, header + yaml.safe_dump(jsonable(config), sort_keys=False))
+
+    def _root_of_sources(self, sources: Mapping[str, Path | None]) -> str:
+        """The root beside which the sources lie, or lay: of those that are not found yet it is the last run's."""
+        unfound = any(path is not None and not path.exists() for path in sources.values())
+        return self.record.root if unfound and self.record.root else str(self.root)
 
     # ------------------------------------------------------------ stages
     def published(self, stage: str) -> Manifest | None:
@@ -363,7 +369,9 @@ def _no_workspace(root: Path) -> WorkspaceError:
     beside = root.with_name(f"{root.name}{WORKSPACE_SUFFIX}")
     if is_workspace(beside):
         return WorkspaceError(f"{root} is no workspace.", f"That of the photos in it is {beside}.")
-    return WorkspaceError(f"There is no workspace at {root}.", f"Make one with `hineus run PHOTOS --workspace {root}`.")
+    return WorkspaceError(
+        f"There is no workspace at {root}.", f"Make one with `hineus run PHOTOS --workspace {shlex.quote(str(root))}`."
+    )
 
 
 def _is_own(path: Path) -> bool:

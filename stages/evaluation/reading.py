@@ -174,7 +174,7 @@ def read_masks(folder: Path, cameras: PinholeCameras) -> Iterator[tuple[int, np.
     Raises:
         InputError: none has one, or one is not of its camera's size.
     """
-    from stages.capture.masks import match_masks, read_mask
+    from stages.capture.masks import load_mask, match_masks
 
     if not folder.is_dir():
         raise InputError(f"There is no folder {folder}.", "`--masks` takes a folder of masks, named like the photos.")
@@ -187,7 +187,7 @@ def read_masks(folder: Path, cameras: PinholeCameras) -> Iterator[tuple[int, np.
     for i, name in enumerate(cameras.names):
         if name in found:
             size = int(cameras.sizes[i][0]), int(cameras.sizes[i][1])
-            yield i, read_mask(found[name], name, size, size, 1)
+            yield i, load_mask(found[name], name, size, size, 1).kept
 
 
 def read_matrix(path: Path) -> np.ndarray:

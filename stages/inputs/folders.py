@@ -153,11 +153,11 @@ def _walk(folder: Path, root: Path, seen: set[tuple[int, int]], top: Path, left:
                 left.append(LeftOut(name, what, missed=True))
             continue
         if stat.S_ISDIR(mode):
-            if (why := _why_not_into(path, root)) is not None:
-                left += [LeftOut(name, why)] if why else []
-                continue
             try:
-                yield from _walk(path, root, seen, top, left)
+                if (why := _why_not_into(path, root)) is None:
+                    yield from _walk(path, root, seen, top, left)
+                elif why:
+                    left.append(LeftOut(name, why))
             except PermissionError:
                 left.append(LeftOut(name, "a folder that may not be read", missed=True))
         elif (reason := _match(UNFINISHED_FILES, path)) is not None:

@@ -210,9 +210,14 @@ class Trainer:
         return self.device.type == "cuda" and scheduled and not self.terms.at_work
 
     def _keep_rates_on_device(self) -> None:
-        """Learning rates that a graph reads anew, where there is one."""
-        if self.replay is not None:
-            for group in self.optimizer.param_groups:
+        """Learning rates that a graph reads anew, where there is one; plain numbers elsewhere.
+
+        A checkpoint may come from another device.
+        """
+        for group in self.optimizer.param_groups:
+            if self.replay is None:
+                group |= {"lr": group["base_lr"], "capturable": False}
+            else:
                 group |= {"lr": torch.tensor(group["base_lr"], device=self.device), "capturable": True}
 
     def _set_rates(self, factor: float) -> None:

@@ -91,7 +91,7 @@ def match_photos(poses: KnownPoses, photos: Iterable[str]) -> dict[str, KnownCam
         photos: relative posix paths.
 
     Raises:
-        InputError: no photo has a camera, or two photos fit one camera equally well.
+        InputError: there are no photos, none has a camera, or two photos fit one camera equally well.
     """
     photos = list(photos)
     by_stem: dict[str, list[str]] = {}
@@ -112,11 +112,15 @@ def match_photos(poses: KnownPoses, photos: Iterable[str]) -> dict[str, KnownCam
     for photo in photos:
         if photo in cameras_of:
             matched[photo] = max(cameras_of[photo], key=lambda scored: scored[0])[1]
+    if not photos:
+        raise InputError(
+            f"There are no photos that the {len(poses.cameras)} poses in {poses.origin} could be of.",
+            f"Name the folder that holds {poses.cameras[0].name} and the others.",
+        )
     if not matched:
-        example = f", photos are called e.g. {photos[0]}" if photos else ""
         raise InputError(
             f"None of the {len(photos)} photos has a pose in {poses.origin}: it names {len(poses.cameras)} images, "
-            f"e.g. {poses.cameras[0].name}{example}.",
+            f"e.g. {poses.cameras[0].name}, photos are called e.g. {photos[0]}.",
             "Name the folder of the photos these poses belong to: `hineus run PHOTOS --poses FILE`.",
         )
     return matched

@@ -74,6 +74,25 @@ def describe_where(scene: PosedScene, place: Place, numbers: Mapping[str, Mappin
     return [*sentences, place.describe()]
 
 
+def describe_history(manifests: Mapping[str, Manifest]) -> list[str]:
+    """A sentence on what was kept of the result before photos came or went; none where nothing was."""
+    sfm, undistort, train = (
+        manifests[name].numbers if name in manifests else {} for name in ("sfm", "undistort", "train")
+    )
+    parts, kept = [], train.get("kept_of_budget")
+    if sfm.get("new") or sfm.get("gone"):
+        moved = sfm.get("moved_percent")
+        by = "" if moved is None else f" (they moved by {moved:.2g} % of the distance to what they see)"
+        parts.append(f"{sfm['known']} photos were known, {sfm['new']} are new, {sfm['gone']} gone")
+        parts.append(f"known poses {'stayed' if sfm.get('poses_stayed') else 'did not stay'}{by}")
+    if "region_kept" in undistort and (parts or kept):
+        parts.append(f"the region {'stayed' if undistort['region_kept'] else 'was found anew'}")
+    if kept:
+        steps = f", {train['steps_in_all']:,} steps in all" if "steps_in_all" in train else ""
+        parts.append(f"training went on with {100 * kept:.0f} % of its budget counted as spent{steps}")
+    return [f"This result goes on from an earlier one: {'; '.join(parts)}."] if parts else []
+
+
 def stage_row(manifest: Manifest) -> dict[str, str]:
     """One line of the stage table."""
     simple = {k: v for k, v in manifest.numbers.items() if isinstance(v, (int, float, str)) and not isinstance(v, bool)}

@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from stages.capture.masks import pair_masks, read_mask
+from stages.capture.masks import load_mask, pair_masks
 from stages.evaluation.photos.regions import WHITE
 from stages.geometry.cameras import PinholeCameras, PosedScene
 from stages.geometry.normalisation import into_frame
@@ -75,7 +75,7 @@ class NovelPhotos:
         pixels, mask = _read(self._views.folder / name, self._views.background == "white")
         if name in self._masks:
             size = pixels.shape[1], pixels.shape[0]
-            mask = np.where(read_mask(self._masks[name], name, size, size, 1), WHITE, 0).astype(np.uint8)
+            mask = np.where(load_mask(self._masks[name], name, size, size, 1).kept, WHITE, 0).astype(np.uint8)
         pixels, mask = pinhole_photo(self._lenses[name], pixels, mask, self._max_side)
         return pixels, None if mask is None else mask > OPAQUE
 
