@@ -9,9 +9,10 @@ from toy_pipeline import TOY
 
 from configs.params import Config
 from stages.engine.fingerprint import SourceDigests
-from stages.engine.photos_since import compare_photos, photos_since
+from stages.engine.photos_since import compare_photos
 from stages.engine.runner import run_pipeline
 from stages.engine.workspace import Workspace
+from stages.whereabouts import photos_since
 
 BEFORE = {"1.jpg": "a", "2.jpg": "b", "3.jpg": "c", "4.jpg": "d"}
 
