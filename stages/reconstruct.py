@@ -18,7 +18,7 @@ from stages import artifacts
 from stages.caches import temporary_files
 from stages.capture.listing import is_video
 from stages.engine.fingerprint import SourceDigests
-from stages.engine.photos_since import READS_PHOTOS, PhotosSince, photos_since
+from stages.engine.photos_since import PhotosSince
 from stages.engine.run_log import log_to_file
 from stages.engine.runner import Listener, StageOutcome, naming_command, run_pipeline, source_option
 from stages.engine.stage import Stage
@@ -30,7 +30,7 @@ from stages.posing.control_files import CONTROL
 from stages.posing.reading import locate_poses, masks_beside
 from stages.preflight import Preflight, in_short, masks_in_words, preflight
 from stages.request import Request
-from stages.whereabouts import default_workspace, find_source, holds_files, refuse_other_photos
+from stages.whereabouts import default_workspace, find_source, holds_files, photos_since, refuse_other_photos
 
 log = logging.getLogger(__name__)
 
@@ -250,7 +250,7 @@ def _photos_since(workspace: Workspace, digests: SourceDigests) -> PhotosSince:
     """What has become of the workspace's photos. Those that are gone are no others."""
     photos = digests.sources["photos"]
     assert photos is not None
-    if not workspace.stage_folder(READS_PHOTOS).exists():
+    if not workspace.stage_folder(artifacts.IMAGE_SET.stage).exists():
         return PhotosSince("new")
     if not holds_files(photos):
         return PhotosSince("same")

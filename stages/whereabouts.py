@@ -9,7 +9,10 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from stages.engine.photos_since import PhotosSince
+from stages.artifacts import IMAGE_SET
+from stages.engine.fingerprint import FileDigests
+from stages.engine.manifest import ManifestDamaged
+from stages.engine.photos_since import PhotosSince, compare_photos
 from stages.engine.workspace import WORKSPACE_SUFFIX, Workspace
 from stages.errors import WorkspaceError
 from stages.inputs.folders import named_files, readable
@@ -86,6 +89,24 @@ def holds_files(path: Path) -> bool:
 
 
 # ---------------------------------------------------------------- other photos
+def photos_since(workspace: Workspace, folder: Path, now: FileDigests) -> PhotosSince:
+    """Compare the photos of now with those that the workspace's publications were made of.
+
+    Args:
+        workspace: with its record; read only.
+        folder: where the photos of now lie (or the video), absolute and without links, as the record has it.
+        now: their contents, see `SourceDigests.files`.
+    """
+    try:
+        made = workspace.published(IMAGE_SET.stage)
+    except ManifestDamaged:
+        made = None
+    before = made.identity.sources.get("photos") if made else None
+    if before is None:
+        return PhotosSince("new", added=tuple(now))
+    return compare_photos(before, now, same_folder=workspace.record.sources.get("photos") == str(folder))
+
+
 def refuse_other_photos(workspace: Workspace, photos: Path, since: PhotosSince) -> None:
     """Raises WorkspaceError where the workspace was made of other photos: its results would be lost."""
     if since.kind != "other":

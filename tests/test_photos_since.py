@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from toy_pipeline import TOY
 
 from configs.params import Config
+from stages.engine import status
 from stages.engine.fingerprint import SourceDigests
-from stages.engine.photos_since import compare_photos, photos_since
+from stages.engine.photos_since import compare_photos
 from stages.engine.runner import run_pipeline
+from stages.engine.status import previous_to_continue
 from stages.engine.workspace import Workspace
+from stages.whereabouts import photos_since
 
 BEFORE = {"1.jpg": "a", "2.jpg": "b", "3.jpg": "c", "4.jpg": "d"}
 
@@ -69,3 +73,19 @@ def test_of_a_workspace(tmp_path: Path) -> None:
     assert since("elsewhere") == "moved"
     (workspace.stage_folder("ingest") / "manifest.json").write_text("{")
     assert since("others") == "new"
+
+
+def test_outputs_are_read_back_of_stages_that_go_on_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "photos" / "1.jpg").write_text("one")
+    workspace = Workspace.open(tmp_path / "ws", create=True)
+    run_pipeline(TOY, workspace, Config(), {"photos": tmp_path / "photos"})
+    read: list[bool] = []
+    monkeypatch.setattr(status, "output_problem", lambda folder, manifest, hashes: read.append(hashes))
+    assert not TOY[1].continues
+    assert previous_to_continue(TOY[1], workspace, Config()) is None
+    assert read == []
+    goes_on = replace(TOY[1], continues=True)
+    assert previous_to_continue(goes_on, workspace, Config()) is not None
+    assert previous_to_continue(goes_on, workspace, Config(), hashes=False) is not None
+    assert read == [True, False]

@@ -1,20 +1,16 @@
-"""Are these the photos that a workspace was made of? Their contents decide, so that a move is no change."""
+"""Are these the photos of before? Their contents decide, so that a move is no change."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Literal
 
 from stages.engine.fingerprint import FileDigests
-from stages.engine.manifest import ManifestDamaged
-from stages.engine.workspace import Workspace
 
 Kind = Literal["new", "same", "moved", "changed", "other"]
 
 SHARED = 0.5  # of the smaller of two sets of photos: with so many in common, one is a later state of the other
-READS_PHOTOS = "ingest"  # the stage whose publication records the photos
 
 
 @dataclass(frozen=True)
@@ -33,24 +29,6 @@ class PhotosSince:
     kept: Mapping[str, str] = field(default_factory=dict)
     added: tuple[str, ...] = ()
     removed: tuple[str, ...] = ()
-
-
-def photos_since(workspace: Workspace, folder: Path, now: FileDigests) -> PhotosSince:
-    """Compare the photos of now with those that the workspace's publications were made of.
-
-    Args:
-        workspace: with its record; read only.
-        folder: where the photos of now lie (or the video), absolute and without links, as the record has it.
-        now: their contents, see `SourceDigests.files`.
-    """
-    try:
-        made = workspace.published(READS_PHOTOS)
-    except ManifestDamaged:
-        made = None
-    before = made.identity.sources.get("photos") if made else None
-    if before is None:
-        return PhotosSince("new", added=tuple(now))
-    return compare_photos(before, now, same_folder=workspace.record.sources.get("photos") == str(folder))
 
 
 def compare_photos(before: FileDigests, now: FileDigests, same_folder: bool) -> PhotosSince:
