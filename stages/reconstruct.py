@@ -80,7 +80,7 @@ def reconstruct(request: Request, pipeline: Sequence[Stage], listener: Listener 
     workspace = Workspace.open(choose_folder(request), create=True)
     digests = SourceDigests({"photos": choose_photos(request, workspace)}, workspace.digest_cache)
     sources = choose_sources(request, workspace, digests)
-    preset, config = choose_config(request, workspace)
+    preset, config = choose_config(request, workspace, digests)
     device = choose_device(request.device)
     with workspace.lock(), log_to_file(workspace.log_path), temporary_files(workspace.root / ".work"):
         digests.save()
@@ -123,7 +123,7 @@ def check_photos(request: Request) -> Preflight:
     except WorkspaceError as error:  # other photos' workspace; the photos are looked at all the same
         refused = [f"{error.message} {error.hint}"]
         sources = choose_sources(replace(request, other_photos=True), workspace, digests)
-    _, config = choose_config(request, workspace)
+    _, config = choose_config(request, workspace, digests)
     known = (digests.files("photos") or {}) if workspace.config_path.exists() else {}
     done = _preflight(sources, workspace.root, config, device, workers, decode=True, digests=known)
     kept = what_is_kept(workspace, config, sources["photos"], sources["masks"], known) if known else ""
@@ -237,13 +237,20 @@ def choose_sources(request: Request, workspace: Workspace, digests: SourceDigest
     masks = request.masks.resolve() if request.masks else None
     poses = locate_poses(request.poses).resolve() if request.poses else None
     control = request.control.resolve() if request.control else None
-    if str(photos) == workspace.record.sources.get("photos") or since.kind not in ("new", "other"):
+    if _are_those_of_the_last_run(workspace, photos, since):
         masks = masks or (None if request.no_masks else find_source(workspace, "masks", photos))
         poses = poses or (None if request.no_poses else find_source(workspace, "poses", photos))
         control = control or (None if request.no_control else find_source(workspace, CONTROL, photos))
     if masks is None and request.poses:
         masks = _masks_of(poses, request.no_masks)
     return {"photos": photos, "masks": masks, "poses": poses, CONTROL: control}
+
+
+def _are_those_of_the_last_run(workspace: Workspace, photos: Path, since: PhotosSince) -> bool:
+    """Whether the photos are of the same scene as those of the last run, so that what was said then holds."""
+    if since.kind == "new":
+        return str(photos) == workspace.record.sources.get("photos")
+    return since.kind != "other"
 
 
 def _photos_since(workspace: Workspace, digests: SourceDigests) -> PhotosSince:
@@ -295,7 +302,7 @@ def _masks_of(poses: Path | None, without: bool) -> Path | None:
     return masks_beside(poses) if poses is not None and not without else None
 
 
-def choose_config(request: Request, workspace: Workspace) -> tuple[str | None, Config]:
+def choose_config(request: Request, workspace: Workspace, digests: SourceDigests) -> tuple[str | None, Config]:
     """The preset's name and the settings.
 
     A workspace goes on with the settings it was last run with, `--set` on top, until a preset or a file is named;
@@ -307,7 +314,7 @@ def choose_config(request: Request, workspace: Workspace) -> tuple[str | None, C
     kept = request.preset is None and request.config is None and workspace.config_path.exists()
     if not kept:
         named = request.preset or default_preset()
-        return named, load_config(named, request.config, [*_of_these_masks(request, workspace), *request.sets])
+        return named, load_config(named, request.config, [*_of_these_masks(request, workspace, digests), *request.sets])
     preset = workspace.record.preset
     log.info("settings: those of the last run (preset %s); name a --preset to start anew", preset or "none")
     try:
@@ -320,10 +327,11 @@ def choose_config(request: Request, workspace: Workspace) -> tuple[str | None, C
         ) from error
 
 
-def _of_these_masks(request: Request, workspace: Workspace) -> list[str]:
+def _of_these_masks(request: Request, workspace: Workspace, digests: SourceDigests) -> list[str]:
     """What the last run said of masks, where only a preset is new: a workspace remembers its masks, too."""
-    recorded = workspace.record.sources.get("photos")
-    same_photos = request.photos is None or str(request.photos.resolve()) == recorded
+    photos = digests.sources["photos"]
+    assert photos is not None
+    same_photos = _are_those_of_the_last_run(workspace, photos, _photos_since(workspace, digests))
     if not same_photos or request.masks or request.no_masks or request.config or not workspace.config_path.exists():
         return []
     try:

@@ -12,6 +12,7 @@ import pytest
 from toy_pipeline import with_stage
 from typer.testing import CliRunner, Result
 
+from configs.load import load_config
 from hineus_cli.app import build_app
 from stages import reconstruct, whereabouts
 from stages.artifacts import SkippedImage
@@ -296,3 +297,19 @@ def test_masks_that_follow_a_moved_workspace_later_are_found(masked: Path) -> No
         (masked / f"away-{name}").rename(masked / "later" / name)
     assert actions(run("-w", "later/ws")) == {"skipped"}
     assert sources(masked / "later/ws")["masks"] == f"{masked}/later/masks"
+
+
+def test_photos_moved_with_a_new_preset_keep_what_black_means(masked: Path) -> None:
+    run("a/images", "-w", "a/ws", "--masks-black-keeps")
+    shutil.copytree(masked / "a/images", masked / "copy")
+    run("copy", "-w", "a/ws", "--preset", "tiny")
+    assert load_config(None, masked / "a/ws/config.yaml").ingest.masks_keep == "black"
+
+
+def test_nothing_of_other_photos_is_taken_over(masked: Path) -> None:
+    shutil.rmtree(masked / "a/images")
+    make_photos(masked / "a/images", "another scene", 5)
+    for path in (masked / "a/images").iterdir():
+        path.rename(path.with_stem(f"new_{path.stem}"))
+    run("a/images", "-w", "a/ws", "--other-photos")
+    assert sources(masked / "a/ws")["masks"] is None
