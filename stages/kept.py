@@ -37,32 +37,21 @@ def what_is_kept(
         forced: stages that run anew in any case.
     """
     try:
-        return _what_is_kept(workspace, config, source, masks, now, forced)
+        made = workspace.published(INGEST.name)
+        before = made.identity.sources.get("photos") if made else None
+        if not before or not now or source is None:  # photos that are nowhere to be found are not removed
+            return ""
+        then, today = _taken(workspace, before), _captures(source, masks, now)
+        if then == today:
+            return _of_a_stopped_run(workspace, config, forced)
+        known, new, gone = then & today, today - then, then - today
+        if not known or not (new or gone):
+            return ""
+        left = {path for path, digest in before.items() if digest in known}
+        kept = _of_poses_and_training(workspace, config, left, len(new), len(gone), forced)
+        return f"{len(known)} photos known, {len(new)} new, {len(gone)} gone: {kept}"
     except (ManifestDamaged, FileNotFoundError):  # a file of the workspace is gone: the stages tell which
         return ""
-
-
-def _what_is_kept(
-    workspace: Workspace,
-    config: Config,
-    source: Path | None,
-    masks: Path | None,
-    now: FileDigests,
-    forced: Collection[str],
-) -> str:
-    made = workspace.published(INGEST.name)
-    before = made.identity.sources.get("photos") if made else None
-    if not before or not now or source is None:  # photos that are nowhere to be found are not removed
-        return ""
-    then, today = _taken(workspace, before), _captures(source, masks, now)
-    if then == today:
-        return _of_a_stopped_run(workspace, config, forced)
-    known, new, gone = then & today, today - then, then - today
-    if not known or not (new or gone):
-        return ""
-    left = {path for path, digest in before.items() if digest in known}
-    kept = _of_poses_and_training(workspace, config, left, len(new), len(gone), forced)
-    return f"{len(known)} photos known, {len(new)} new, {len(gone)} gone: {kept}"
 
 
 def _of_poses_and_training(

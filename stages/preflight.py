@@ -25,7 +25,7 @@ from stages.capture.selection import Sources
 from stages.engine.fingerprint import file_sha256
 from stages.errors import InputError
 from stages.limits import available_memory, nearest_existing
-from stages.posing.control_files import read_control
+from stages.posing.control_files import CONTROL, read_control
 from stages.posing.marks import foresee
 from stages.posing.reading import read_poses
 
@@ -124,27 +124,28 @@ class Preflight:
 
 
 def preflight(
-    source: Path,
-    masks: Path | None,
+    sources: Mapping[str, Path | None],
     folder: Path,
     config: Config,
     device: str,
     workers: int,
     decode: bool,
-    poses: Path | None = None,
-    control: Path | None = None,
     digests: Mapping[str, str] | None = None,
 ) -> Preflight:
     """Look at the photos, and at the memory and the disk of `folder`, where the workspace will lie.
 
     `decode`: whether to judge the photos' pixels, too; before a run that is left to ingest, which decodes them anyway.
-    `poses`, `control`: files or folders of known poses and of ground control points. `digests`: of photos whose sha256
-    is known.
+    `sources`: by name the photos, masks, known poses and control points that are given. `digests`: of photos whose
+    sha256 is known.
 
     Raises:
         InputError: there is no such folder or video, or the poses or control points cannot be used.
         ConfigError, SystemRequirementError: the points' coordinates cannot be converted.
     """
+
+    source, masks = sources["photos"], sources.get("masks")
+    poses, control = sources.get("poses"), sources.get(CONTROL)
+    assert source is not None, "there is nothing to look at"
 
     def digest(path: str, file: Path) -> str:
         return (digests or {}).get(path) or file_sha256(file)

@@ -24,6 +24,7 @@ from stages.engine.runner import Listener, StageOutcome, naming_command, run_pip
 from stages.engine.stage import Stage
 from stages.engine.workspace import Workspace
 from stages.errors import ConfigError, InputError, SystemRequirementError, WorkspaceError
+from stages.inputs.folders import is_workspace
 from stages.kept import what_is_kept
 from stages.limits import available_cores
 from stages.posing.control_files import CONTROL
@@ -88,7 +89,7 @@ def reconstruct(request: Request, pipeline: Sequence[Stage], listener: Listener 
         photos = sources["photos"]
         now = (digests.files("photos") if digests.available("photos") else None) or {}
         if photos is not None and not workspace.stage_folder("ingest").exists():
-            _tell_preflight(_preflight(sources, workspace.root, config, device, workers, decode=False, digests=now))
+            _tell_preflight(preflight(sources, workspace.root, config, device, workers, decode=False, digests=now))
         if kept := what_is_kept(workspace, config, photos, sources["masks"], now, _forced(request, pipeline)):
             log.info("%s", kept)
         log.debug("preset %s, device %s, %d workers, %s", preset, device, workers, sources)
@@ -125,24 +126,9 @@ def check_photos(request: Request) -> Preflight:
         sources = choose_sources(replace(request, other_photos=True), workspace, digests)
     _, config = choose_config(request, workspace, digests)
     known = (digests.files("photos") or {}) if workspace.config_path.exists() else {}
-    done = _preflight(sources, workspace.root, config, device, workers, decode=True, digests=known)
+    done = preflight(sources, workspace.root, config, device, workers, decode=True, digests=known)
     kept = what_is_kept(workspace, config, sources["photos"], sources["masks"], known) if known else ""
     return replace(done, refusals=(*done.refusals, *refused), kept=kept)
-
-
-def _preflight(
-    sources: Mapping[str, Path | None],
-    folder: Path,
-    config: Config,
-    device: str,
-    workers: int,
-    decode: bool,
-    digests: Mapping[str, str],
-) -> Preflight:
-    photos = sources["photos"]
-    assert photos is not None, "there is nothing to look at"
-    given = sources["poses"], sources[CONTROL]
-    return preflight(photos, sources["masks"], folder, config, device, workers, decode, *given, digests=digests)
 
 
 def _tell_preflight(done: Preflight) -> None:
@@ -171,7 +157,7 @@ def choose_folder(request: Request) -> Path:
         return request.workspace
     if request.photos is not None:
         return default_workspace(request.photos).folder
-    if artifacts.is_workspace(Path.cwd()):
+    if is_workspace(Path.cwd()):
         return Path.cwd()
     raise ConfigError(
         "Neither a folder of photos nor a workspace is given.",
@@ -329,10 +315,11 @@ def choose_config(request: Request, workspace: Workspace, digests: SourceDigests
 
 def _of_these_masks(request: Request, workspace: Workspace, digests: SourceDigests) -> list[str]:
     """What the last run said of masks, where only a preset is new: a workspace remembers its masks, too."""
+    if request.masks or request.no_masks or request.config or not workspace.config_path.exists():
+        return []
     photos = digests.sources["photos"]
     assert photos is not None
-    same_photos = _are_those_of_the_last_run(workspace, photos, _photos_since(workspace, digests))
-    if not same_photos or request.masks or request.no_masks or request.config or not workspace.config_path.exists():
+    if not _are_those_of_the_last_run(workspace, photos, _photos_since(workspace, digests)):
         return []
     try:
         before = load_config(None, workspace.config_path).ingest

@@ -142,7 +142,7 @@ def test_what_is_done_to_files_is_said_beforehand(photos: Path):
     picture(51).save(photos / "broken.jpg", icc_profile=b"nothing")
     picture(52).resize((4000, 3000)).save(photos / "large.jpg")
     picture(53).save(photos / "IMG_1.THM", format="JPEG")
-    said = dict(module.facts(preflight(photos, None, photos.parent, load_config("cpu"), "cpu", 2, decode=False)))
+    said = dict(module.facts(preflight({"photos": photos}, photos.parent, load_config("cpu"), "cpu", 2, decode=False)))
     assert said["reduced"] == "1 of 27 to 3200 pixels, by `ingest.max_side`"
     assert said["colours"] == "Adobe RGB (1 photos), converted to sRGB"
     assert said["set aside"] == "IMG_1.THM: the preview of a video"
@@ -206,7 +206,7 @@ def test_needs_grow_with_photos_as_measured():
 
 
 def test_nothing_is_said_of_the_time_on_a_gpu(photos: Path):
-    done = preflight(photos, None, photos.parent, load_config("gpu"), "cuda", 2, decode=False)
+    done = preflight({"photos": photos}, photos.parent, load_config("gpu"), "cuda", 2, decode=False)
     assert done.needs.minutes is None
     assert "not measured" in dict(module.facts(done))["needs"]
 

@@ -40,4 +40,3 @@ from stages.artifacts.sfm import (
 )
 from stages.artifacts.train import CAMERAS, FIELD, HELD_OUT, METRICS, PREVIEWS, SCENE, checkpoint_path, preview_path
 from stages.artifacts.undistort import FIRST_SCENE, PINHOLE_PHOTOS, SILHOUETTES
-from stages.inputs.folders import WORKSPACE_RECORD, is_workspace

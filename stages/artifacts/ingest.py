@@ -30,7 +30,7 @@ class ImageRecord:
         gps: latitude and longitude in degrees (WGS 84) and altitude in metres, where EXIF has all three.
         made_mask: the way of `ingest.auto_mask` in which its mask was made; empty where it came with the photo or
             there is none. What "salient" made is a guess, see `SILHOUETTES`.
-        taken: upright width and height in pixels of the source, which may have been reduced; None in older workspaces.
+        taken: upright width and height in pixels of the source, which may have been reduced; None: as it is.
         frame: views that were taken at once from one place, as those of a 360-degree picture, have the same; empty
             for photos. Their intrinsics are known: no distortion, the principal point in the middle.
         cam_from_frame: [3][3] rotation from what the views of a frame share into this one.

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from stages.artifacts.artifact import Artifact
 from stages.artifacts.json_files import Array, Record, read_record, write_record
-from stages.geometry.place import ControlMark, ControlPoint, GivenRegion, Place
+from stages.geometry.place import ControlPoint, GivenRegion, Place
 from stages.geometry.similarity import Similarity
 
 _PLACE = "place.json"
@@ -24,25 +24,6 @@ class SimilarityRecord(Record):
         return Similarity(self.scale, self.rotation, self.translation)
 
 
-class _MarkRecord(Record):
-    photo: str
-    error_px: float | None
-    used: bool
-
-
-class _ControlRecord(Record):
-    name: str
-    coordinates: tuple[float, float, float]
-    check: bool
-    used: bool
-    miss: tuple[float, float, float] | None
-    left_out_m: float | None
-    marks: tuple[_MarkRecord, ...]
-
-    def point(self) -> ControlPoint:
-        return ControlPoint(**{**dict(self), "marks": tuple(ControlMark(**dict(mark)) for mark in self.marks)})
-
-
 class _PlaceRecord(Record):
     world_from_poses: SimilarityRecord
     metric: bool
@@ -51,7 +32,7 @@ class _PlaceRecord(Record):
     origin: tuple[float, float, float] | None
     gps_residual: float | None
     up: Array | None
-    control: tuple[_ControlRecord, ...] = ()
+    control: tuple[ControlPoint, ...] = ()
     control_residual: float | None = None
     crs: str = ""
     offset: tuple[float, float, float] | None = None
@@ -72,8 +53,7 @@ def _save_place(folder: Path, place: Place) -> None:
 
 def _load_place(folder: Path) -> Place:
     record = read_record(folder / _PLACE, _PlaceRecord)
-    control = tuple(each.point() for each in record.control)
-    return Place(**{**dict(record), "world_from_poses": record.world_from_poses.similarity(), "control": control})
+    return Place(**{**dict(record), "world_from_poses": record.world_from_poses.similarity()})
 
 
 def _save_given_region(folder: Path, region: GivenRegion | None) -> None:

@@ -89,7 +89,7 @@ class Trainer:
         self.replay = Replay(self.device, self.generator) if self._replays() else None
         # What a graph reads anew at each step: the density's scale, the weight of the sightings.
         self._scale, self._sparse_weight = torch.zeros(2, device=self.device).unbind()
-        self._keep_rates_on_device()
+        self._prepare_rates()
 
     def start_from(self, distances: Float[np.ndarray, "g g g"]) -> float:
         """Bring the SDF to distances at the centres of a grid over [-1, 1]^3, before the first step.
@@ -209,7 +209,7 @@ class Trainer:
         scheduled = self.params.density.scale == "scheduled" and self.fields.proposal is None
         return self.device.type == "cuda" and scheduled and not self.terms.at_work
 
-    def _keep_rates_on_device(self) -> None:
+    def _prepare_rates(self) -> None:
         """Learning rates that a graph reads anew, where there is one; plain numbers elsewhere.
 
         A checkpoint may come from another device.
@@ -313,7 +313,7 @@ class Trainer:
     def load_state(self, state: dict[str, Any]) -> None:
         self.fields.load_state_dict(state["fields"])
         self.optimizer.load_state_dict(state["optimizer"])
-        self._keep_rates_on_device()
+        self._prepare_rates()
         self.cache.values.copy_(state["cache"])
         self.cache_step = state["cache_step"]
         self.generator.set_state(state["generator"].cpu())

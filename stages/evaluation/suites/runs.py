@@ -31,6 +31,7 @@ from stages.evaluation.suites.registry import Suite, find_scenes
 from stages.evaluation.suites.scene import SuiteScene, Wanted
 from stages.evaluation.suites.scores import posed_mesh, result_mesh, score_result
 from stages.export_poses import export_poses
+from stages.inputs.folders import WORKSPACE_RECORD, is_workspace
 from stages.posing.exporting import write_colmap
 from stages.reconstruct import Reconstruction, default_preset, reconstruct
 from stages.request import Request
@@ -146,7 +147,7 @@ def _ask(request: BenchRequest, scene: SuiteScene, place: Path, seed: int) -> Re
 
 def _share_poses(first: Path, place: Path) -> None:
     """Start another seed from the poses of the first: only the training is to differ."""
-    if place.exists() or not (first / "workspace.json").exists():
+    if place.exists() or not is_workspace(first):
         return
     partial = place.with_name(f"{place.name}.partial")
     with storage_errors(place, "copying the poses"):
@@ -154,7 +155,7 @@ def _share_poses(first: Path, place: Path) -> None:
         for name in POSED:
             if (first / name).is_dir():
                 shutil.copytree(first / name, partial / name)
-        for name in ("workspace.json", "config.yaml"):
+        for name in (WORKSPACE_RECORD, "config.yaml"):
             shutil.copyfile(first / name, partial / name)
         partial.rename(place)
 
