@@ -83,8 +83,7 @@ def _by_photo(
     points_seen: Sequence[np.ndarray],
     pool: ThreadPoolExecutor,
 ) -> Iterator[list[_Compared]]:
-    """The pairs of each photo in turn. A pair is compared when the first of its photos needs it, and forgotten after the
-    second."""
+    """The pairs of each photo in turn; one is compared when its first photo needs it, and forgotten after the second."""
     of_photo = defaultdict(list)
     for pair in pairs:
         for k in pair:
@@ -96,8 +95,8 @@ def _by_photo(
         plane = rectify(views[left], views[right], np.concatenate([points_seen[left], points_seen[right]]))
         if plane is None:
             return None
-        turned = [warped(greys[k], views[k], plane, k == right) for k in pair]
-        return _Compared(left, right, plane, disparities(*turned, plane))
+        turned = {k: warped(greys[k], views[k], plane, k == right) for k in pair}
+        return _Compared(left, right, plane, disparities(turned[left], turned[right], plane))
 
     for k in range(count):
         new = [pair for pair in of_photo[k] if pair not in known]

@@ -39,7 +39,7 @@ def disparities(
     """Disparity of each pixel of the left photo as OpenCV has it, see `in_pixels`."""
     import cv2
 
-    matcher = cv2.StereoSGBM_create(
+    matcher = cv2.StereoSGBM.create(
         plane.least, plane.count, BLOCK, P1, P2, MAX_CHANGE, 63, UNIQUENESS, SPECKLE, SPECKLE_RANGE,
         cv2.STEREO_SGBM_MODE_SGBM_3WAY,
     )  # fmt: skip

@@ -1,8 +1,8 @@
 """How far depths are to be trusted: the paper's visibility and ambiguity, asked of geometry.
 
 Four neighbours can agree on what is not there: on polished metal they all see the same reflection, at the same depth
-behind the surface. Photos from further aside do not. So the judge of a place is the share of all photos which look at it
-from within 60 degrees that find it too; and a photo is only asked where nothing that is known stands in between.
+behind the surface. Photos from further aside do not. So the judge of a place is the share of all photos which look at
+it from within 60 degrees that find it too; and a photo is only asked where nothing that is known stands in between.
 """
 
 from __future__ import annotations
