@@ -30,10 +30,11 @@ class FieldParams(Section):
         "analytic", description="SDF gradients by differentiation, or central differences one active voxel to each side"
     )
     sphere_radius: float = Field(0.5, gt=0, lt=1, description="the SDF is this sphere before training, scene units")
-    init: Literal["auto", "sphere", "room", "hull"] = Field(
+    init: Literal["auto", "sphere", "room", "hull", "carved"] = Field(
         "auto",
-        description="the SDF before training: that sphere, a room around the cameras, or the visual hull of masks (one "
-        "for each photo); auto: a room where most cameras stand in that sphere, else it",
+        description="the SDF before training: that sphere, a room around the cameras, the visual hull of masks (one "
+        "for each photo), or what the dense points' lines of sight carve; auto: a room where most cameras stand in "
+        "that sphere, else carved, or the sphere where there are no trusted points",
     )
     background: bool = Field(True, description="model what lies outside the region (never where masks exist)")
     background_log2_rows: int = Field(15, ge=8, le=24, description="rows per level of the background's encoding")

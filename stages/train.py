@@ -37,6 +37,7 @@ from stages.engine.stage import Stage, StageContext
 from stages.errors import ConfigError, InputError, ReconstructionError
 from stages.geometry.cameras import PinholeCameras, PosedScene
 from stages.geometry.normalisation import regrown
+from stages.geometry.point_cloud import PointCloud
 from stages.geometry.similarity import Similarity
 
 log = logging.getLogger(__name__)
@@ -158,7 +159,7 @@ class _Training:
         before = _last_scene(context, scene)
         if before is None:
             training = cls(context, scene, _make_trainer(context, scene), looked=not scene.growable)
-            _start_from_shape(training.trainer, scene.cameras)
+            _start_from_shape(training.trainer, scene.cameras, _cloud(context, scene))
             return training
         region = _kept_region(scene, before)
         kept = region.of(scene) if region else scene
@@ -270,9 +271,13 @@ def _make_trainer(context: StageContext[TrainParams], scene: PosedScene) -> Any:
     photos = Photos(scene.cameras, *images, context.device, ~held_out)
     training = (~held_out).numpy()
     sightings = Sightings.from_scene(scene, context.device, training)
-    cloud = context.read(POINT_CLOUD).moved(scene.poses_from_scene.inverse())
-    dense = Sightings.from_cloud(cloud, scene.cameras.centers, context.device, training)
+    dense = Sightings.from_cloud(_cloud(context, scene), scene.cameras.centers, context.device, training)
     return Trainer(photos, sightings, dense, params, context.device)
+
+
+def _cloud(context: StageContext[TrainParams], scene: PosedScene) -> PointCloud:
+    """The dense points in the frame of a scene."""
+    return context.read(POINT_CLOUD).moved(scene.poses_from_scene.inverse())
 
 
 # ---------------------------------------------------------------- a region that grows
@@ -406,9 +411,11 @@ def _load_images(
     return images, masks if masked == len(names) else None
 
 
-def _start_from_shape(trainer: Any, cameras: PinholeCameras) -> None:
-    """Where training is not to start from a sphere: bring the SDF to a room, or to the visual hull of the masks."""
+def _start_from_shape(trainer: Any, cameras: PinholeCameras, cloud: PointCloud) -> None:
+    """Where training is not to start from a sphere: bring the SDF to a room, the visual hull of the masks, or what
+    dense points carve."""
     from stages.geometry.hull import room_distances
+    from stages.stereo.carving import carved_distances
 
     params = trainer.params.field
     inside = np.linalg.norm(cameras.centers, axis=1) < params.sphere_radius
@@ -418,6 +425,9 @@ def _start_from_shape(trainer: Any, cameras: PinholeCameras) -> None:
     elif params.init == "room" or (params.init == "auto" and inside.mean() > 0.5):
         error = trainer.start_from(room_distances())
         log.info("the SDF starts from a room around the cameras, met to %.4f on average", error)
+    elif params.init in ("auto", "carved") and (carved := carved_distances(cloud, cameras.centers)) is not None:
+        error = trainer.start_from(carved)
+        log.info("the SDF starts from what dense points carve, met to %.4f on average", error)
 
 
 def _hull(cameras: PinholeCameras, photos: Any) -> np.ndarray:

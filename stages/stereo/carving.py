@@ -16,13 +16,13 @@ if TYPE_CHECKING:
 MIN_TRUST = 0.5
 # So many cells behind a point are solid; what several lines say of a cell counts no more than so many.
 BEHIND, ENOUGH = 3, 4.0
-# How strongly cells of which no line says anything are the sphere that training starts from elsewhere, beside the
-# cells around them: those within sqrt(1 / PRIOR) cells count.
-PRIOR = 0.05
+# Cells of which no line says anything are, weakly, a ball of this radius: of metal, stereo says next to nothing, but
+# carves what is around it. They follow the cells within sqrt(1 / PRIOR) of them.
+SPHERE, PRIOR = 0.7, 0.1
 
 
 def carved_distances(
-    cloud: PointCloud, centers: Float[np.ndarray, "i 3"], sphere_radius: float, cells: int = DISTANCE_CELLS
+    cloud: PointCloud, centers: Float[np.ndarray, "i 3"], cells: int = DISTANCE_CELLS
 ) -> Float32[np.ndarray, "{cells} {cells} {cells}"] | None:
     """Signed distances at the centres of a grid over [-1, 1]^3, negative inside; axes x, y, z.
 
@@ -41,7 +41,7 @@ def carved_distances(
     trusted = cloud.chosen((cloud.trust >= MIN_TRUST) & (np.linalg.norm(cloud.points, axis=1) < 1))
     votes = np.zeros((2, cells, cells, cells), np.float32)
     depth_kernels.line_votes(trusted.points, trusted.starts, trusted.photos, centers, BEHIND, votes)
-    sphere = np.where(np.linalg.norm(cube(cells), axis=-1) < sphere_radius, -1.0, 1.0)
+    sphere = np.where(np.linalg.norm(cube(cells), axis=-1) < SPHERE, -1.0, 1.0)
     inside = _solved(votes, sphere) < 0
     if not inside.any() or inside.all():
         return None
