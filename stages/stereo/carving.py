@@ -16,6 +16,8 @@ if TYPE_CHECKING:
 
 # Points with less trust than this say nothing of the first shape.
 MIN_TRUST = 0.5
+# No more of them than this are asked, evenly chosen.
+MAX_POINTS = 150_000
 # So many cells behind a point are solid; what several lines say of a cell counts no more than so many.
 BEHIND, ENOUGH = 3, 4.0
 # Cells of which no line says anything are, weakly, a ball of this radius: of metal, stereo says next to nothing, but
@@ -57,6 +59,7 @@ def carved(
     from stages.stereo import depth_kernels
 
     trusted = cloud.chosen((cloud.trust >= MIN_TRUST) & (np.linalg.norm(cloud.points, axis=1) < 1))
+    trusted = trusted.chosen(np.arange(len(trusted)) % max(1, len(trusted) // MAX_POINTS) == 0)
     votes = np.zeros((2, cells, cells, cells), np.float32)
     depth_kernels.line_votes(trusted.points, trusted.starts, trusted.photos, centers, BEHIND, votes)
     ball = np.where(np.linalg.norm(cube(cells), axis=-1) < BALL, -1.0, 1.0)
@@ -108,7 +111,7 @@ def _solved(votes: Float[np.ndarray, "2 g g g"], ball: Float[np.ndarray, "g g g"
         return result.ravel()
 
     operator = LinearOperator((ball.size, ball.size), matvec=apply, dtype=np.float64)
-    solution, _ = cg(operator, (known + PRIOR * ball).ravel(), x0=ball.ravel(), rtol=1e-3, maxiter=200)
+    solution, _ = cg(operator, (known + PRIOR * ball).ravel(), x0=ball.ravel(), rtol=1e-2, maxiter=100)
     result: np.ndarray = solution.reshape(shape)
     return result
 
