@@ -9,27 +9,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from rigs import shell
 
 from stages.files.points import laz_bytes, points_ply_bytes
 from stages.geometry.point_cloud import PointCloud
 
 UTM = (465123.0, 5247811.0, 410.0)
-
-
-def shell(count: int = 400, radius: float = 0.7) -> PointCloud:
-    """Points of a sphere; the k-th is seen by k % 4 + 1 photos and has the trust k / count."""
-    random = np.random.default_rng(0)
-    normals = random.normal(size=(count, 3))
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    seen = np.arange(count) % 4 + 1
-    return PointCloud(
-        radius * normals,
-        normals,
-        random.integers(0, 256, (count, 3)).astype(np.uint8),
-        np.arange(count) / count,
-        np.concatenate([[0], np.cumsum(seen)]),
-        np.concatenate([np.arange(n) for n in seen]),
-    )
 
 
 @pytest.fixture
@@ -71,6 +56,8 @@ def test_laspy_reads_the_laz_in_its_coordinate_system() -> None:
     cloud = shell()
     found = laspy.read(io.BytesIO(laz_bytes(cloud, UTM, "EPSG:32632", "hineus 0.1.0")))
     assert found.header.parse_crs().to_epsg() == 32632
+    assert found.header.global_encoding.wkt
+    assert found.header.vlrs.get("WktCoordinateSystemVlr")[0].string.startswith("PROJCS[")  # not PROJCRS
     assert (str(found.header.version), found.point_format.id) == ("1.4", 7)
     assert found.header.are_points_compressed
     assert found.header.generating_software == "hineus 0.1.0"

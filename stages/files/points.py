@@ -46,7 +46,7 @@ def laz_bytes(cloud: PointCloud, offset: Sequence[float] = (0.0, 0.0, 0.0), crs:
     Args:
         cloud: one point or more.
         offset: added to its coordinates, in float64, it gives those of the file.
-        crs: the coordinate system of these, as "EPSG:32632".
+        crs: the coordinate system of these, projected, as "EPSG:32632".
         program: what wrote it.
 
     Raises:
@@ -70,7 +70,10 @@ def laz_bytes(cloud: PointCloud, offset: Sequence[float] = (0.0, 0.0, 0.0), crs:
     if crs:
         import pyproj
 
-        header.add_crs(pyproj.CRS.from_user_input(crs))
+        # the first form of WKT, as LAS wants it: it also says x east, y north of grids that are defined otherwise
+        wkt = pyproj.CRS.from_user_input(crs).to_wkt("WKT1_GDAL")
+        header.vlrs.append(laspy.vlrs.known.WktCoordinateSystemVlr(wkt))
+        header.global_encoding.wkt = True
     las = laspy.LasData(header)
     las.x, las.y, las.z = (points + offset).T
     las.red, las.green, las.blue = cloud.colors.T.astype(np.uint16) * FULL_RANGE
