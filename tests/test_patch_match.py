@@ -11,7 +11,7 @@ from rigs import capture, look_at
 from stages.artifacts import Pictures, write_png
 from stages.geometry.cameras import PinholeCameras
 from stages.stereo import patch_match
-from stages.stereo.patch_match import patch_match_depths, read_agreeing, read_array, shrunk, write_workspace
+from stages.stereo.patch_match import patch_match_depths, read_agreeing, read_array, reduced_cameras, write_workspace
 
 NORMAL, HEIGHT = np.array([0.3, 0.1, 1.0]) / np.linalg.norm([0.3, 0.1, 1.0]), 0.2
 
@@ -129,7 +129,7 @@ def test_depths_come_back_by_photo(
     import pycolmap
 
     folder, told, asked = tmp_path / "out", [], []
-    reduced = shrunk(cameras, 120)
+    reduced = reduced_cameras(cameras, 120)
 
     def match(workspace: Path, options) -> None:
         asked.append(options)

@@ -19,6 +19,7 @@ from stages.artifacts.pictures import IMAGES, Pictures, write_png
 from stages.compiling import njit
 from stages.geometry.cameras import PinholeCameras
 from stages.posing.colmap_model import pinhole_model
+from stages.stereo.depths import views_of
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Float32, Integer
@@ -81,7 +82,7 @@ def write_workspace(
     """
     import cv2
 
-    reduced = shrunk(cameras, max_side)
+    reduced = reduced_cameras(cameras, max_side)
     width, height = reduced.sizes.max(0).tolist()
     for index, name in enumerate(cameras.names):
         size = tuple(reduced.sizes[index].tolist())
@@ -126,12 +127,10 @@ def sparse_model(
     return model
 
 
-def shrunk(cameras: PinholeCameras, max_side: int) -> PinholeCameras:
+def reduced_cameras(cameras: PinholeCameras, max_side: int) -> PinholeCameras:
     """The cameras of photos that were reduced to at most `max_side` pixels along a side."""
-    scales = np.minimum(1.0, max_side / cameras.sizes.max(1, keepdims=True))
-    sizes = np.maximum(1, np.round(scales * cameras.sizes)).astype(np.int64)
-    intrinsics = cameras.intrinsics.copy()
-    intrinsics[:, :2] *= (sizes / cameras.sizes)[:, :, None]
+    views = views_of(cameras, max_side)
+    sizes, intrinsics = np.array([view.size for view in views]), np.stack([view.matrix for view in views])
     return replace(cameras, sizes=sizes, intrinsics=intrinsics)
 
 
