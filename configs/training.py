@@ -30,10 +30,11 @@ class FieldParams(Section):
         "analytic", description="SDF gradients by differentiation, or central differences one active voxel to each side"
     )
     sphere_radius: float = Field(0.5, gt=0, lt=1, description="the SDF is this sphere before training, scene units")
-    init: Literal["auto", "sphere", "room", "hull"] = Field(
+    init: Literal["auto", "sphere", "room", "hull", "carved"] = Field(
         "auto",
-        description="the SDF before training: that sphere, a room around the cameras, or the visual hull of masks (one "
-        "for each photo); auto: a room where most cameras stand in that sphere, else it",
+        description="the SDF before training: that sphere, a room around the cameras, the visual hull of masks (one "
+        "for each photo), or what the dense points' lines of sight carve; auto: a room where most cameras stand in "
+        "that sphere, else carved, or the sphere where there are no trusted points",
     )
     background: bool = Field(True, description="model what lies outside the region (never where masks exist)")
     background_log2_rows: int = Field(15, ge=8, le=24, description="rows per level of the background's encoding")
@@ -97,6 +98,16 @@ class LossParams(Section):
         0.01, ge=0, description="the SDF must have changed sign this far before and behind SfM points, scene units"
     )
     sparse_batch: int = Field(256, ge=0, description="sightings of SfM points per step")
+    dense: float = Field(3.0, ge=0, description="weight of the dense stereo points' terms, times each point's trust")
+    dense_end: float = Field(
+        1.0, gt=0, le=1, description="part of that weight which is left at the end, falling evenly on a log scale"
+    )
+    dense_tolerance: float = Field(0.003, gt=0, description="dense points off by this count linearly, scene units")
+    dense_step: float = Field(
+        0.01, ge=0, description="the SDF must have changed sign this far before and behind dense points, scene units"
+    )
+    dense_batch: int = Field(512, ge=0, description="sightings of dense points per step")
+    normals: float = Field(0.03, ge=0, description="weight of the dense points' normals, times each point's trust")
 
 
 class AmbiguityParams(Section):

@@ -20,12 +20,24 @@ import numpy as np
 
 from configs.training import TrainParams
 from stages import artifacts
-from stages.artifacts import CAMERAS, FIELD, FIRST_SCENE, HELD_OUT, METRICS, PINHOLE_PHOTOS, PREVIEWS, SCENE, Pictures
+from stages.artifacts import (
+    CAMERAS,
+    FIELD,
+    FIRST_SCENE,
+    HELD_OUT,
+    METRICS,
+    PINHOLE_PHOTOS,
+    POINT_CLOUD,
+    PREVIEWS,
+    SCENE,
+    Pictures,
+)
 from stages.engine.manifest import load_manifest
 from stages.engine.stage import Stage, StageContext
 from stages.errors import ConfigError, InputError, ReconstructionError
 from stages.geometry.cameras import PinholeCameras, PosedScene
 from stages.geometry.normalisation import regrown
+from stages.geometry.point_cloud import PointCloud
 from stages.geometry.similarity import Similarity
 
 log = logging.getLogger(__name__)
@@ -82,7 +94,8 @@ def run(context: StageContext[TrainParams]) -> dict[str, Any]:
         "train_seconds": round(seconds, 1),
         "rays_per_second": round(training.steps_done * params.sampling.rays / max(seconds, 1e-9)),
         "photos": len(trainer.photos),
-        "sightings": len(trainer.sightings.weights),
+        "sightings": len(trainer.sightings),
+        "dense_sightings": len(trainer.dense),
         "region_grown": round(training.region.radius if training.region else 1.0, 3),
         **summary,
     }
@@ -146,7 +159,7 @@ class _Training:
         before = _last_scene(context, scene)
         if before is None:
             training = cls(context, scene, _make_trainer(context, scene), looked=not scene.growable)
-            _start_from_shape(training.trainer, scene.cameras)
+            _start_from_shape(training.trainer, scene.cameras, _cloud(context, scene))
             return training
         region = _kept_region(scene, before)
         kept = region.of(scene) if region else scene
@@ -256,8 +269,15 @@ def _make_trainer(context: StageContext[TrainParams], scene: PosedScene) -> Any:
     _check_hold_out(len(held_out), int(held_out.sum()), params.hold_out)
     images = _load_images(context.read(PINHOLE_PHOTOS), scene.cameras.names)
     photos = Photos(scene.cameras, *images, context.device, ~held_out)
-    sightings = Sightings.from_scene(scene, context.device, (~held_out).numpy())
-    return Trainer(photos, sightings, params, context.device)
+    training = (~held_out).numpy()
+    sightings = Sightings.from_scene(scene, context.device, training)
+    dense = Sightings.from_cloud(_cloud(context, scene), scene.cameras.centers, context.device, training)
+    return Trainer(photos, sightings, dense, params, context.device)
+
+
+def _cloud(context: StageContext[TrainParams], scene: PosedScene) -> PointCloud:
+    """The dense points in the frame of a scene."""
+    return context.read(POINT_CLOUD).moved(scene.poses_from_scene.inverse())
 
 
 # ---------------------------------------------------------------- a region that grows
@@ -391,9 +411,11 @@ def _load_images(
     return images, masks if masked == len(names) else None
 
 
-def _start_from_shape(trainer: Any, cameras: PinholeCameras) -> None:
-    """Where training is not to start from a sphere: bring the SDF to a room, or to the visual hull of the masks."""
+def _start_from_shape(trainer: Any, cameras: PinholeCameras, cloud: PointCloud) -> None:
+    """Where training is not to start from a sphere: bring the SDF to a room, the visual hull of the masks, or what
+    dense points carve."""
     from stages.geometry.hull import room_distances
+    from stages.stereo.carving import carved_distances
 
     params = trainer.params.field
     inside = np.linalg.norm(cameras.centers, axis=1) < params.sphere_radius
@@ -403,6 +425,9 @@ def _start_from_shape(trainer: Any, cameras: PinholeCameras) -> None:
     elif params.init == "room" or (params.init == "auto" and inside.mean() > 0.5):
         error = trainer.start_from(room_distances())
         log.info("the SDF starts from a room around the cameras, met to %.4f on average", error)
+    elif params.init in ("auto", "carved") and (carved := carved_distances(cloud, cameras.centers)) is not None:
+        error = trainer.start_from(carved)
+        log.info("the SDF starts from what dense points carve, met to %.4f on average", error)
 
 
 def _hull(cameras: PinholeCameras, photos: Any) -> np.ndarray:
@@ -503,7 +528,7 @@ TRAIN: Stage[TrainParams] = Stage(
     version=6,
     settings=lambda config: config.train,
     run=run,
-    reads=(FIRST_SCENE, PINHOLE_PHOTOS),
+    reads=(FIRST_SCENE, PINHOLE_PHOTOS, POINT_CLOUD),
     writes=(FIELD, CAMERAS, SCENE, METRICS, PREVIEWS, HELD_OUT),
     continues=True,
     summary="learn a signed distance field and its colours from the posed images",

@@ -11,8 +11,9 @@ import numpy as np
 
 from stages.artifacts import ImageRecord
 from stages.errors import InputError
+from stages.posing.features import extract
 from stages.posing.known import MAX_STRETCH, KnownCamera
-from stages.posing.settings import feature_options, mapping_options, match_options
+from stages.posing.settings import mapping_options, match_options
 
 log = logging.getLogger(__name__)
 
@@ -73,7 +74,7 @@ def triangulate(
     database_path = work / DATABASE
     model = _posed_model(database_path, images_folder, cameras)
     progress(0.02, 1, "features")
-    pycolmap.extract_features(database_path, images_folder, **feature_options(params, workers, cuda))
+    extract(database_path, images_folder, params, workers, cuda)
     progress(PART_FEATURES, 1, "matches")
     matcher = _match(database_path, model, params, threads, cuda)
     progress(PART_MATCHES, 1, "points")

@@ -25,13 +25,13 @@ from stages.errors import InputError
 from stages.extras import package_file
 from stages.posing.adding import KnownPhotos, copy_features, known_model, renamed_model
 from stages.posing.evidence import MIN_PNP, MIN_VERIFIED
+from stages.posing.features import extract
 from stages.posing.joining import join_models
 from stages.posing.ladder import Rung, Solution, better
 from stages.posing.rigs import write_rigs
 from stages.posing.settings import (
     STATIONARY_PX,
     expect_corners,
-    feature_options,
     mapping_options,
     match_options,
     verification_options,
@@ -429,17 +429,8 @@ class Workbench:
 
     def _extract(self, base: Base) -> None:
         """Features; finding them is deterministic with any number of threads."""
-        import pycolmap
-
-        reader = pycolmap.ImageReaderOptions()
-        if base.masked:
-            reader.mask_path = str(self.masks_folder)
-        pycolmap.extract_features(
-            self.database(base),
-            self.images_folder,
-            reader_options=reader,
-            **feature_options(self.params, self.workers, self.cuda, base.affine),
-        )
+        masks = self.masks_folder if base.masked else None
+        extract(self.database(base), self.images_folder, self.params, self.workers, self.cuda, base.affine, masks)
 
     def _matching(self) -> dict[str, Any]:
         options = match_options(self.params, self.threads, self.cuda, self._guided, self.verified, self._stationary)

@@ -83,7 +83,7 @@ def _by_photo(
     points_seen: Sequence[np.ndarray],
     pool: ThreadPoolExecutor,
 ) -> Iterator[list[_Compared]]:
-    """The pairs of each photo in turn; one is compared when its first photo needs it, and forgotten after the second."""
+    """The pairs of each photo in turn; one is compared when its first photo needs it, forgotten after the second."""
     of_photo = defaultdict(list)
     for pair in pairs:
         for k in pair:
