@@ -58,6 +58,12 @@ class SamplingParams(Section):
 
     rays: int = Field(512, ge=1, description="rays per step")
     samples: int = Field(16, ge=2, description="samples per ray inside the region of interest")
+    samples_end: int = Field(
+        8, ge=2, description="samples per ray once the density is sharp, fewer and fewer from 0.3 of the budget on"
+    )
+    needed_share: float = Field(
+        0.7, ge=0, le=1, description="part of the rays that goes where the surface is, and where colours are met worse"
+    )
     free_points: int = Field(256, ge=0, description="points per step anywhere in the region, for the Eikonal term")
     background_samples: int = Field(16, ge=1, description="samples per ray outside the region")
     sampler: Literal["grid", "proposal"] = Field(
@@ -76,6 +82,12 @@ class ScheduleParams(Section):
 
     start_levels: int = Field(4, ge=1, description="levels of the encoding in use at the start")
     coarse_until: float = Field(0.4, ge=0, le=1, description="progress at which all levels are in use")
+    deferred_from: float | None = Field(
+        0.3,
+        ge=0,
+        le=1,
+        description="progress from which a ray has one colour, at its mean point, not one for each sample; null: never",
+    )
     lr_table: float = Field(1e-2, gt=0, description="peak learning rate of the hash tables")
     lr_network: float = Field(3e-3, gt=0, description="peak learning rate of the networks")
     lr_warm_up: float = Field(0.02, ge=0, lt=1, description="progress at which the peak rate is reached")

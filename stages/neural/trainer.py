@@ -14,6 +14,7 @@ from stages.neural import losses, schedules
 from stages.neural.acceleration import is_mixed, points_at_a_time, short_products
 from stages.neural.encoding_shapes import Frequencies, HashGrid
 from stages.neural.fields import Fields, FieldShape
+from stages.neural.needed_rays import NeededRays
 from stages.neural.proposal import interlevel_loss, sample_edges, updates_now
 from stages.neural.rendered import Rendered
 from stages.neural.renderer import Renderer
@@ -30,6 +31,8 @@ if TYPE_CHECKING:
 
 # The regression to a hull before training: long enough for an error of about a cell of its grid.
 HULL_STEPS, HULL_POINTS = 200, 2048
+# Rays go where they are needed once there is a shape that says where; that is asked at each so many refreshes.
+NEEDED_FROM, LOOK_EVERY = 0.1, 2
 
 
 def field_shape(params: TrainParams, num_images: int, background: bool) -> FieldShape:
@@ -81,6 +84,7 @@ class Trainer:
             fused=True,
         )
         self.cache = SdfCache(params.sampling.cache_resolution, device)
+        self.needed = NeededRays(photos, params.sampling.needed_share)
         self.generator = torch.Generator(device=device).manual_seed(params.seed)
         self.terms = Terms(self.fields, self.cache, params, photos, self.generator)
         self.renderer = Renderer(self.fields, self.cache, params, self.terms)
@@ -137,14 +141,15 @@ class Trainer:
             self._scale.fill_(moment.scale)
             self._sparse_weight.fill_(sparse_weight)
             current = replace(moment, scale=self._scale)
-            numbers = self.replay(lambda: self._update(current, self._sparse_weight), moment.levels)
+            kind = moment.levels, moment.samples, moment.deferred
+            numbers = self.replay(lambda: self._update(current, self._sparse_weight), kind)
         self.step_index += 1
         return numbers
 
     def _update(self, moment: Moment, sparse_weight: Tensor | float) -> dict[str, Tensor]:
         """Rays, losses, gradients, and the optimiser's step."""
         sampling, weights = self.params.sampling, self.params.losses
-        batch = self.photos.draw(sampling.rays, self.generator)
+        batch, cells = self.needed.draw(sampling.rays, self.generator)
         places, sparse_weights = self.sightings.draw(weights.sparse_batch, weights.sparse_step, self.generator)
         anywhere = torch.rand(sampling.free_points, 3, generator=self.generator, device=self.device) * 2 - 1
         rendered = self.renderer.render(batch, moment, torch.cat([places, anywhere]), self.generator)
@@ -156,6 +161,7 @@ class Trainer:
         if batch.masks is not None:  # outside the masks nothing is known of the colour
             ray_error = ray_error * batch.masks
             mask_loss = losses.mask_error(rendered.opacity, batch.masks).mean()
+        self.needed.learn(cells, ray_error)
         trust = self.terms.color_weight(rendered, exposed, moment)
         rgb_loss = (ray_error * trust).mean()
         omega = self.terms.eikonal_weight(rendered, ray_error, trust, moment)
@@ -202,7 +208,7 @@ class Trainer:
             }
 
     def _replays(self) -> bool:
-        """Whether steps can be a CUDA graph: nothing but levels changes in how they go.
+        """Whether steps can be a CUDA graph: few things change in how they go, each a few times.
 
         The paper's terms look at the progress and may wait for the device; a proposal network is not trained in each.
         """
@@ -258,6 +264,8 @@ class Trainer:
         band = None if full else 4 * self.cache.cell
         self.cache.refresh(lambda p: self.fields.sdf.sdf(p, moment.levels), band)
         self.cache_step = self.step_index
+        if self.needed.share and moment.progress >= NEEDED_FROM and refreshes % LOOK_EVERY == 0:
+            self.needed.look(self.cache)
 
     # ------------------------------------------------------------------ the shape so far
     @torch.no_grad()
@@ -306,6 +314,7 @@ class Trainer:
             "optimizer": self.optimizer.state_dict(),
             "cache": self.cache.values,
             "cache_step": self.cache_step,
+            "needed": self.needed.state(),
             "generator": self.generator.get_state(),
             "step_index": self.step_index,
         }
@@ -316,5 +325,6 @@ class Trainer:
         self._prepare_rates()
         self.cache.values.copy_(state["cache"])
         self.cache_step = state["cache_step"]
+        self.needed.load_state(state["needed"])
         self.generator.set_state(state["generator"].cpu())
         self.step_index = state["step_index"]
