@@ -54,10 +54,12 @@ class IngestParams(Section):
 class SfmParams(Section):
     """Images to camera poses (COLMAP)."""
 
-    matcher: Literal["auto", "exhaustive", "sequential", "spatial"] = Field(
-        "auto", description="which image pairs are matched; auto: exhaustive up to `exhaustive_max` photos"
+    matcher: Literal["auto", "preemptive", "exhaustive", "sequential", "spatial"] = Field(
+        "auto",
+        description="which image pairs are matched; preemptive: those of which large features match; auto: so up to "
+        "`exhaustive_max` photos",
     )
-    exhaustive_max: int = Field(150, ge=2, description="auto matches all pairs up to this many photos")
+    exhaustive_max: int = Field(150, ge=2, description="auto looks at all pairs up to this many photos")
     mapper: Literal["incremental", "global"] = Field("incremental", description="how poses are solved")
     wanted: float = Field(
         0.95,
