@@ -175,7 +175,16 @@ class TermParams(Section):
 class TrainParams(Section):
     """Posed images to a neural signed distance field."""
 
-    steps: int = Field(8000, ge=1, description="optimiser steps (ignored where `minutes` is set)")
+    steps: int = Field(
+        8000, ge=1, description="optimiser steps where stereo explains nothing (ignored where `minutes` is set)"
+    )
+    steps_if_explained: float = Field(
+        0.2,
+        gt=0,
+        le=1,
+        description="part of `steps` that is enough where trusted dense points cover all of the surface; in between by "
+        "the share that they cover",
+    )
     minutes: float | None = Field(None, gt=0, description="wall-clock budget in minutes instead of steps")
     seed: int = Field(0, ge=0, description="random seed")
     hold_out: int = Field(
