@@ -540,7 +540,7 @@ def _last_numbers(metrics: Path) -> dict[str, float]:
 
 TRAIN: Stage[TrainParams] = Stage(
     name="train",
-    version=6,
+    version=7,
     settings=lambda config: config.train,
     run=run,
     reads=(FIRST_SCENE, PINHOLE_PHOTOS, POINT_CLOUD),

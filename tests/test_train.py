@@ -481,7 +481,7 @@ def test_the_hull_of_a_ball_is_a_little_more_than_the_ball():
 def test_training_can_start_from_the_hull():
     trainer = make_trainer(changed(TINY, {"field.sphere_radius": 0.8, "field.init": "hull"}), masks=True)
     cameras = ring_of_cameras()
-    train._start_from_shape(trainer, cameras, PointCloud.empty())
+    train._start_from_shape(trainer, cameras, None)
     levels = trainer.moment(0.0).levels
     points = torch.nn.functional.normalize(torch.randn(300, 3, generator=torch.Generator().manual_seed(0)), dim=1)
     with torch.no_grad():
@@ -499,7 +499,7 @@ def test_cameras_inside_the_sphere_start_in_a_free_room(distance, room):
     pose = cameras.extrinsics.copy()
     pose[:, :, 3] *= distance / np.linalg.norm(cameras.centers, axis=1)[:, None]
     trainer = make_trainer()
-    train._start_from_shape(trainer, replace(cameras, extrinsics=pose), PointCloud.empty())
+    train._start_from_shape(trainer, replace(cameras, extrinsics=pose), None)
     middle = torch.nn.functional.normalize(torch.randn(100, 3, generator=torch.Generator().manual_seed(0)), dim=1)
     with torch.no_grad():
         levels = trainer.moment(0.0).levels

@@ -59,12 +59,14 @@ def carved(
     from stages.stereo import depth_kernels
 
     trusted = cloud.chosen((cloud.trust >= MIN_TRUST) & (np.linalg.norm(cloud.points, axis=1) < 1))
+    if not len(trusted):
+        return None
     trusted = trusted.chosen(np.arange(len(trusted)) % max(1, len(trusted) // MAX_POINTS) == 0)
     votes = np.zeros((2, cells, cells, cells), np.float32)
     depth_kernels.line_votes(trusted.points, trusted.starts, trusted.photos, centers, BEHIND, votes)
     ball = np.where(np.linalg.norm(cube(cells), axis=-1) < BALL, -1.0, 1.0)
     inside = _solved(votes, ball) < 0
-    if not len(trusted) or not inside.any() or inside.all():
+    if not inside.any() or inside.all():
         return None
     return Carved(distances_to(inside), _explained(inside, votes[0] > 0, trusted, ground))
 
