@@ -139,7 +139,7 @@ class Plan:
     @property
     def sets(self) -> list[str]:
         """All that is set on top of the preset."""
-        # A budget of minutes would overrule that of steps, dense points would shorten it; a preview at the end is enough.
+        # Minutes would overrule a budget of steps, dense points would shorten it; a preview at the end is enough.
         budget = [
             "train.minutes=null", f"train.steps={self.steps}", "train.steps_if_explained=1", "train.preview_every=1",
         ]  # fmt: skip
