@@ -32,13 +32,15 @@ def carved_distances(
         cloud, centers: in the scene frame; centres of the photos that saw the points.
 
     Returns:
-        None where nothing is solid, or all is.
+        None where there are no trusted points.
     """
     from scipy.ndimage import distance_transform_edt
 
     from stages.stereo import depth_kernels
 
     trusted = cloud.chosen((cloud.trust >= MIN_TRUST) & (np.linalg.norm(cloud.points, axis=1) < 1))
+    if not len(trusted):
+        return None
     votes = np.zeros((2, cells, cells, cells), np.float32)
     depth_kernels.line_votes(trusted.points, trusted.starts, trusted.photos, centers, BEHIND, votes)
     sphere = np.where(np.linalg.norm(cube(cells), axis=-1) < SPHERE, -1.0, 1.0)
