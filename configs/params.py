@@ -170,6 +170,12 @@ class DensifyParams(Section):
     neighbors: int = Field(4, ge=1, le=20, description="photos that each photo is compared with")
 
 
+class HeldOutDensifyParams(DensifyParams):
+    """With `train.hold_out`, as it reaches the stage: photos held out from training make no dense points either."""
+
+    hold_out: int = 0
+
+
 class ExtractParams(Section):
     """Neural field to mesh."""
 
