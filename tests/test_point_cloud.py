@@ -15,7 +15,7 @@ from stages.neural.sightings import Sightings
 from stages.stereo import depth_kernels
 from stages.stereo.carving import carved_distances
 from stages.stereo.depths import views_of
-from stages.stereo.fusion import fused
+from stages.stereo.fusion import _cells, fused
 
 
 def cloud_of(points: np.ndarray, lists: list[list[int]], trust: np.ndarray | float = 1.0) -> PointCloud:
@@ -46,7 +46,7 @@ def test_depths_of_one_place_become_one_point_seen_by_their_photos():
     cams = ring(1)
     view = views_of(cams, 1000)[0]
     true = draw(cams).depths[0].astype(np.float32)
-    trusts = [np.full(true.shape, t, np.float32) for t in (0.9, 0.3, 0.6)]
+    trusts = [np.float32(t) * (true > 0) for t in (0.9, 0.3, 0.6)]
     colors = [np.full((*true.shape, 3), c, np.uint8) for c in (100, 200, 0)]
     cloud = fused([view] * 3, [true] * 3, trusts, colors)
     np.testing.assert_array_equal(np.diff(cloud.starts), 3)
@@ -68,13 +68,21 @@ def test_a_close_up_keeps_its_detail():
     near, far = ring(1, focal=760.0), ring(1)
     views = [views_of(near, 1000)[0], views_of(far, 1000)[0]]
     depths = [draw(cams).depths[0].astype(np.float32) for cams in (near, far)]
-    trusts = [np.ones_like(depth) for depth in depths]
+    trusts = [(depth > 0).astype(np.float32) for depth in depths]
     colors = [np.zeros((120, 160, 3), np.uint8)] * 2
     both = fused(views, depths, trusts, colors)
     alone = [fused(views[k : k + 1], depths[k : k + 1], trusts[:1], colors[:1]) for k in range(2)]
     assert len(both) == len(alone[0]) + len(alone[1])  # two octaves apart, no cell is shared
     by_photo = np.bincount(both.photos)
     np.testing.assert_array_equal(by_photo, [len(each) for each in alone])
+
+
+def test_no_two_cells_have_one_number():
+    axis = np.arange(-20, 20) + 0.5
+    points = np.stack(np.meshgrid(axis, axis, axis), -1).reshape(-1, 3)
+    keys = [_cells(points * size, np.full(len(points), size)) for size in (0.5, 1.0, 2.0)]
+    assert len(np.unique(keys)) == 3 * len(points)
+    np.testing.assert_array_equal(_cells(points + 0.4, np.full(len(points), 1.0)), keys[1])
 
 
 def test_no_trust_gives_no_points():

@@ -53,6 +53,7 @@ def _cells(points: Float[np.ndarray, "n 3"], widths: Float[np.ndarray, " n"]) ->
     key = np.zeros(len(points), np.uint64)
     for factor, column in zip(_FACTORS, columns, strict=True):
         key = (key ^ column.astype(np.uint64)) * np.uint64(factor)
+        key ^= key >> np.uint64(32)  # products alone give places mirrored at zero one number
     return key
 
 
