@@ -7,6 +7,7 @@ either: what it is measured by must not have shaped what it starts from.
 from __future__ import annotations
 
 import logging
+import shutil
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -16,6 +17,7 @@ import numpy as np
 from configs.params import HeldOutDensifyParams
 from stages.artifacts import DEPTH_MAPS, FIRST_SCENE, PINHOLE_PHOTOS, POINT_CLOUD, Pictures
 from stages.engine.stage import Stage, StageContext
+from stages.errors import SystemRequirementError
 from stages.geometry.cameras import PosedScene
 from stages.geometry.point_cloud import PointCloud
 from stages.stereo.rectification import View
@@ -41,7 +43,7 @@ def run(context: StageContext[HeldOutDensifyParams]) -> dict[str, Any]:
     pairs = pairs_of(views, scene.points, scene.observations, context.params.neighbors)
     pictures = context.read(PINHOLE_PHOTOS)
     colors = [_at_size(pictures, name, view) for name, view in zip(scene.cameras.names, views, strict=True)]
-    depths, trusts = _compare(context, scene, views, pairs, colors)
+    depths, trusts = _judged(context, scene, views, pairs, colors)
     numbers = _publish(context, scene, used, views, depths, trusts, colors)
     if not numbers["points"]:
         _say_why(len(views), len(pairs), numbers["depth_maps"])
@@ -85,7 +87,7 @@ def _at_size(pictures: Pictures, name: str, view: View) -> np.ndarray:
     return photo if same else cv2.resize(photo, view.size, interpolation=cv2.INTER_AREA)
 
 
-def _compare(
+def _judged(
     context: StageContext[HeldOutDensifyParams],
     scene: PosedScene,
     views: Sequence[View],
@@ -96,22 +98,61 @@ def _compare(
     import cv2
     import numba
 
-    from stages.stereo.depths import depth_maps
     from stages.stereo.trust import trust_of
 
-    seen = [scene.points[scene.observations[scene.observations[:, 0] == k, 1]] for k in range(len(views))]
-    greys = [cv2.cvtColor(photo, cv2.COLOR_RGB2GRAY) for photo in colors]
     threads, compiled_threads = cv2.getNumThreads(), numba.get_num_threads()
     cv2.setNumThreads(1)  # the pool is the parallelism
     numba.set_num_threads(min(context.workers, numba.config.NUMBA_NUM_THREADS))
     try:
-        depths = depth_maps(views, greys, pairs, seen, context.workers, lambda k: context.progress(k, len(views) + 1))
+        if context.params.method == "patch_match":
+            depths = _by_patch_match(context, scene, views)
+        else:
+            depths = _by_semi_global_matching(context, scene, views, pairs, colors)
         for name, depth in zip(scene.cameras.names, depths, strict=True):
             _cut(depth, context.read(PINHOLE_PHOTOS).mask(name))
         return depths, trust_of(views, depths)
     finally:
         cv2.setNumThreads(threads)
         numba.set_num_threads(compiled_threads)
+
+
+def _by_semi_global_matching(
+    context: StageContext[HeldOutDensifyParams],
+    scene: PosedScene,
+    views: Sequence[View],
+    pairs: Sequence[tuple[int, int]],
+    colors: Sequence[np.ndarray],
+) -> list[np.ndarray]:
+    import cv2
+
+    from stages.stereo.depths import depth_maps
+
+    seen = [scene.points[scene.observations[scene.observations[:, 0] == k, 1]] for k in range(len(views))]
+    greys = [cv2.cvtColor(photo, cv2.COLOR_RGB2GRAY) for photo in colors]
+    return depth_maps(views, greys, pairs, seen, context.workers, lambda k: context.progress(k, len(views) + 1))
+
+
+def _by_patch_match(
+    context: StageContext[HeldOutDensifyParams], scene: PosedScene, views: Sequence[View]
+) -> list[np.ndarray]:
+    """Raises SystemRequirementError where pycolmap was built without CUDA."""
+    import pycolmap
+
+    from stages.stereo.patch_match import patch_match_depths
+
+    if not pycolmap.has_cuda:
+        raise SystemRequirementError(
+            "`densify.method` = patch_match needs a pycolmap that was built with CUDA; this one was not.",
+            "Try `--set densify.method=auto`, or `pip install pycolmap-cuda12`.",
+        )
+    depths = [np.zeros(view.size[::-1], np.float32) for view in views]
+    folder = context.scratch / "patch_match"
+    shutil.rmtree(folder, ignore_errors=True)
+    pictures = context.read(PINHOLE_PHOTOS)
+    for k, depth, _ in patch_match_depths(scene, pictures, folder, context.params.side, context.progress):
+        depths[k] = depth
+    shutil.rmtree(folder)
+    return depths
 
 
 def _cut(depth: np.ndarray, mask: np.ndarray | None) -> None:

@@ -42,7 +42,7 @@ def run(context: StageContext[ExtractParams]) -> dict[str, Any]:
         raise ReconstructionError(
             f"The field has no surface inside the region of interest: 0 faces at {resolution}^3 "
             f"(distance at the centre {centre:+.3f}).",
-            "Training ended too early or the region is wrong: try `--set train.steps=6000`, or "
+            "Training ended too early or the region is wrong: try `--set train.steps=20000`, or "
             "`--set undistort.roi_scale=1.5`.",
         )
     context.write(RAW_MESH, (surface.vertices, surface.faces))

@@ -32,11 +32,7 @@ def densify(
     numbers = DENSIFY.run(
         StageContext({"undistort": folder}, {}, out, root, settings, workers=workers, reads=DENSIFY.reads)
     )
-    cloud = artifacts.POINT_CLOUD.load(out).moved(POSES_FROM_SCENE.inverse())
-        f.write(
-            f"{root} {name} {numbers['points']} maps {numbers['depth_maps']} pairs {numbers.get('pairs')} trust {numbers.get('trust')} trusted {trusted(cloud)} wrong {wrong(cloud) if trusted(cloud) else None}\n"
-        )
-    return numbers, cloud
+    return numbers, artifacts.POINT_CLOUD.load(out).moved(POSES_FROM_SCENE.inverse())
 
 
 def off(cloud: PointCloud) -> np.ndarray:

@@ -1,20 +1,21 @@
-"""Dense points: fused of depth maps, moved, chosen, what they carve, and how training is held to them."""
+"""Dense points: fused of depth maps, moved, chosen, what they explain, and how training is held to them."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 from stereo_scene import RADIUS, camera, cameras, draw, ring
 
-from stages.geometry.hull import cube
+from stages.geometry.plane import Plane
 from stages.geometry.point_cloud import PointCloud
 from stages.geometry.similarity import Similarity
-from stages.neural.losses import normal_error
 from stages.neural.sightings import Sightings
 from stages.stereo import depth_kernels
-from stages.stereo.carving import carved_distances
 from stages.stereo.depths import views_of
+from stages.stereo.explaining import explained_share
 from stages.stereo.fusion import _cells, fused
 
 
@@ -110,7 +111,7 @@ def test_points_moved_and_chosen():
     assert len(PointCloud.empty().moved(target)) == 0
 
 
-# ---------------------------------------------------------------- carving
+# ---------------------------------------------------------------- what is explained
 def test_votes_of_one_line_along_an_axis():
     votes = np.zeros((2, 16, 16, 16), np.float32)
     point, center = np.array([[0.3, 0.06, 0.06]]), np.array([[-5.0, 0.06, 0.06]])
@@ -126,37 +127,31 @@ def test_votes_of_one_line_along_an_axis():
     assert votes.sum() == expected.sum()
 
 
-def test_a_ball_carved_from_its_points():
+def test_share_of_a_ball_that_points_explain():
     cams = all_around()
-    found = carved_distances(ball_cloud(cams), cams.centers, 32)
-    assert found is not None
-    true = np.linalg.norm(cube(32), axis=-1) - RADIUS
-    near = np.abs(true) < 0.3
-    assert np.abs(found - true)[near].mean() < 2 / 32
-    assert (found[true > 0.12] > 0).all()
-    assert (found[true < -0.12] < 0).all()
-
-
-def test_nothing_trusted_carves_nothing():
-    cams = all_around()
-    assert carved_distances(PointCloud.empty(), cams.centers, 16) is None
-    points = ball_cloud(cams, 50)
-    doubtful = PointCloud(**{**points.__dict__, "trust": np.full(len(points), 0.2)})
-    assert carved_distances(doubtful, cams.centers, 16) is None
+    whole = ball_cloud(cams)
+    assert explained_share(whole, cams.centers, None, 32) > 0.9
+    doubtful = replace(whole, trust=np.full(len(whole), 0.2))
+    for nothing in (PointCloud.empty(), doubtful):
+        assert explained_share(nothing, cams.centers, None, 32) == 0
+    # what the ground hides from the question is not asked for
+    ground = Plane(np.array([0.0, 0, 1]), 0.0, 0.01, 1.0)
+    assert explained_share(whole.chosen(np.abs(whole.points[:, 2]) > 0.1), cams.centers, ground, 32) > 0.9
 
 
 # ---------------------------------------------------------------- training
 def test_sightings_of_a_cloud():
     points = np.array([[0.5, 0, 0], [0, 0.3, 0], [0, 0, 2.0], [0, 0, 0.7]])
-    cloud = cloud_of(points, [[0, 1], [1, 2], [0, 2], [2]], np.array([0.5, 0.0, 1.0, 0.25]))
+    cloud = cloud_of(points, [[0, 1], [1, 2], [0, 2], [2, 0, 1, 0]], np.array([0.5, 0.0, 1.0, 0.2]))
     centers = np.array([[3.0, 0, 0], [0, 3, 0], [0, 0, 3]])
     found = Sightings.from_cloud(cloud, centers, "cpu")
     assert found.points.tolist() == pytest.approx(np.array([[0.5, 0, 0], [0, 0, 0.7]]))  # no trust; outside the sphere
-    assert found.weights.tolist() == [0.5, 0.25]
-    assert found.normals.tolist() == [[1, 0, 0], [0, 0, 1]]
-    assert found.lines.tolist() == [[0, 0], [1, 0], [2, 1]]
+    assert found.weights.tolist() == pytest.approx([0.25, 0.15])  # times 1/2, of two photos; 3/4, of four
+    assert found.lines.tolist() == [[0, 0], [1, 0], [2, 1], [0, 1], [1, 1], [0, 1]]
+    alone = Sightings.from_cloud(cloud_of(points[:1], [[1]]), centers, "cpu")
+    assert len(alone.lines) == 0
     held_out = Sightings.from_cloud(cloud, centers, "cpu", np.array([True, False, True]))
-    assert held_out.lines.tolist() == [[0, 0], [2, 1]]
+    assert held_out.lines.tolist() == [[0, 0], [2, 1], [0, 1], [0, 1]]
     drawn = found.draw(3, 0.01, torch.Generator().manual_seed(0))
     at, behind, before, free = drawn.places.view(4, 3, 3)
     for k in range(3):
@@ -168,11 +163,3 @@ def test_sightings_of_a_cloud():
         assert np.linalg.norm(free[k]) <= 1 + 1e-5
     nothing = Sightings.from_cloud(PointCloud.empty(), centers, "cpu")
     assert len(nothing.draw(5, 0.01, torch.Generator()).weights) == 0
-
-
-def test_error_of_normals():
-    gradients = torch.tensor([[0.0, 0, 2], [0, 0, -0.5], [1, 0, 0], [1, 2, 3]])
-    normals = torch.tensor([[0.0, 0, 1], [0, 0, 1], [0, 0, 1], [0, 0, 0]])
-    assert normal_error(gradients, normals).tolist() == pytest.approx([0, 2, 1, 0])
-    some = torch.randn(4, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0), requires_grad=True)
-    assert torch.autograd.gradcheck(lambda g: normal_error(g, normals.double()), (some,))

@@ -13,6 +13,7 @@ from stages.artifacts import ImageRecord
 from stages.errors import InputError
 from stages.posing.features import extract
 from stages.posing.known import MAX_STRETCH, KnownCamera
+from stages.posing.pairs import PREEMPTIVE, likely_pairs, match_pairs
 from stages.posing.settings import mapping_options, match_options
 
 log = logging.getLogger(__name__)
@@ -123,13 +124,16 @@ def _posed_model(
 
 
 def _match(database_path: Path, model: Any, params: Any, threads: int, cuda: bool) -> str:
-    """All pairs of small sets, else neighbours in space: the poses say which these are."""
+    """Likely pairs of small sets, else neighbours in space: the poses say which these are."""
     import pycolmap
 
     options = match_options(params, threads, cuda)
     matcher = params.matcher
     if matcher == "auto":
-        matcher = "exhaustive" if model.num_reg_images() <= params.exhaustive_max else "spatial"
+        matcher = PREEMPTIVE if model.num_reg_images() <= params.exhaustive_max else "spatial"
+    if matcher == PREEMPTIVE:
+        match_pairs(database_path, likely_pairs(database_path), options)
+        return matcher
     if matcher == "spatial":
         _write_positions(database_path, model)
         options["pairing_options"] = pairing = pycolmap.SpatialPairingOptions()

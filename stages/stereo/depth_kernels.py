@@ -215,7 +215,7 @@ def line_votes(points, starts, photos, centers, behind, votes):  # pragma: no co
             o = centers[photos[k]]
             dx, dy, dz = points[p, 0] - o[0], points[p, 1] - o[1], points[p, 2] - o[2]
             length = np.sqrt(dx * dx + dy * dy + dz * dz)
-            for step in range(-4 * cells, behind + 1):
+            for step in range(-2 * cells, behind + 1):
                 t = (length + step * cell) / length
                 if t <= 0 or step == 0:
                     continue

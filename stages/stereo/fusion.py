@@ -16,8 +16,9 @@ if TYPE_CHECKING:
 
 # No more depths than this become points, evenly chosen of all: memory.
 MAX_DEPTHS = 4_000_000
-# Odd, of bits without order: cells hash to 64 bits, where millions do not meet.
-_FACTORS = (0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB, 0xD6E8FEB86659FD93)
+# Bits of a cell's place along an axis; with those of its size they fill 64. A cell is about a pixel wide, so that places
+# which share their last 19 bits are hundreds of photos apart.
+_BITS = 19
 
 
 def fused(
@@ -49,11 +50,9 @@ def fused(
 def _cells(points: Float[np.ndarray, "n 3"], widths: Float[np.ndarray, " n"]) -> UInt64[np.ndarray, " n"]:
     """A number for the cell of each point: of its size as a power of two, and where it is on a grid of that size."""
     octave = np.round(np.log2(widths)).astype(np.int64)
-    columns = (octave, *np.floor(points / 2.0 ** octave[:, None]).astype(np.int64).T)
-    key = np.zeros(len(points), np.uint64)
-    for factor, column in zip(_FACTORS, columns, strict=True):
-        key = (key ^ column.astype(np.uint64)) * np.uint64(factor)
-        key ^= key >> np.uint64(32)  # products alone give places mirrored at zero one number
+    key = octave.astype(np.uint64)
+    for column in np.floor(points / 2.0 ** octave[:, None]).astype(np.int64).T:
+        key = key << np.uint64(_BITS) | column.astype(np.uint64) & np.uint64(2**_BITS - 1)
     return key
 
 
