@@ -251,6 +251,8 @@ def test_the_means_of_a_ray_that_meets_nothing_have_finite_gradients():
     assert all(mean.abs().max() == 0 for mean in means)
     (opacity * torch.cat(means, 1)).sum().backward()
     assert torch.isfinite(weights.grad).all()
+    none = ray_means(torch.zeros(0, 7), torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0, 4))
+    assert [tuple(part.shape) for part in none] == [(0, 1), (0, 3), (0, 3), (0, 4)]
 
 
 def test_samples_get_fewer_in_even_steps():

@@ -86,7 +86,8 @@ def ray_means(
     A ray that meets nothing has means near 0 and finite gradients.
     """
     normals = torch.nn.functional.normalize(gradients, dim=1)
-    values = torch.cat([points, normals, features], 1).view(*weights.shape, -1)
+    values = torch.cat([points, normals, features], 1)
+    values = values.view(*weights.shape, values.shape[1])
     opacity = weights.sum(1, keepdim=True)
     means = torch.bmm(weights[:, None], values).squeeze(1) / opacity.clamp(min=_OPACITY_FLOOR)
     point, normal, feature = means.split([3, 3, features.shape[1]], 1)
