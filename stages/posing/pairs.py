@@ -24,7 +24,7 @@ LARGEST = 300  # features of each photo that are looked at
 # Photos that show nothing in common share two of these matches, and up to six; of pairs with 30 verified matches of
 # all features, 99 in 100 share six.
 CLEAR = 6
-MOST, LEAST = 16, 6  # partners of a photo: clear ones, and whatever they share
+MOST, LEAST = 12, 6  # partners of a photo: clear ones, and whatever they share
 BEST, NEXT = 3, 2  # near a photo: partners that share most, and photos to each side in the order of names
 # COLMAP's tests of a match, as angles between descriptors: to the nearest one, and to it over that to the second.
 MAX_ANGLE, MAX_RATIO = 0.7, 0.8
