@@ -30,11 +30,10 @@ class FieldParams(Section):
         "analytic", description="SDF gradients by differentiation, or central differences one active voxel to each side"
     )
     sphere_radius: float = Field(0.5, gt=0, lt=1, description="the SDF is this sphere before training, scene units")
-    init: Literal["auto", "sphere", "room", "hull", "carved"] = Field(
+    init: Literal["auto", "sphere", "room", "hull"] = Field(
         "auto",
-        description="the SDF before training: that sphere, a room around the cameras, the visual hull of masks (one "
-        "for each photo), or what the dense points' lines of sight carve; auto: a room where most cameras stand in "
-        "that sphere, else carved, or the sphere where there are no trusted points",
+        description="the SDF before training: that sphere, a room around the cameras, or the visual hull of masks (one "
+        "for each photo); auto: a room where most cameras stand in that sphere, else it",
     )
     background: bool = Field(True, description="model what lies outside the region (never where masks exist)")
     background_log2_rows: int = Field(15, ge=8, le=24, description="rows per level of the background's encoding")
@@ -59,6 +58,12 @@ class SamplingParams(Section):
 
     rays: int = Field(512, ge=1, description="rays per step")
     samples: int = Field(16, ge=2, description="samples per ray inside the region of interest")
+    samples_end: int = Field(
+        8, ge=2, description="samples per ray once the density is sharp, fewer and fewer from 0.3 of the budget on"
+    )
+    needed_share: float = Field(
+        0.7, ge=0, le=1, description="part of the rays that goes where the surface is, and where colours are met worse"
+    )
     free_points: int = Field(256, ge=0, description="points per step anywhere in the region, for the Eikonal term")
     background_samples: int = Field(16, ge=1, description="samples per ray outside the region")
     sampler: Literal["grid", "proposal"] = Field(
@@ -77,6 +82,12 @@ class ScheduleParams(Section):
 
     start_levels: int = Field(4, ge=1, description="levels of the encoding in use at the start")
     coarse_until: float = Field(0.4, ge=0, le=1, description="progress at which all levels are in use")
+    deferred_from: float | None = Field(
+        0.3,
+        ge=0,
+        le=1,
+        description="progress from which a ray has one colour, at its mean point, not one for each sample; null: never",
+    )
     lr_table: float = Field(1e-2, gt=0, description="peak learning rate of the hash tables")
     lr_network: float = Field(3e-3, gt=0, description="peak learning rate of the networks")
     lr_warm_up: float = Field(0.02, ge=0, lt=1, description="progress at which the peak rate is reached")
@@ -99,15 +110,11 @@ class LossParams(Section):
     )
     sparse_batch: int = Field(256, ge=0, description="sightings of SfM points per step")
     dense: float = Field(3.0, ge=0, description="weight of the dense stereo points' terms, times each point's trust")
-    dense_end: float = Field(
-        1.0, gt=0, le=1, description="part of that weight which is left at the end, falling evenly on a log scale"
-    )
     dense_tolerance: float = Field(0.003, gt=0, description="dense points off by this count linearly, scene units")
     dense_step: float = Field(
         0.01, ge=0, description="the SDF must have changed sign this far before and behind dense points, scene units"
     )
     dense_batch: int = Field(512, ge=0, description="sightings of dense points per step")
-    normals: float = Field(0.03, ge=0, description="weight of the dense points' normals, times each point's trust")
 
 
 class AmbiguityParams(Section):
@@ -179,7 +186,7 @@ class TrainParams(Section):
         8000, ge=1, description="optimiser steps where stereo explains nothing (ignored where `minutes` is set)"
     )
     steps_if_explained: float = Field(
-        0.2,
+        0.25,
         gt=0,
         le=1,
         description="part of `steps` that is enough where trusted dense points cover all of the surface; in between by "

@@ -39,7 +39,6 @@ from stages.geometry.cameras import PinholeCameras, PosedScene
 from stages.geometry.normalisation import regrown
 from stages.geometry.point_cloud import PointCloud
 from stages.geometry.similarity import Similarity
-from stages.stereo.carving import Carved
 
 log = logging.getLogger(__name__)
 
@@ -159,14 +158,12 @@ class _Training:
     def _fresh(cls, context: StageContext[TrainParams], scene: PosedScene) -> _Training:
         """At the first step: from the last training of this capture where it helps, else from the first shape."""
         from stages.neural.trained_field import load_field
-        from stages.stereo.carving import carved
 
         before = _last_scene(context, scene)
-        shape = carved(_cloud(context, scene), scene.cameras.centers, scene.ground)
-        steps = _budget(context.params, shape)
+        steps = _budget(context, scene)
         if before is None:
             training = cls(context, scene, _make_trainer(context, scene), looked=not scene.growable, steps=steps)
-            _start_from_shape(training.trainer, scene.cameras, shape)
+            _start_from_shape(training.trainer, scene.cameras)
             return training
         region = _kept_region(scene, before)
         kept = region.of(scene) if region else scene
@@ -418,18 +415,21 @@ def _load_images(
     return images, masks if masked == len(names) else None
 
 
-def _budget(params: TrainParams, shape: Carved | None) -> int:
+def _budget(context: StageContext[TrainParams], scene: PosedScene) -> int:
     """Steps, fewer the more of the surface dense points explain."""
-    explained = shape.explained if shape else 0.0
+    from stages.stereo.explaining import explained_share
+
+    params = context.params
+    if params.minutes:
+        return params.steps
+    explained = explained_share(_cloud(context, scene), scene.cameras.centers, scene.ground)
     steps = max(1, round(params.steps * (1 + explained * (params.steps_if_explained - 1))))
-    if not params.minutes:
-        log.info("dense points explain %.0f %% of the surface: %d steps", 100 * explained, steps)
+    log.info("dense points explain %.0f %% of the surface: %d steps", 100 * explained, steps)
     return steps
 
 
-def _start_from_shape(trainer: Any, cameras: PinholeCameras, shape: Carved | None) -> None:
-    """Where training is not to start from a sphere: bring the SDF to a room, the visual hull of the masks, or what
-    dense points carve."""
+def _start_from_shape(trainer: Any, cameras: PinholeCameras) -> None:
+    """Where training is not to start from a sphere: bring the SDF to a room, or to the visual hull of the masks."""
     from stages.geometry.hull import room_distances
 
     params = trainer.params.field
@@ -440,9 +440,6 @@ def _start_from_shape(trainer: Any, cameras: PinholeCameras, shape: Carved | Non
     elif params.init == "room" or (params.init == "auto" and inside.mean() > 0.5):
         error = trainer.start_from(room_distances())
         log.info("the SDF starts from a room around the cameras, met to %.4f on average", error)
-    elif params.init in ("auto", "carved") and shape is not None:
-        error = trainer.start_from(shape.distances)
-        log.info("the SDF starts from what dense points carve, met to %.4f on average", error)
 
 
 def _hull(cameras: PinholeCameras, photos: Any) -> np.ndarray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from stages.neural.density import laplace_density, section_optical_depth
+from stages.neural.renderer import Renderer
 from stages.neural.rendering import composite, rendering_weights, sample_optical_depths, weights_from_optical_depth
 from stages.neural.sampling import (
     Rays,
@@ -20,6 +22,7 @@ from stages.neural.sampling import (
     intersect_unit_sphere,
     stratified,
 )
+from stages.neural.schedules import even_steps
 
 
 def test_laplace_density_at_known_places():
@@ -140,7 +143,21 @@ def test_band_refresh_touches_only_the_neighbourhood_of_the_surface():
     far = cache.values.clone()
     count = cache.refresh(lambda p: torch.full((len(p),), 9.0), band=2 * cache.cell)
     assert 0 < count < 0.4 * cache.values.numel()
-    assert torch.equal(cache.values == 9.0, far.abs() < 2 * cache.cell)
+    renewed, near = (values.view(-1)[cache.inside] for values in (cache.values == 9.0, far.abs() < 2 * cache.cell))
+    assert torch.equal(renewed, near)
+
+
+@pytest.mark.parametrize("resolution", [9, 24])
+def test_the_cache_holds_all_that_is_read_within_the_unit_sphere_and_little_more(resolution):
+    cache = SdfCache(resolution, "cpu")
+    count = cache.refresh(lambda p: torch.full((len(p),), 9.0))
+    ball = torch.nn.functional.normalize(torch.randn(5000, 3, generator=torch.Generator().manual_seed(0)), dim=1)
+    torch.testing.assert_close(
+        cache.lookup(ball), torch.full((5000,), 9.0)
+    )  # all eight corners of the cells that the sphere passes through
+    assert count == (cache.values == 9.0).sum() < 0.9 * cache.values.numel()
+    corner = cache.values[0, 0, 0, 0, 0].item()
+    assert corner == pytest.approx(3**0.5 - 1)
 
 
 def test_samples_gather_at_the_surface_sorted_inside_the_interval():
@@ -187,3 +204,69 @@ def test_half_of_the_laplace_depth_lies_on_each_side_of_a_wall():
     tau = sample_optical_depths(1.0 - distances, distances, 0.02)
     assert tau.sum().item() == pytest.approx(0.5, rel=1e-3)
     assert np.isfinite(tau.numpy()).all()
+
+
+# ---------------------------------------------------------------- one colour a ray
+class Flat:
+    """A radiance field that answers in closed form: a linear function of what it is asked."""
+
+    def __call__(self, points, normals, view_dirs, features):
+        return 0.3 * points + 0.2 * normals + 0.1 * view_dirs + features[:, :3]
+
+
+def deferred_renderer(radiance) -> Renderer:
+    return Renderer(SimpleNamespace(radiance=radiance), None, None, None)
+
+
+def ray_values(num_rays: int = 5, num_samples: int = 7) -> dict[str, torch.Tensor]:
+    generator = torch.Generator().manual_seed(0)
+    points, gradients, features = (torch.randn(num_rays * num_samples, n, generator=generator) for n in (3, 3, 4))
+    weights = torch.rand(num_rays, num_samples, generator=generator) / num_samples
+    return {"weights": weights, "points": points, "gradients": gradients, "features": features}
+
+
+def test_a_deferred_colour_is_that_of_the_mean_point_normal_and_features():
+    values = ray_values()
+    directions = torch.nn.functional.normalize(torch.randn(5, 3, generator=torch.Generator().manual_seed(1)), dim=1)
+    colors = deferred_renderer(Flat())._deferred_colors(SimpleNamespace(directions=directions), **values)
+    for r in range(5):
+        weights = values["weights"][r]
+        opacity = weights.sum()
+        rows = range(7 * r, 7 * r + 7)
+        point = sum(weights[k] * values["points"][row] for k, row in enumerate(rows)) / opacity
+        feature = sum(weights[k] * values["features"][row] for k, row in enumerate(rows)) / opacity
+        units = [values["gradients"][row] / values["gradients"][row].norm() for row in rows]
+        normal = sum(weights[k] * unit for k, unit in enumerate(units))
+        expected = opacity * (0.3 * point + 0.2 * normal / normal.norm() + 0.1 * directions[r] + feature[:3])
+        torch.testing.assert_close(colors[r], expected)
+
+
+def test_a_deferred_colour_of_one_sample_is_its_colour_and_pulls_at_all_it_is_made_of():
+    values = ray_values(5, 1)
+    batch = SimpleNamespace(directions=torch.zeros(5, 3))
+    for value in values.values():
+        value.requires_grad_()
+    colors = deferred_renderer(Flat())._deferred_colors(batch, **values)
+    normals = torch.nn.functional.normalize(values["gradients"], dim=1)
+    expected = values["weights"] * Flat()(values["points"], normals, batch.directions, values["features"])
+    torch.testing.assert_close(colors, expected)
+    colors.sum().backward()
+    assert all(value.grad.abs().max() > 0 for value in values.values())
+
+
+def test_a_deferred_colour_of_an_empty_ray_is_black_and_its_gradient_finite():
+    values = {name: value.requires_grad_() for name, value in ray_values().items()}
+    empty = {**values, "weights": (0 * values["weights"])}
+    colors = deferred_renderer(Flat())._deferred_colors(SimpleNamespace(directions=torch.zeros(5, 3)), **empty)
+    assert colors.abs().max() == 0
+    colors.sum().backward()
+    assert all(torch.isfinite(value.grad).all() for value in values.values() if value.grad is not None)
+
+
+def test_samples_get_fewer_in_even_steps():
+    counts = [even_steps(i / 100, 16, 8, 0.3, 0.9) for i in range(101)]
+    assert counts[:31] == [16] * 31
+    assert counts[90:] == [8] * 11
+    assert counts[60] == 12
+    assert sorted(set(counts), reverse=True) == list(range(16, 7, -1))
+    assert [even_steps(p, 16, 8, 0.3, 0.3) for p in (0.3, 0.31)] == [16, 8]

@@ -27,6 +27,10 @@ if TYPE_CHECKING:
 
 # Samples that weigh less than this get no colour: together they change a pixel by less than one grey level.
 _COLOR_THRESHOLD = 2e-4
+# Keeps the mean over a ray finite where it meets nothing.
+_OPACITY_FLOOR = 1e-4
+# Progress until which a ray has all its samples: the surface is found by then.
+_FEWER_FROM = 0.3
 # Rays that let less than this through show nothing of the background: two grey levels at most.
 _BACKGROUND_THRESHOLD = 0.01
 # The background's last sample is this near to infinity, as a part of the contracted shell: 200 radii away.
@@ -53,7 +57,12 @@ class Renderer:
         else:
             end = max(density.scale_end, 0.5 * grid.voxel_size())
             scale = schedules.exponential(progress / density.sharpen_until, density.scale_start, end)
-        return Moment(progress, scale, levels, grid.voxel_size(levels))
+        sampling = self.params.sampling
+        samples = schedules.even_steps(
+            progress, sampling.samples, min(sampling.samples_end, sampling.samples), _FEWER_FROM, density.sharpen_until
+        )
+        deferred = schedule.deferred_from is not None and progress >= schedule.deferred_from
+        return Moment(progress, scale, levels, grid.voxel_size(levels), samples, deferred)
 
     def render(
         self,
@@ -76,7 +85,8 @@ class Renderer:
             sdf[:num_points].view(num_rays, num_samples), distances, moment.scale, self.params.density.form
         )
 
-        colors = self._colors(batch, weights, points, gradients, features)
+        shade = self._deferred_colors if moment.deferred else self._colors
+        colors = shade(batch, weights, points, gradients[:num_points], features[:num_points])
         if self.fields.background is not None:
             colors = colors + self._background(self.fields.background, batch, transmittance, generator)
         rendered = Rendered(
@@ -91,9 +101,9 @@ class Renderer:
         """Distances of the samples, and the proposal network's histogram where it made them."""
         params = self.params.sampling
         if self.fields.proposal is None:
-            return importance_distances(self.cache, batch, params.samples, moment.scale, generator), None
+            return importance_distances(self.cache, batch, moment.samples, moment.scale, generator), None
         distances, edges, weights = proposal_distances(
-            self.fields.proposal, batch, params.proposal_samples, params.samples, generator
+            self.fields.proposal, batch, params.proposal_samples, moment.samples, generator
         )
         return distances, (edges, weights)
 
@@ -102,19 +112,16 @@ class Renderer:
         batch: RayBatch,
         weights: Float[Tensor, "r k"],
         points: Float[Tensor, "r*k 3"],
-        gradients: Float[Tensor, "more 3"],
-        features: Float[Tensor, "more g"],
+        gradients: Float[Tensor, "r*k 3"],
+        features: Float[Tensor, "r*k g"],
     ) -> Float[Tensor, "r 3"]:
-        """Colour of the samples that weigh enough, weighted and summed over each ray.
-
-        The first of the gradients and features belong to the samples, the others to the extra points.
-        """
+        """Colour of the samples that weigh enough, weighted and summed over each ray."""
         num_rays, num_samples = weights.shape
         heavy = weights.detach().view(-1) > _COLOR_THRESHOLD
         if fixed_shapes(weights.device):
             directions = batch.directions[:, None].expand(-1, num_samples, -1).reshape(-1, 3)
-            normals = torch.nn.functional.normalize(gradients[: len(points)], dim=1)
-            colors = self.fields.radiance(points, normals, directions, features[: len(points)])
+            normals = torch.nn.functional.normalize(gradients, dim=1)
+            colors = self.fields.radiance(points, normals, directions, features)
             return composite(weights * heavy.view_as(weights), colors.view(num_rays, num_samples, 3))
         seen = torch.nonzero(heavy).squeeze(1)
         ray = seen // num_samples
@@ -122,6 +129,28 @@ class Renderer:
         colors = self.fields.radiance(points[seen], normals, batch.directions[ray], features[seen])
         nothing = torch.zeros(num_rays, 3, device=points.device)
         return nothing.index_add(0, ray, weights.view(-1)[seen, None] * colors)
+
+    def _deferred_colors(
+        self,
+        batch: RayBatch,
+        weights: Float[Tensor, "r k"],
+        points: Float[Tensor, "r*k 3"],
+        gradients: Float[Tensor, "r*k 3"],
+        features: Float[Tensor, "r*k g"],
+    ) -> Float[Tensor, "r 3"]:
+        """Opacity of each ray times the colour at its mean point, of its mean normal and features.
+
+        C = W c(sum_k w_k x_k / W, sum_k w_k n_k / |.|, sum_k w_k z_k / W), W = sum_k w_k: one colour a ray (deferred
+        shading). Where W is 0 the colour weighs nothing, and its gradient is finite.
+        """
+        num_rays, num_samples = weights.shape
+        normals = torch.nn.functional.normalize(gradients, dim=1)
+        values = torch.cat([points, normals, features], 1).view(num_rays, num_samples, -1)
+        opacity = weights.sum(1, keepdim=True)
+        means = torch.bmm(weights[:, None], values).squeeze(1) / opacity.clamp(min=_OPACITY_FLOOR)
+        point, normal, feature = means.split([3, 3, features.shape[1]], 1)
+        normal = torch.nn.functional.normalize(normal, dim=1)
+        return opacity * self.fields.radiance(point, normal, batch.directions, feature)
 
     def _background(
         self,

@@ -5,6 +5,7 @@ Shapes: r rays, k samples a ray. Distances are along the ray, scene units.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -27,9 +28,9 @@ _EVEN_FLOOR = 1e-4
 _NUM_BINS = 64
 # A ray enters the sphere no nearer than this, scene units: a camera may stand inside.
 _NEAR = 0.02
-# Part of the grid that a refresh near the surface takes on CUDA: a band of 4 cells to either side of a sphere that
-# fills the region has a fifth of a grid of 96 cells a side, and less of a finer one.
-_NEAREST_SHARE = 0.25
+# Part of the unit sphere that a refresh near the surface takes on CUDA: a band of 4 cells to either side of a sphere
+# that fills the region has two fifths of it in a grid of 96 cells a side, and less in a finer one.
+_NEAREST_SHARE = 0.5
 
 
 @dataclass(frozen=True)
@@ -90,12 +91,17 @@ class SdfCache:
     """The SDF on a regular grid over [-1, 1]^3, refreshed now and then; what sampling and visibility read.
 
     Attributes:
-        values: [1, 1, G, G, G] float32, indexed z, y, x as `grid_sample` wants it.
+        values: [1, 1, G, G, G] float32, indexed z, y, x as `grid_sample` wants it. Past the cells that touch the unit
+            sphere, where nothing is looked for, they stay at |x| - 1.
+        inside: flat indices of the corners of those cells, which a refresh evaluates.
     """
 
     def __init__(self, resolution: int, device: torch.device | str) -> None:
         self.resolution = resolution
-        self.values = torch.zeros(1, 1, resolution, resolution, resolution, device=device)
+        squares = torch.linspace(-1, 1, resolution, device=device) ** 2
+        outside = (squares[:, None, None] + squares[:, None] + squares).sqrt() - 1
+        self.inside = torch.nonzero(outside.view(-1) < math.sqrt(3) * self.cell).squeeze(1)
+        self.values = outside[None, None]
 
     @property
     def cell(self) -> float:
@@ -110,17 +116,19 @@ class SdfCache:
 
     @torch.no_grad()
     def refresh(self, sdf: Callable[[Tensor], Tensor], band: float | None = None) -> int:
-        """Evaluate sdf([M, 3]) -> [M] on the grid: everywhere, or where |cached f| < band. Returns M.
+        """Evaluate sdf([M, 3]) -> [M] in the unit sphere: everywhere, or where |cached f| < band. Returns M.
 
-        On CUDA the band is as wide as a fixed part of the grid.
+        On CUDA the band is as wide as a fixed part of the sphere.
         """
         flat = self.values.view(-1)
-        if band is None:
-            rows = torch.arange(flat.numel(), device=flat.device)
-        elif fixed_shapes(flat.device):
-            rows = flat.abs().topk(int(_NEAREST_SHARE * flat.numel()), largest=False, sorted=False).indices
-        else:
-            rows = torch.nonzero(flat.abs() < band).squeeze(1)
+        rows = self.inside
+        if band is not None:
+            sizes = flat[rows].abs()
+            if fixed_shapes(flat.device):
+                nearest = sizes.topk(int(_NEAREST_SHARE * len(rows)), largest=False, sorted=False).indices
+            else:
+                nearest = torch.nonzero(sizes < band).squeeze(1)
+            rows = rows[nearest]
         for chunk in rows.split(points_at_a_time(flat.device)):
             flat[chunk] = sdf(self.points(chunk))
         return len(rows)

@@ -31,12 +31,10 @@ class Drawn(NamedTuple):
 
     Attributes:
         places: four along each line: the points, then those behind them, those before, and those on the free line.
-        normals: unit, of the points; zero where none is known.
         weights: in [0, 1].
     """
 
     places: Float[Tensor, "places 3"]
-    normals: Float[Tensor, "s 3"]
     weights: Float[Tensor, " s"]
 
 
@@ -46,14 +44,12 @@ class Sightings:
 
     Attributes:
         points: inside the region of interest.
-        normals: unit, zero where none is known.
         weights: of the points, in [0, 1].
         origins: of all photos, projection centres.
         lines: photo and point of each.
     """
 
     points: Float[Tensor, "p 3"]
-    normals: Float[Tensor, "p 3"]
     weights: Float[Tensor, " p"]
     origins: Float[Tensor, "i 3"]
     lines: Int[Tensor, "m 2"]
@@ -70,8 +66,7 @@ class Sightings:
         Of the photos where `training` is true only, if it is given.
         """
         weights = 1 / (1 + scene.point_errors**2)
-        nothing = np.zeros_like(scene.points)
-        return _within(scene.points, nothing, weights, scene.cameras.centers, scene.observations, device, training)
+        return _within(scene.points, weights, scene.cameras.centers, scene.observations, device, training)
 
     @staticmethod
     def from_cloud(
@@ -83,7 +78,7 @@ class Sightings:
         """Of a dense cloud in the scene frame; its trust is the weight, and what has none is left out."""
         point = np.repeat(np.arange(len(cloud)), np.diff(cloud.starts))
         observations = np.stack([cloud.photos, point], 1)
-        return _within(cloud.points, cloud.normals, cloud.trust, centers, observations, device, training)
+        return _within(cloud.points, cloud.trust, centers, observations, device, training)
 
     def draw(self, count: int, step: float, generator: torch.Generator) -> Drawn:
         """Four places along each of S random sightings; S is at most `count`.
@@ -103,12 +98,11 @@ class Sightings:
         offset = step * directions
         free = (along * (lengths - entry)).clamp(min=step)[:, None] * directions
         places = torch.cat([points, points + offset, points - offset, points - free])
-        return Drawn(places, self.normals[point], self.weights[point])
+        return Drawn(places, self.weights[point])
 
 
 def _within(
     points: Float[np.ndarray, "p 3"],
-    normals: Float[np.ndarray, "p 3"],
     weights: Float[np.ndarray, " p"],
     centers: Float[np.ndarray, "i 3"],
     lines: Integer[np.ndarray, "m 2"],
@@ -120,11 +114,11 @@ def _within(
     kept = inside[lines[:, 1]]
     if training is not None:
         kept &= training[lines[:, 0]]
-    at, facing, trust = (torch.from_numpy(each[inside]).float().to(device) for each in (points, normals, weights))
+    at, trust = (torch.from_numpy(each[inside]).float().to(device) for each in (points, weights))
     row = np.cumsum(inside) - 1
     rows = np.stack([lines[kept, 0], row[lines[kept, 1]]], 1)
     origins = torch.from_numpy(centers).float().to(device)
-    return Sightings(at, facing, trust, origins, torch.from_numpy(rows).long().to(device))
+    return Sightings(at, trust, origins, torch.from_numpy(rows).long().to(device))
 
 
 def sighting_loss(

@@ -14,6 +14,7 @@ from stages.neural import losses, schedules
 from stages.neural.acceleration import is_mixed, points_at_a_time, short_products
 from stages.neural.encoding_shapes import Frequencies, HashGrid
 from stages.neural.fields import Fields, FieldShape
+from stages.neural.needed_rays import NeededRays
 from stages.neural.proposal import interlevel_loss, sample_edges, updates_now
 from stages.neural.rendered import Rendered
 from stages.neural.renderer import Renderer
@@ -30,6 +31,8 @@ if TYPE_CHECKING:
 
 # The regression to a hull before training: long enough for an error of about a cell of its grid.
 HULL_STEPS, HULL_POINTS = 200, 2048
+# Rays go where they are needed once there is a shape that says where; that is asked at each so many refreshes.
+NEEDED_FROM, LOOK_EVERY = 0.1, 2
 
 
 def field_shape(params: TrainParams, num_images: int, background: bool) -> FieldShape:
@@ -83,6 +86,7 @@ class Trainer:
             fused=True,
         )
         self.cache = SdfCache(params.sampling.cache_resolution, device)
+        self.needed = NeededRays(photos, params.sampling.needed_share)
         self.generator = torch.Generator(device=device).manual_seed(params.seed)
         self.terms = Terms(self.fields, self.cache, params, photos, self.generator)
         self.renderer = Renderer(self.fields, self.cache, params, self.terms)
@@ -90,7 +94,7 @@ class Trainer:
         self.cache_step = -(10**9)
         self.replay = Replay(self.device, self.generator) if self._replays() else None
         # What a graph reads anew at each step: the density's scale, the weight of the sightings.
-        self._scale, self._sparse_weight, self._dense_weight = torch.zeros(3, device=self.device).unbind()
+        self._scale, self._sparse_weight = torch.zeros(2, device=self.device).unbind()
         self._prepare_rates()
 
     def start_from(self, distances: Float[np.ndarray, "g g g"]) -> float:
@@ -133,22 +137,21 @@ class Trainer:
         decay = schedules.warm_up_then_decay if schedule.lr_decay == "cosine" else schedules.warm_up_then_exponential
         self._set_rates(decay(progress, schedule.lr_warm_up, schedule.lr_final))
         sparse_weight = weights.sparse * schedules.fade_out(progress, weights.sparse_until)
-        dense_weight = schedules.exponential(progress, 1.0, weights.dense_end)
         if self.replay is None:
-            numbers = self._update(moment, sparse_weight, dense_weight)
+            numbers = self._update(moment, sparse_weight)
         else:
             self._scale.fill_(moment.scale)
             self._sparse_weight.fill_(sparse_weight)
-            self._dense_weight.fill_(dense_weight)
             current = replace(moment, scale=self._scale)
-            numbers = self.replay(lambda: self._update(current, self._sparse_weight, self._dense_weight), moment.levels)
+            kind = moment.levels, moment.samples, moment.deferred
+            numbers = self.replay(lambda: self._update(current, self._sparse_weight), kind)
         self.step_index += 1
         return numbers
 
-    def _update(self, moment: Moment, sparse_weight: Tensor | float, dense_weight: Tensor | float) -> dict[str, Tensor]:
+    def _update(self, moment: Moment, sparse_weight: Tensor | float) -> dict[str, Tensor]:
         """Rays, losses, gradients, and the optimiser's step."""
         sampling, weights = self.params.sampling, self.params.losses
-        batch = self.photos.draw(sampling.rays, self.generator)
+        batch, cells = self.needed.draw(sampling.rays, self.generator)
         sparse = self.sightings.draw(weights.sparse_batch, weights.sparse_step, self.generator)
         dense = self.dense.draw(weights.dense_batch, weights.dense_step, self.generator)
         anywhere = torch.rand(sampling.free_points, 3, generator=self.generator, device=self.device) * 2 - 1
@@ -162,6 +165,7 @@ class Trainer:
         if batch.masks is not None:  # outside the masks nothing is known of the colour
             ray_error = ray_error * batch.masks
             mask_loss = losses.mask_error(rendered.opacity, batch.masks).mean()
+        self.needed.learn(cells, ray_error)
         trust = self.terms.color_weight(rendered, exposed, moment)
         rgb_loss = (ray_error * trust).mean()
         omega = self.terms.eikonal_weight(rendered, ray_error, trust, moment)
@@ -176,8 +180,6 @@ class Trainer:
         dense_loss = sighting_loss(
             rendered.extra_sdf[first:last], dense.weights, weights.dense_tolerance, weights.dense_step
         )
-        on_points = rendered.extra_gradients[first : first + len(dense.weights)]
-        normal_loss = (dense.weights * losses.normal_error(on_points, dense.normals)).sum() / max(len(on_points), 1)
         exposure_loss = losses.exposure_error(self.fields.log_gains).mean()
         proposal_loss = self._proposal_loss(rendered)
 
@@ -186,7 +188,7 @@ class Trainer:
             + weights.eikonal * eikonal_loss
             + sum(weight * term_loss for weight, term_loss in of_terms.values())
             + sparse_weight * sparse_loss
-            + dense_weight * (weights.dense * dense_loss + weights.normals * normal_loss)
+            + weights.dense * dense_loss
             + weights.mask * mask_loss
             + weights.exposure * exposure_loss
             + proposal_loss
@@ -208,7 +210,6 @@ class Trainer:
                 **{name: term_loss.detach() for name, (_, term_loss) in of_terms.items()},
                 "sparse": sparse_loss.detach(),
                 "dense": dense_loss.detach(),
-                "normals": normal_loss.detach(),
                 "mask": mask_loss.detach(),
                 "proposal": proposal_loss.detach(),
                 "psnr": -10 * torch.log10(mse.clamp(min=1e-10)),
@@ -219,7 +220,7 @@ class Trainer:
             }
 
     def _replays(self) -> bool:
-        """Whether steps can be a CUDA graph: nothing but levels changes in how they go.
+        """Whether steps can be a CUDA graph: few things change in how they go, each a few times.
 
         The paper's terms look at the progress and may wait for the device; a proposal network is not trained in each.
         """
@@ -275,6 +276,8 @@ class Trainer:
         band = None if full else 4 * self.cache.cell
         self.cache.refresh(lambda p: self.fields.sdf.sdf(p, moment.levels), band)
         self.cache_step = self.step_index
+        if self.needed.share and moment.progress >= NEEDED_FROM and refreshes % LOOK_EVERY == 0:
+            self.needed.look(self.cache)
 
     # ------------------------------------------------------------------ the shape so far
     @torch.no_grad()
@@ -323,6 +326,7 @@ class Trainer:
             "optimizer": self.optimizer.state_dict(),
             "cache": self.cache.values,
             "cache_step": self.cache_step,
+            "needed": self.needed.state(),
             "generator": self.generator.get_state(),
             "step_index": self.step_index,
         }
@@ -333,5 +337,6 @@ class Trainer:
         self._prepare_rates()
         self.cache.values.copy_(state["cache"])
         self.cache_step = state["cache_step"]
+        self.needed.load_state(state["needed"])
         self.generator.set_state(state["generator"].cpu())
         self.step_index = state["step_index"]

@@ -91,12 +91,17 @@ class Photos:
 
         On CUDA exactly as many: where fewer of those drawn cross the sphere, the first are taken again.
         """
+        return self.rays(*self.draw_pixels(num_rays, generator), limit=num_rays)
+
+    def draw_pixels(
+        self, num_rays: int, generator: torch.Generator
+    ) -> tuple[Int[Tensor, " more"], Float[Tensor, "more 2"]]:
+        """Photos and integer pixels in their boxes: so many that about `num_rays` of them cross the unit sphere."""
         count = int(num_rays * _OVERDRAW)
         images = self._drawn[torch.randint(len(self._drawn), (count,), generator=generator, device=self.device)]
         place = torch.rand(count, 2, generator=generator, device=self.device)
         low, high = self.boxes[images, :2], self.boxes[images, 2:]
-        pixels = (low + place * (high - low)).floor()
-        return self.rays(images, pixels, limit=num_rays)
+        return images, (low + place * (high - low)).floor()
 
     def observe(self, points: Float[Tensor, "p 3"]) -> tuple[Float[Tensor, "p i 3"], Bool[Tensor, "p i"]]:
         """What every photo shows at scene points: colours in [0, 1] and whether it may show it.
@@ -114,15 +119,18 @@ class Photos:
             inside &= self.masks[rows] > 127
         return self.pixels[rows].float() / 255, inside
 
+    def directions(self, images: Int[Tensor, " r"], pixels: Float[Tensor, "r 2"]) -> Float[Tensor, "r 3"]:
+        """Unit directions of the rays through the centres of integer pixels (x, y) of photos."""
+        homogeneous = torch.nn.functional.pad(pixels + 0.5, (0, 1), value=1.0)
+        directions = torch.bmm(self.scene_from_pixel[images], homogeneous.unsqueeze(2)).squeeze(2)
+        return torch.nn.functional.normalize(directions, dim=1)
+
     def rays(self, images: Int[Tensor, " r"], pixels: Float[Tensor, "r 2"], limit: int | None = None) -> RayBatch:
         """Rays through the centres of integer pixels (x, y) of photos; those that miss are dropped.
 
         With a limit the first that hit, as `draw` wants them.
         """
-        homogeneous = torch.nn.functional.pad(pixels + 0.5, (0, 1), value=1.0)
-        directions = torch.bmm(self.scene_from_pixel[images], homogeneous.unsqueeze(2)).squeeze(2)
-        directions = torch.nn.functional.normalize(directions, dim=1)
-        origins = self.centers[images]
+        directions, origins = self.directions(images, pixels), self.centers[images]
         entry, leave, hit = intersect_unit_sphere(origins, directions)
         if limit is not None and fixed_shapes(self.device):
             kept = first_rows(hit, limit)

@@ -1,18 +1,21 @@
-"""A first shape from dense points: what their lines of sight pass through is free, what lies behind them is solid."""
+"""How much of what is to be reconstructed dense points explain already.
+
+What their lines of sight pass through is free, what lies behind them is solid; what is left has a surface, and points
+cover some of it. On polished metal they cover a sixth, on a plain part with bores three fifths, on a helmet nine tenths.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from stages.geometry.hull import DISTANCE_CELLS, cube, distances_to
+from stages.geometry.hull import DISTANCE_CELLS, cube
 from stages.geometry.plane import Plane
 from stages.geometry.point_cloud import PointCloud
 
 if TYPE_CHECKING:
-    from jaxtyping import Bool, Float, Float32
+    from jaxtyping import Bool, Float
 
 # Points with less trust than this say nothing of the first shape.
 MIN_TRUST = 0.5
@@ -29,52 +32,34 @@ WITHIN, OFF_GROUND = 0.9, 2.0
 COVERED = 0.1
 
 
-@dataclass(frozen=True)
-class Carved:
-    """What dense points make of a region.
-
-    Attributes:
-        distances: signed, at the centres of a grid over [-1, 1]^3, negative inside; axes x, y, z.
-        explained: share of its surface, where photos see it and off the ground, that is covered by dense points.
-    """
-
-    distances: Float32[np.ndarray, "g g g"]
-    explained: float
-
-
-def carved(
+def explained_share(
     cloud: PointCloud, centers: Float[np.ndarray, "i 3"], ground: Plane | None, cells: int = DISTANCE_CELLS
-) -> Carved | None:
-    """The shape that dense points' lines of sight leave in the unit sphere.
+) -> float:
+    """Share of the surface in the unit sphere, where photos see it and off the ground, that dense points cover.
 
-    Cells that no line says anything of follow those around them, and weakly a ball.
+    The surface is that of what the points' lines of sight leave: cells of a grid that none passes. Cells that no line
+    says anything of follow those around them, and weakly a ball.
 
     Args:
         cloud, centers: in the scene frame; centres of the photos that saw the points.
         ground: in the scene frame, where there is one.
-
-    Returns:
-        None where nothing is solid, or all is.
     """
     from stages.stereo import depth_kernels
 
     trusted = cloud.chosen((cloud.trust >= MIN_TRUST) & (np.linalg.norm(cloud.points, axis=1) < 1))
     if not len(trusted):
-        return None
+        return 0.0
     trusted = trusted.chosen(np.arange(len(trusted)) % max(1, len(trusted) // MAX_POINTS) == 0)
     votes = np.zeros((2, cells, cells, cells), np.float32)
     depth_kernels.line_votes(trusted.points, trusted.starts, trusted.photos, centers, BEHIND, votes)
     ball = np.where(np.linalg.norm(cube(cells), axis=-1) < BALL, -1.0, 1.0)
-    inside = _solved(votes, ball) < 0
-    if not inside.any() or inside.all():
-        return None
-    return Carved(distances_to(inside), _explained(inside, votes[0] > 0, trusted, ground))
+    return _covered(_solved(votes, ball) < 0, votes[0] > 0, trusted, ground)
 
 
-def _explained(
+def _covered(
     inside: Bool[np.ndarray, "g g g"], free: Bool[np.ndarray, "g g g"], trusted: PointCloud, ground: Plane | None
 ) -> float:
-    """See `Carved`; a cell counts with the points of those around it."""
+    """Share of the cells at the surface that hold points enough, those around them included."""
     from scipy.ndimage import binary_dilation, uniform_filter
 
     cells = len(inside)
