@@ -163,11 +163,19 @@ class UndistortParams(Section):
 class DensifyParams(Section):
     """Pinhole images to depth maps and a point cloud."""
 
-    method: Literal["auto", "off"] = Field(
-        "auto", description="auto: semi-global matching of neighbouring photos; off: no dense points"
+    method: Literal["auto", "patch_match", "off"] = Field(
+        "auto",
+        description="auto: semi-global matching of neighbouring photos; patch_match: COLMAP's, which needs a GPU and a "
+        "pycolmap that was built with CUDA; off: no dense points",
     )
     side: int = Field(1000, ge=64, description="photos are compared at this longest side, pixels")
     neighbors: int = Field(4, ge=1, le=20, description="photos that each photo is compared with")
+
+
+class HeldOutDensifyParams(DensifyParams):
+    """With `train.hold_out`, as it reaches the stage: photos held out from training make no dense points either."""
+
+    hold_out: int = 0
 
 
 class ExtractParams(Section):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from configs.params import SfmParams
-from stages.posing.features import extract
+from stages.posing.features import append, extract
 from stages.posing.settings import feature_options
 
 WIDTH, HEIGHT = 320, 240
@@ -81,3 +81,46 @@ def test_where_the_first_photos_are_plain_the_others_are_not_tried(tmp_path: Pat
     monkeypatch.setattr(pycolmap, "extract_features", lambda *_, **options: searched.append(options["image_names"]))
     extract(found, tmp_path / "photos", SfmParams(), 1, False)
     assert searched == [["plain0.png", "plain8.png"], names]
+
+
+def test_features_and_matches_are_appended(tmp_path: Path):
+    import pycolmap
+
+    random = np.random.default_rng(0)
+
+    def written(path: Path, counts: list[int], matches: dict[tuple[int, int], list[list[int]]]) -> Path:
+        with pycolmap.Database.open(path) as opened:
+            camera = opened.write_camera(pycolmap.Camera.create_from_model_name(0, "SIMPLE_RADIAL", 90.0, 64, 48))
+            for number, count in enumerate(counts):
+                image_id = opened.write_image(pycolmap.Image(name=f"{number}.jpg", camera_id=camera))
+                opened.write_keypoints(image_id, random.uniform(1, 48, (count, 6)).astype(np.float32))
+                data = random.integers(1, 255, (count, 128), dtype=np.uint8)
+                opened.write_descriptors(
+                    image_id, pycolmap.FeatureDescriptors(pycolmap.FeatureExtractorType.SIFT, data)
+                )
+            for pair, indices in matches.items():
+                opened.write_matches(*pair, np.array(indices, np.uint32))
+                opened.write_two_view_geometry(*pair, pycolmap.TwoViewGeometry())
+        return path
+
+    own = written(tmp_path / "own.db", [3, 4, 5], {(1, 2): [[0, 1], [2, 3]], (1, 3): [[2, 2]]})
+    more = written(tmp_path / "more.db", [6, 7, 8], {(1, 2): [[5, 0]], (2, 3): [[1, 7]]})
+    with pycolmap.Database.open(own) as opened:
+        before = [(opened.read_keypoints(i), np.asarray(opened.read_descriptors(i).data)) for i in (1, 2, 3)]
+    append(more, own, [(1, 2)])
+    with pycolmap.Database.open(own) as opened:
+        assert [opened.num_keypoints_for_image(i) for i in (1, 2, 3)] == [3 + 6, 4 + 7, 5]
+        for i, (keypoints, data) in enumerate(before, 1):
+            np.testing.assert_array_equal(opened.read_keypoints(i)[: len(keypoints)], keypoints)
+            got = np.asarray(opened.read_descriptors(i).data)
+            assert len(got) == opened.num_keypoints_for_image(i)
+            np.testing.assert_array_equal(got[: len(data)], data)
+            assert not got[len(data) :].any()
+        np.testing.assert_array_equal(opened.read_matches(1, 2), [[0, 1], [2, 3], [5 + 3, 0 + 4]])
+        np.testing.assert_array_equal(opened.read_matches(1, 3), [[2, 2]])
+        assert not opened.exists_two_view_geometry(1, 2)
+        assert opened.exists_two_view_geometry(1, 3)
+        assert not opened.exists_matches(2, 3)
+    append(more, own, [(2, 3)])
+    with pycolmap.Database.open(own) as opened:
+        np.testing.assert_array_equal(opened.read_matches(2, 3), [[1 + 4 + 7, 7 + 5]])

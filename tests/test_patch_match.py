@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from rigs import capture, look_at
+from rigs import capture, look_at, scene_without_points
 
 from stages.artifacts import Pictures, write_png
-from stages.geometry.cameras import PinholeCameras
+from stages.geometry.cameras import PinholeCameras, PosedScene
 from stages.stereo import patch_match
 from stages.stereo.patch_match import patch_match_depths, read_agreeing, read_array, reduced_cameras, write_workspace
 
@@ -41,6 +42,11 @@ def on_plane(count: int = 60) -> tuple[np.ndarray, np.ndarray]:
     points = np.random.default_rng(0).uniform(-0.5, 0.5, (count, 3))
     points[:, 2] = (HEIGHT - points[:, :2] @ NORMAL[:2]) / NORMAL[2]
     return points, np.array([(photo, point) for photo in range(4) for point in range(count)])
+
+
+def posed(cameras: PinholeCameras, points: np.ndarray, observations: np.ndarray) -> PosedScene:
+    sparse = {"points": points.astype(np.float32), "point_errors": np.zeros(len(points), np.float32)}
+    return replace(scene_without_points(cameras), **sparse, observations=observations)
 
 
 def plane_depths(cameras: PinholeCameras, index: int) -> np.ndarray:
@@ -79,7 +85,7 @@ def test_colmap_fuses_the_maps_to_the_plane(cameras: PinholeCameras, pictures: P
     import pycolmap
 
     folder = tmp_path / "workspace"
-    reduced = write_workspace(cameras, pictures, *on_plane(), folder, max_side=120)
+    reduced = write_workspace(posed(cameras, *on_plane()), pictures, folder, max_side=120)
     write_maps(folder, reduced)
     (tmp_path / "fused").mkdir()
     options = pycolmap.StereoFusionOptions()
@@ -96,16 +102,17 @@ def test_colmap_reads_cameras_and_points(cameras: PinholeCameras, pictures: Pict
 
     points, observations = on_plane()
     seen_by_one = np.concatenate([points, [[0.0, 0, 3]]])
-    write_workspace(cameras, pictures, seen_by_one, np.append(observations, [[0, 60]], 0), tmp_path / "out", 120)
+    scene = posed(cameras, seen_by_one, np.append(observations, [[0, 60]], 0))
+    write_workspace(scene, pictures, tmp_path / "out", 120)
     model = pycolmap.Reconstruction(str(tmp_path / "out" / "sparse"))
     assert {image.name for image in model.images.values()} == {f"{i:06d}.png" for i in range(4)}
     assert {(camera.model_name, camera.width, camera.height) for camera in model.cameras.values()} == {
         ("PINHOLE", 120, 103)  # 140 x 120 became 120 x 103, 160 x 120 became 120 x 90
     }
     assert model.num_points3D() == 60
-    assert model.compute_mean_reprojection_error() < 1e-9
+    assert model.compute_mean_reprojection_error() < 1e-4
     points3d = np.array([model.points3D[k].xyz for k in sorted(model.points3D)])
-    np.testing.assert_allclose(points3d, points, atol=1e-9)
+    np.testing.assert_allclose(points3d, points, atol=1e-6)
     camera = model.cameras[model.images[1].camera_id]
     np.testing.assert_allclose(camera.params, [112.5, 112.5, 59.5, 44.5])
     picture = Pictures(tmp_path / "out").image("000000.png")
@@ -117,7 +124,8 @@ def test_photos_that_see_nothing_are_no_problems_to_solve(
     cameras: PinholeCameras, pictures: Pictures, tmp_path: Path
 ) -> None:
     points, observations = on_plane()
-    write_workspace(cameras, pictures, points, observations[observations[:, 0] != 2], tmp_path / "out", 120)
+    scene = posed(cameras, points, observations[observations[:, 0] != 2])
+    write_workspace(scene, pictures, tmp_path / "out", 120)
     problems = (tmp_path / "out" / "stereo" / "patch-match.cfg").read_text().splitlines()
     assert problems[::2] == ["000000.png", "000001.png", "000003.png"]
     assert set(problems[1::2]) == {"__auto__, 20"}
@@ -128,7 +136,7 @@ def test_depths_come_back_by_photo(
 ) -> None:
     import pycolmap
 
-    folder, told, asked = tmp_path / "out", [], []
+    folder, told, asked, scene = tmp_path / "out", [], [], posed(cameras, *on_plane())
     reduced = reduced_cameras(cameras, 120)
 
     def match(workspace: Path, options) -> None:
@@ -137,7 +145,7 @@ def test_depths_come_back_by_photo(
 
     monkeypatch.setattr(pycolmap, "patch_match_stereo", match)
     monkeypatch.setattr(patch_match, "POLL_S", 0.001)
-    found = list(patch_match_depths(cameras, pictures, *on_plane(), folder, 120, lambda *done: told.append(done)))
+    found = list(patch_match_depths(scene, pictures, folder, 120, lambda *done: told.append(done)))
     assert [index for index, _, _ in found] == [0, 2, 3]
     for index, depth, trust in found:
         np.testing.assert_allclose(depth, plane_depths(reduced, index), rtol=1e-6)
@@ -149,7 +157,7 @@ def test_depths_come_back_by_photo(
 @pytest.mark.skipif("__import__('pycolmap').has_cuda", reason="there is a GPU, or may be")
 def test_without_cuda_colmap_says_so(cameras: PinholeCameras, pictures: Pictures, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="CUDA"):
-        list(patch_match_depths(cameras, pictures, *on_plane(), tmp_path / "out", 120, lambda *done: None))
+        list(patch_match_depths(posed(cameras, *on_plane()), pictures, tmp_path / "out", 120, lambda *done: None))
 
 
 def test_the_formats_as_they_are_documented(tmp_path: Path) -> None:

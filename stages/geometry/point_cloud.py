@@ -43,8 +43,8 @@ class PointCloud:
         return PointCloud(nothing, nothing, nothing.astype(np.uint8), np.zeros(0, np.float32), starts, photos)
 
     def moved(self, target_from_poses: Similarity) -> PointCloud:
-        """The same points in another frame."""
-        points = target_from_poses.apply(self.points).astype(np.float32)
+        """The same points in another frame, as float64: there they may be millions of metres from its origin."""
+        points = target_from_poses.apply(self.points.astype(np.float64))
         normals = (self.normals @ target_from_poses.rotation.T).astype(np.float32)
         return PointCloud(points, normals, self.colors, self.trust, self.starts, self.photos)
 

@@ -8,8 +8,11 @@ photo's own size, and finds the same features.
 from __future__ import annotations
 
 import shutil
+from collections.abc import Collection, Iterable
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from stages.posing.adding import copy_keypoints
 from stages.posing.settings import feature_options
@@ -27,22 +30,26 @@ def extract(
     cuda: bool,
     affine: bool = False,
     masks_folder: Path | None = None,
+    among: Collection[int] | None = None,
 ) -> None:
-    """Write the features of all photos of a database that have none yet.
+    """Write the features of photos of a database that have none yet.
 
     Args:
         params: `configs.params.SfmParams`.
         workers, cuda, affine: see `stages.posing.settings.feature_options`.
         masks_folder: features are looked for where PHOTO.png in there is not black; everywhere without.
+        among: ids of the images; all without.
     """
     import pycolmap
 
+    names = _without_features(database, among)
+    if not names:
+        return
     reader = pycolmap.ImageReaderOptions()
     if masks_folder is not None:
         reader.mask_path = str(masks_folder)
     options = feature_options(params, workers, cuda, affine)
-    names = _without_features(database)
-    if names and not options["extraction_options"].use_gpu:
+    if not options["extraction_options"].use_gpu:
         _extract_rich(database, images_folder, reader, names, feature_options(params, workers, cuda, affine))
     pycolmap.extract_features(database, images_folder, image_names=names, reader_options=reader, **options)
 
@@ -70,12 +77,13 @@ def _extract_rich(database: Path, images_folder: Path, reader: Any, names: list[
     scratch.unlink()
 
 
-def _without_features(database: Path) -> list[str]:
+def _without_features(database: Path, among: Collection[int] | None) -> list[str]:
     import pycolmap
 
     with pycolmap.Database.open(database) as opened:
-        images = sorted(opened.read_all_images(), key=lambda image: image.image_id)
-        return [image.name for image in images if not opened.exists_keypoints(image.image_id)]
+        images = {image.image_id: image.name for image in opened.read_all_images()}
+        ids = sorted(images if among is None else among)
+        return [images[i] for i in ids if not opened.exists_keypoints(i)]
 
 
 def _rich(database: Path, least: int) -> list[int]:
@@ -85,3 +93,43 @@ def _rich(database: Path, least: int) -> list[int]:
     with pycolmap.Database.open(database) as opened:
         ids = sorted(image.image_id for image in opened.read_all_images())
         return [i for i in ids if opened.num_keypoints_for_image(i) >= least]
+
+
+def append(source: Path, database: Path, pairs: Iterable[tuple[int, int]]) -> None:
+    """Put the features of images, and what matches of them, beside those the images have in another database.
+
+    The pairs (of image ids, the same in both) have to be verified again. What was appended matches nothing by itself:
+    features of one and the same spot, each the other's rival, would pass no test. So its descriptors are zero.
+    """
+    import pycolmap
+
+    pairs = sorted(pairs)
+    with (
+        pycolmap.Database.open(source) as own,
+        pycolmap.Database.open(database) as opened,
+        pycolmap.DatabaseTransaction(opened),
+    ):
+        more = {i: own.read_keypoints(i) for i in sorted({i for pair in pairs for i in pair})}
+        before = {i: opened.read_keypoints(i) for i in more}
+        for i, keypoints in more.items():
+            opened.update_keypoints(i, np.concatenate([before[i], keypoints]))
+        _pad_descriptors(opened, {i: len(keypoints) for i, keypoints in more.items()})
+        for i, j in pairs:
+            matches = [own.read_matches(i, j) + np.array([len(before[i]), len(before[j])], np.uint32)]
+            if opened.exists_matches(i, j):
+                matches.insert(0, opened.read_matches(i, j))
+                opened.delete_matches(i, j)
+            if opened.exists_two_view_geometry(i, j):
+                opened.delete_two_view_geometry(i, j)
+            opened.write_matches(i, j, np.concatenate(matches).astype(np.uint32))
+
+
+def _pad_descriptors(database: Any, rows: dict[int, int]) -> None:
+    """Append so many rows of zeros to the descriptors of images of an open database."""
+    found = {image.image_id: database.read_descriptors(image.image_id) for image in database.read_all_images()}
+    database.clear_descriptors()  # one image's cannot be replaced
+    for image_id, descriptors in found.items():
+        if image_id in rows:
+            data = np.asarray(descriptors.data)
+            descriptors.data = np.concatenate([data, np.zeros((rows[image_id], data.shape[1]), data.dtype)])
+        database.write_descriptors(image_id, descriptors)

@@ -8,8 +8,9 @@ connect all photos.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
+from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,18 +25,43 @@ LARGEST = 300  # features of each photo that are looked at
 # all features, 99 in 100 share six.
 CLEAR = 6
 MOST, LEAST = 16, 6  # partners of a photo: clear ones, and whatever they share
+BEST, NEXT = 3, 2  # near a photo: partners that share most, and photos to each side in the order of names
 # COLMAP's tests of a match, as angles between descriptors: to the nearest one, and to it over that to the second.
 MAX_ANGLE, MAX_RATIO = 0.7, 0.8
 
 
 def likely_pairs(database: Path) -> list[tuple[int, int]]:
     """Pairs of image ids, sorted, the first of each the smaller one."""
+    ids, _, common = common_in(database)
+    return [(ids[i], ids[j]) for i, j in choose_pairs(common)]
+
+
+def near_pairs(database: Path, left_out: Collection[str]) -> list[tuple[int, int]]:
+    """Pairs among each of some photos and the few likely to show the same: the best partners, and those next in name.
+
+    Returns:
+        Pairs of image ids, sorted, the first of each the smaller one.
+    """
+    ids, names, common = common_in(database)
+    by_name = sorted(range(len(ids)), key=names.__getitem__)
+    pairs = set[tuple[int, int]]()
+    for place, i in enumerate(by_name):
+        if names[i] in left_out:
+            group = {*by_name[max(0, place - NEXT) : place + NEXT + 1], i}
+            group |= set([int(j) for j in np.argsort(-common[i], kind="stable") if j != i][:BEST])
+            pairs |= set(combinations(sorted(group), 2))
+    return [(ids[i], ids[j]) for i, j in sorted(pairs)]
+
+
+def common_in(database: Path) -> tuple[list[int], list[str], Int[np.ndarray, "n n"]]:
+    """Ids and names of a database's images, and how many of the largest features of each two match."""
     import pycolmap
 
     with pycolmap.Database.open(database) as opened:
-        ids = sorted(image.image_id for image in opened.read_all_images())
-        descriptors = [largest_descriptors(opened, image_id) for image_id in ids]
-    return [(ids[i], ids[j]) for i, j in choose_pairs(common_features(descriptors))]
+        images = sorted(opened.read_all_images(), key=lambda image: image.image_id)
+        ids = [image.image_id for image in images]
+        common = common_features([largest_descriptors(opened, image_id) for image_id in ids])
+    return ids, [image.name for image in images], common
 
 
 def largest_descriptors(database: Any, image_id: int) -> Float[np.ndarray, "k 128"]:

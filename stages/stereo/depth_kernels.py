@@ -14,6 +14,8 @@ _SAME_SURFACE = 1.0
 # Cosines: photos whose lines of sight to a point differ by more than 60 degrees say nothing of each other; nor does one
 # that sees the surface from behind, or almost from the side.
 _WIDE, _FACING = 0.5, 0.2
+# Neighbouring depths that differ by more than this part of them are two surfaces: no normal spans both.
+_NEAR = 0.05
 
 
 @njit(nogil=True, cache=True)
@@ -117,67 +119,63 @@ def _known(depth, v, u, dv, du, reach, near):  # pragma: no cover - compiled
 
 
 @njit(nogil=True, parallel=True, cache=True)
-def normals_of(depth, pixels_from_rays, reach, normals):  # pragma: no cover - compiled
-    """Unit normals [h, w, 3] of a depth map in the frame of its camera, towards it; 0 where they are not known.
+def normals_at(depth, rows, columns, pixels_from_rays, reach, normals):  # pragma: no cover - compiled
+    """Unit normals [n, 3] of a depth map in the frame of its camera, towards it; 0 where they are not known.
 
-    The plane through the places `reach` pixels to either side, where all four are known and near in depth.
+    The plane through the places `reach` pixels to either side, or nearer, where they are known and near in depth.
+
+    Args:
+        rows, columns: [n], pixels.
+        pixels_from_rays: [3, 3], intrinsics without skew.
+        normals: written.
     """
-    height, width = depth.shape
     m = pixels_from_rays
-    for v in prange(height):
-        for u in range(width):
-            normals[v, u] = 0
-            d = depth[v, u]
-            if d <= 0:
-                continue
-            near = d * 0.05
-            left, right = _known(depth, v, u, 0, -1, reach, near), _known(depth, v, u, 0, 1, reach, near)
-            up, down = _known(depth, v, u, -1, 0, reach, near), _known(depth, v, u, 1, 0, reach, near)
-            if left + right == 0 or up + down == 0:
-                continue
-            # pixels_from_rays: [2, 3] fx 0 cx, 0 fy cy
-            y0 = (v + 0.5 - m[1, 2]) / m[1, 1]
-            x0 = (u + 0.5 - m[0, 2]) / m[0, 0]
-            a, b, c, e = depth[v, u - left], depth[v, u + right], depth[v - up, u], depth[v + down, u]
-            xa, xb = x0 - left / m[0, 0], x0 + right / m[0, 0]
-            yc, ye = y0 - up / m[1, 1], y0 + down / m[1, 1]
-            px, py, pz = xb * b - xa * a, y0 * (b - a), b - a
-            qx, qy, qz = x0 * (e - c), ye * e - yc * c, e - c
-            nx, ny, nz = qy * pz - qz * py, qz * px - qx * pz, qx * py - qy * px
-            length = np.sqrt(nx * nx + ny * ny + nz * nz)
-            if length < 1e-20:
-                continue
-            normals[v, u, 0], normals[v, u, 1], normals[v, u, 2] = nx / length, ny / length, nz / length
+    for k in prange(len(rows)):
+        v, u = rows[k], columns[k]
+        normals[k] = 0
+        near = depth[v, u] * _NEAR
+        left, right = _known(depth, v, u, 0, -1, reach, near), _known(depth, v, u, 0, 1, reach, near)
+        up, down = _known(depth, v, u, -1, 0, reach, near), _known(depth, v, u, 1, 0, reach, near)
+        if left + right == 0 or up + down == 0:
+            continue
+        x0, y0 = (u + 0.5 - m[0, 2]) / m[0, 0], (v + 0.5 - m[1, 2]) / m[1, 1]
+        a, b, c, e = depth[v, u - left], depth[v, u + right], depth[v - up, u], depth[v + down, u]
+        xa, xb = x0 - left / m[0, 0], x0 + right / m[0, 0]
+        yc, ye = y0 - up / m[1, 1], y0 + down / m[1, 1]
+        px, py, pz = xb * b - xa * a, y0 * (b - a), b - a
+        qx, qy, qz = x0 * (e - c), ye * e - yc * c, e - c
+        nx, ny, nz = qy * pz - qz * py, qz * px - qx * pz, qx * py - qy * px
+        length = np.sqrt(nx * nx + ny * ny + nz * nz)
+        if length > 0:
+            normals[k, 0], normals[k, 1], normals[k, 2] = nx / length, ny / length, nz / length
 
 
 @njit(nogil=True, parallel=True, cache=True)
 def votes(
-    owner, rows, columns, points, normals, matrices, centers, sizes, starts, depths, trusted, tolerance, counts
+    center, others, points, normals, matrices, centers, sizes, starts, depths, trusted, tolerances, counts
 ):  # pragma: no cover - compiled
     """What other photos say of a photo's points.
 
     Args:
-        owner: the photo whose points these are.
-        rows, columns: where the points lie in `counts`.
+        center, others: of the photo whose points these are; the photos that are asked.
         points, normals: [n, 3]; a normal of zero is unknown.
         matrices, centers, sizes: [i, 3, 4] pixels from the frame, [i, 3], [i, 2] width and height.
         starts, depths, trusted: photo k's depths, row by row, begin at `starts[k]`; whether what is there is known to
             be there, and so excuses photos that do not see what is behind it.
-        tolerance: depths that differ by less than this part agree.
-        counts: [h, w, 3], added to: photos that look at the place, that agree, that see through it.
+        tolerances: [i], depths in these photos that differ by less than this part agree.
+        counts: [n, 3], written: photos that look at the place, that agree, that see through it.
     """
     for k in prange(len(points)):
         px, py, pz = points[k, 0], points[k, 1], points[k, 2]
-        ox, oy, oz = centers[owner, 0] - px, centers[owner, 1] - py, centers[owner, 2] - pz
+        nx, ny, nz = normals[k, 0], normals[k, 1], normals[k, 2]
+        ox, oy, oz = center[0] - px, center[1] - py, center[2] - pz
         own = np.sqrt(ox * ox + oy * oy + oz * oz)
-        for j in range(len(centers)):
-            if j == owner:
-                continue
+        asked, agree, through = 0, 0, 0
+        for j in others:
             cx, cy, cz = centers[j, 0] - px, centers[j, 1] - py, centers[j, 2] - pz
             length = np.sqrt(cx * cx + cy * cy + cz * cz)
             if ox * cx + oy * cy + oz * cz < _WIDE * own * length:
                 continue
-            nx, ny, nz = normals[k, 0], normals[k, 1], normals[k, 2]
             if (nx != 0 or ny != 0 or nz != 0) and nx * cx + ny * cy + nz * cz < _FACING * length:
                 continue
             m = matrices[j]
@@ -189,16 +187,15 @@ def votes(
             if not (u >= 0 and v >= 0 and u < sizes[j, 0] and v < sizes[j, 1]):
                 continue
             at = starts[j] + int(v) * sizes[j, 0] + int(u)
-            found = depths[at]
-            if found > 0 and found < z * (1 - tolerance) and trusted[at]:
+            found, margin = depths[at], tolerances[j] * z
+            if found > 0 and found < z - margin and trusted[at]:
                 continue
-            counts[rows[k], columns[k], 0] += 1
-            if found <= 0:
-                continue
-            if abs(found - z) <= tolerance * z:
-                counts[rows[k], columns[k], 1] += 1
-            elif found > z:
-                counts[rows[k], columns[k], 2] += 1
+            asked += 1
+            if found > z + margin:
+                through += 1
+            elif found >= z - margin:
+                agree += 1
+        counts[k, 0], counts[k, 1], counts[k, 2] = asked, agree, through
 
 
 @njit(nogil=True, cache=True)

@@ -6,20 +6,18 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from stages.geometry.cameras import PinholeCameras
-from stages.stereo.matching import disparities, in_pixels, warped
-from stages.stereo.pairs import neighbors_of, scores
-from stages.stereo.rectification import Rectified, View, rectify
+from stages.stereo.matching import disparities, evened, in_pixels, warped
+from stages.stereo.rectification import Rectified, View, rectify, tolerance_of
 
 if TYPE_CHECKING:
-    from jaxtyping import Float, Float32, Int16, Integer, UInt8
+    from jaxtyping import Float, Float32, Int16, UInt8
 
-# Depths of two pairs that differ by less than this part of them agree.
-TOLERANCE = 0.004
 # Of the pairs that know a depth, so many must agree; and never fewer than two.
 MAJORITY = 0.6
 
@@ -45,13 +43,6 @@ def views_of(cameras: PinholeCameras, side: int) -> list[View]:
     return views
 
 
-def pairs_of(
-    cameras: PinholeCameras, points: Float[np.ndarray, "p 3"], observations: Integer[np.ndarray, "m 2"], neighbors: int
-) -> list[tuple[int, int]]:
-    """Pairs of photos to compare, each photo with about `neighbors` others."""
-    return sorted(neighbors_of(scores(cameras, points, observations), neighbors))
-
-
 def depth_maps(
     views: Sequence[View],
     greys: Sequence[UInt8[np.ndarray, "h w"]],
@@ -69,18 +60,17 @@ def depth_maps(
     maps = []
     with ThreadPoolExecutor(max_workers=max(1, workers)) as pool:
         for k, compared in enumerate(_by_photo(len(views), greys, views, pairs, points_seen, pool)):
-            known = list(pool.map(lambda pair, k=k: _depth(views[k], pair, pair.right == k), compared))  # type: ignore[misc]
-            maps.append(_agreed(views[k], known))
+            maps.append(_agreed(views[k], list(pool.map(partial(_depth, k, views[k]), compared))))
             progress(k + 1)
     return maps
 
 
 def _by_photo(
     count: int,
-    greys: Sequence[np.ndarray],
+    greys: Sequence[UInt8[np.ndarray, "h w"]],
     views: Sequence[View],
     pairs: Sequence[tuple[int, int]],
-    points_seen: Sequence[np.ndarray],
+    points_seen: Sequence[Float[np.ndarray, "p 3"]],
     pool: ThreadPoolExecutor,
 ) -> Iterator[list[_Compared]]:
     """The pairs of each photo in turn; one is compared when its first photo needs it, forgotten after the second."""
@@ -95,8 +85,8 @@ def _by_photo(
         plane = rectify(views[left], views[right], np.concatenate([points_seen[left], points_seen[right]]))
         if plane is None:
             return None
-        turned = {k: warped(greys[k], views[k], plane, k == right) for k in pair}
-        return _Compared(left, right, plane, disparities(turned[left], turned[right], plane))
+        turned = [warped(greys[k], views[k], plane, k == right) for k in pair]
+        return _Compared(left, right, plane, disparities(*evened(*turned), plane))
 
     for k in range(count):
         new = [pair for pair in of_photo[k] if pair not in known]
@@ -107,11 +97,11 @@ def _by_photo(
                 del known[pair]
 
 
-def _depth(view: View, pair: _Compared, right: bool) -> np.ndarray:
+def _depth(photo: int, view: View, pair: _Compared) -> Float32[np.ndarray, "h w"]:
     """What a pair says of the depth of one of its photos' pixels, [h, w]; 0 where nothing."""
     from stages.stereo import depth_kernels
 
-    plane = pair.plane
+    plane, right = pair.plane, pair.right == photo
     found = in_pixels(pair.disparities, plane)
     depth = np.empty(view.size[::-1], np.float32)
     depth_kernels.depths_of(
@@ -127,12 +117,12 @@ def _depth(view: View, pair: _Compared, right: bool) -> np.ndarray:
     return depth
 
 
-def _agreed(view: View, known: Sequence[np.ndarray]) -> np.ndarray:
-    """The depth on which most of some maps agree, [h, w]; 0 where too few do."""
+def _agreed(view: View, known: Sequence[Float32[np.ndarray, "h w"]]) -> Float32[np.ndarray, "h w"]:
+    """The depth [h, w] on which most of some maps agree; 0 where too few do."""
     from stages.stereo import depth_kernels
 
     depth = np.zeros(view.size[::-1], np.float32)
     if len(known) >= 2:
         needed = np.array([max(2, int(np.ceil(MAJORITY * count))) for count in range(len(known) + 1)])
-        depth_kernels.agreed(np.stack(known), TOLERANCE, needed, depth)
+        depth_kernels.agreed(np.stack(known), tolerance_of(view), needed, depth)
     return depth

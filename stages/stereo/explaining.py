@@ -1,7 +1,8 @@
 """How much of what is to be reconstructed dense points explain already.
 
 What their lines of sight pass through is free, what lies behind them is solid; what is left has a surface, and points
-cover some of it: on polished metal a sixth, on a plain part with bores three fifths, on a helmet nine tenths.
+cover some of it. On polished metal they cover a sixth, on a plain part with bores three fifths, on a helmet nine
+tenths.
 """
 
 from __future__ import annotations

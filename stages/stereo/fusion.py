@@ -9,13 +9,16 @@ import numpy as np
 
 from stages.geometry.point_cloud import PointCloud
 from stages.stereo.rectification import View
-from stages.stereo.trust import places, view_normals
+from stages.stereo.trust import normals_at, places
 
 if TYPE_CHECKING:
-    from jaxtyping import Float, Float32, Int, UInt8
+    from jaxtyping import Float, Float32, Int, UInt8, UInt64
 
 # No more depths than this become points, evenly chosen of all: memory.
 MAX_DEPTHS = 4_000_000
+# Bits of a cell's place along an axis; with those of its size they fill 64. A cell is about a pixel wide, so that places
+# which share their last 19 bits are hundreds of photos apart.
+_BITS = 19
 
 
 def fused(
@@ -29,33 +32,34 @@ def fused(
     Cells double where pixels do, so that a close-up keeps its detail beside a photo from afar.
     """
     total = sum(int((trust > 0).sum()) for trust in trusts)
-    stride = max(1, int(np.ceil(np.sqrt(total / MAX_DEPTHS))))
-    rows, photos, cells = [], [], []
-    for k, view in enumerate(views):
-        v, u = (stride * each for each in np.nonzero(trusts[k][::stride, ::stride] > 0))
-        at, trust = places(view, depths[k], v, u), trusts[k][v, u]
-        normals = view_normals(view, depths[k])[v, u]
-        rows.append(
-            np.column_stack([at, normals, colors[k][v, u], np.ones(len(v))]).astype(np.float32) * trust[:, None]
-        )
-        photos.append(np.full(len(v), k, np.int32))
-        cells.append(_cells(at, depths[k][v, u] * stride / view.matrix[0, 0]))
     if not total:
         return PointCloud.empty()
+    stride = max(1, int(np.ceil(np.sqrt(total / MAX_DEPTHS))))
+    rows, photos, cells = [], [], []
+    for k, (view, depth, trust) in enumerate(zip(views, depths, trusts, strict=True)):
+        v, u = (stride * each for each in np.nonzero(trust[::stride, ::stride] > 0))
+        at, weights = places(view, depth, v, u), trust[v, u][:, None]
+        row = np.empty((len(v), 10), np.float32)
+        row[:, :3], row[:, 3:6], row[:, 6:9], row[:, 9] = at, normals_at(view, depth, v, u), colors[k][v, u], 1
+        rows.append(row * weights)
+        photos.append(np.full(len(v), k, np.int32))
+        cells.append(_cells(at, depth[v, u] * stride / view.focal))
     return _means(np.concatenate(rows), np.concatenate(photos), np.concatenate(cells))
 
 
-def _cells(points: Float[np.ndarray, "n 3"], widths: Float[np.ndarray, " n"]) -> Int[np.ndarray, "n 4"]:
-    """The cell of each point: its size as a power of two, and where it is on a grid of that size."""
+def _cells(points: Float[np.ndarray, "n 3"], widths: Float[np.ndarray, " n"]) -> UInt64[np.ndarray, " n"]:
+    """A number for the cell of each point: of its size as a power of two, and where it is on a grid of that size."""
     octave = np.round(np.log2(widths)).astype(np.int64)
-    return np.column_stack([octave, np.floor(points / 2.0 ** octave[:, None]).astype(np.int64)])
+    key = octave.astype(np.uint64)
+    for column in np.floor(points / 2.0 ** octave[:, None]).astype(np.int64).T:
+        key = key << np.uint64(_BITS) | column.astype(np.uint64) & np.uint64(2**_BITS - 1)
+    return key
 
 
-def _means(rows: Float[np.ndarray, "n 10"], photos: Int[np.ndarray, " n"], cells: Int[np.ndarray, "n 4"]) -> PointCloud:
+def _means(
+    rows: Float32[np.ndarray, "n 10"], photos: Int[np.ndarray, " n"], key: UInt64[np.ndarray, " n"]
+) -> PointCloud:
     """One point for each cell; rows are place, normal, colour and 1, times trust."""
-    key = np.zeros(len(cells), np.uint64)
-    for factor, column in zip((0x9E3779B97F4A7C15, 73856093, 19349663, 83492791), cells.T, strict=True):
-        key = (key ^ column.astype(np.uint64)) * np.uint64(factor | 1) + np.uint64(factor >> 7)
     order = np.lexsort((photos, key))
     key, photos = key[order], photos[order]
     first = np.flatnonzero(np.concatenate([[True], key[1:] != key[:-1]]))

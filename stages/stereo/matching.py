@@ -19,6 +19,8 @@ P1, P2 = 8 * BLOCK**2, 32 * BLOCK**2
 UNIQUENESS, MAX_CHANGE = 8, 1
 # Islands of so many pixels are noise, where disparities within this many pixels belong together.
 SPECKLE, SPECKLE_RANGE = 60, 2
+# Standard deviation of grey values; with less there is nothing to even.
+LEAST_CONTRAST = 2.0
 # OpenCV's fixed point.
 STEPS = 16.0
 _HALF = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])
@@ -31,6 +33,33 @@ def warped(photo: UInt8[np.ndarray, "h w"], view: View, plane: Rectified, right:
     matrix = np.linalg.inv(_HALF) @ plane.homography(view, right) @ _HALF  # OpenCV's pixel centres are whole numbers
     turned: np.ndarray = cv2.warpPerspective(photo, matrix, plane.size, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
     return turned
+
+
+def evened(
+    left: UInt8[np.ndarray, "a b"], right: UInt8[np.ndarray, "a b"]
+) -> tuple[UInt8[np.ndarray, "a b"], UInt8[np.ndarray, "a b"]]:
+    """Both with the mean and contrast of the one that has more, where both show something: an exposure that jumps."""
+    import cv2
+
+    both = ((left > 0) & (right > 0)).astype(np.uint8)
+    (mean_left, spread_left), (mean_right, spread_right) = (
+        [float(each[0, 0]) for each in cv2.meanStdDev(photo, mask=both)] for photo in (left, right)
+    )
+    if min(spread_left, spread_right) < LEAST_CONTRAST:
+        return left, right
+    if spread_left < spread_right:
+        return _stretched(left, spread_right / spread_left, mean_left, mean_right), right
+    return left, _stretched(right, spread_left / spread_right, mean_right, mean_left)
+
+
+def _stretched(photo: UInt8[np.ndarray, "a b"], factor: float, mean: float, onto: float) -> UInt8[np.ndarray, "a b"]:
+    """Values `factor` times as far from another mean; black, which is nothing, stays."""
+    import cv2
+
+    table = np.clip(np.round(factor * (np.arange(256) - mean) + onto), 1, 255).astype(np.uint8)
+    table[0] = 0
+    stretched: np.ndarray = cv2.LUT(photo, table)
+    return stretched
 
 
 def disparities(

@@ -17,7 +17,7 @@ import numpy as np
 
 from stages.artifacts.pictures import IMAGES, Pictures, write_png
 from stages.compiling import njit
-from stages.geometry.cameras import PinholeCameras
+from stages.geometry.cameras import PinholeCameras, PosedScene
 from stages.posing.colmap_model import pinhole_model
 from stages.stereo.depths import views_of
 
@@ -36,10 +36,8 @@ MIN_POINTS = 3
 
 
 def patch_match_depths(
-    cameras: PinholeCameras,
+    scene: PosedScene,
     pictures: Pictures,
-    points: Float[np.ndarray, "p 3"],
-    observations: Integer[np.ndarray, "m 2"],
     folder: Path,
     max_side: int,
     progress: Callable[[float, float, str], None],
@@ -47,34 +45,26 @@ def patch_match_depths(
     """Match all photos with their neighbours, then give them back one by one. Needs a GPU.
 
     Args:
-        cameras: of the pictures. points: sparse ones in their frame.
-        observations: rows (photo, point): which photo saw which point. They choose neighbours and ranges of depth.
+        scene: of the pictures; its sparse points choose neighbours and ranges of depth.
         folder: empty; takes the photos, and some 50 bytes a pixel of each. The caller's to remove.
         max_side: photos are reduced to so many pixels along their longer side.
         progress: told how many of how many maps are there; each photo has two.
 
     Returns:
-        Number of the photo, its depths along the optical axis in the cameras' unit, 0 where unknown, and their trust in
-        [0, 1]. Photos that overlap with no other are left out.
+        Number of the photo, its depths along the optical axis in units of the scene, 0 where unknown, and their trust
+        in [0, 1]. Photos that overlap with no other are left out.
 
     Raises:
         ValueError: pycolmap's, where there is no GPU.
     """
-    reduced = write_workspace(cameras, pictures, points, observations, folder, max_side)
-    _match(folder, len(cameras), progress)
-    for index in range(len(cameras)):
+    reduced = write_workspace(scene, pictures, folder, max_side)
+    _match(folder, len(reduced), progress)
+    for index in range(len(reduced)):
         if depth_path(folder, index).exists():
             yield index, *read_depths(folder, index, reduced.sizes[index])
 
 
-def write_workspace(
-    cameras: PinholeCameras,
-    pictures: Pictures,
-    points: Float[np.ndarray, "p 3"],
-    observations: Integer[np.ndarray, "m 2"],
-    folder: Path,
-    max_side: int,
-) -> PinholeCameras:
+def write_workspace(scene: PosedScene, pictures: Pictures, folder: Path, max_side: int) -> PinholeCameras:
     """Write images/, sparse/ and stereo/ for COLMAP; arguments as above. Returns the cameras of the reduced photos.
 
     Photos are numbered, for COLMAP takes commas, blanks and `#` in names amiss. All have one size, with a black margin
@@ -82,7 +72,7 @@ def write_workspace(
     """
     import cv2
 
-    reduced = reduced_cameras(cameras, max_side)
+    cameras, reduced = scene.cameras, reduced_cameras(scene.cameras, max_side)
     width, height = reduced.sizes.max(0).tolist()
     for index, name in enumerate(cameras.names):
         size = tuple(reduced.sizes[index].tolist())
@@ -96,10 +86,10 @@ def write_workspace(
         intrinsics=reduced.intrinsics - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]),  # its stereo has whole centres
     )
     (folder / "sparse").mkdir(parents=True)
-    sparse_model(colmap, points, observations).write_binary(str(folder / "sparse"))
+    sparse_model(colmap, scene.points, scene.observations).write_binary(str(folder / "sparse"))
     for kind in ("depth_maps", "normal_maps", "consistency_graphs"):
         (folder / "stereo" / kind).mkdir(parents=True)
-    seen = np.bincount(observations[:, 0], minlength=len(cameras))
+    seen = np.bincount(scene.observations[:, 0], minlength=len(cameras))
     names = [_name(index) for index in np.flatnonzero(seen >= MIN_POINTS).tolist()]
     problems = "".join(f"{name}\n__auto__, {SOURCES}\n" for name in names)
     (folder / "stereo" / "patch-match.cfg").write_text(problems, encoding="ascii")

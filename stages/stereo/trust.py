@@ -8,17 +8,18 @@ it from within 60 degrees that find it too; and a photo is only asked where noth
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from stages.stereo.rectification import View
+from stages.stereo.rectification import View, tolerance_of
 
 if TYPE_CHECKING:
-    from jaxtyping import Bool, Float, Float32
+    from jaxtyping import Bool, Float, Float32, Int
 
-# Depths that differ by less than this part of them agree.
-TOLERANCE = 0.008
+# Depths of two photos agree within this many times what those of one photo's pairs agree within.
+TOLERANCES = 2.0
 # The share of photos that must find a place for it to count at all, and to count in full: on polished metal (1 and 3 %
 # off) a tenth of the places have more than the middle of the two, on a helmet and a plain plaster part 90 and 65 %.
 SUPPORT = (0.15, 0.45)
@@ -26,8 +27,26 @@ SUPPORT = (0.15, 0.45)
 UNCONTRADICTED = (0.4, 0.8)
 # Trust from which a place hides what is behind it.
 KNOWN = 0.5
+# So many photos are asked at most of what one shows, and so many of its places choose them: the cost is to grow with
+# the photos, not with their square.
+MOST_ASKED, SAMPLE = 64, 200
 # Votes are taken at every other pixel, and summed over so many of those to either side: one place has too few.
 _STRIDE, _REACH = 2, 4
+# Pixels to either side that a normal is fitted to.
+_REACH_NORMAL = 3
+
+
+@dataclass(frozen=True)
+class _Photos:
+    """All photos as the compiled loop reads them, see `depth_kernels.votes`; and which have any depth."""
+
+    matrices: Float[np.ndarray, "i 3 4"]
+    centers: Float[np.ndarray, "i 3"]
+    sizes: Int[np.ndarray, "i 2"]
+    starts: Int[np.ndarray, " i+1"]
+    depths: Float32[np.ndarray, " all"]
+    tolerances: Float[np.ndarray, " i"]
+    find: Bool[np.ndarray, " i"]
 
 
 def trust_of(views: Sequence[View], depths: Sequence[Float32[np.ndarray, "h w"]]) -> list[Float32[np.ndarray, "h w"]]:
@@ -35,37 +54,55 @@ def trust_of(views: Sequence[View], depths: Sequence[Float32[np.ndarray, "h w"]]
 
     In two rounds: only the first one's trusted places excuse photos from seeing what is behind them in the second.
     """
-    nothing = [np.zeros(depth.shape, bool) for depth in depths]
-    first = _round(views, depths, nothing)
-    return _round(views, depths, [trust > KNOWN for trust in first])
+    sizes = np.array([view.size for view in views]).reshape(-1, 2)
+    photos = _Photos(
+        matrices=np.stack([v.matrix @ np.c_[v.rotation, -v.rotation @ v.center] for v in views]),
+        centers=np.stack([view.center for view in views]),
+        sizes=sizes,
+        starts=np.concatenate([[0], np.cumsum(sizes.prod(1))]),
+        depths=np.concatenate([depth.ravel() for depth in depths]),
+        tolerances=np.array([TOLERANCES * tolerance_of(view) for view in views]),
+        find=np.array([(depth > 0).any() for depth in depths]),
+    )
+    owned = list(enumerate(zip(views, depths, strict=True)))
+    nothing = np.zeros(len(photos.depths), bool)
+    known = np.concatenate([_judged(k, *each, photos, nothing).ravel() > KNOWN for k, each in owned])
+    return [_judged(k, *each, photos, known) for k, each in owned]
 
 
-def _round(
-    views: Sequence[View], depths: Sequence[np.ndarray], known: Sequence[Bool[np.ndarray, "h w"]]
-) -> list[np.ndarray]:
+def _judged(
+    owner: int, view: View, depth: Float32[np.ndarray, "h w"], photos: _Photos, known: Bool[np.ndarray, " all"]
+) -> Float32[np.ndarray, "h w"]:
+    """Trust [h, w] of one photo's depths, where places `known` to be there hide what is behind them."""
     from stages.stereo import depth_kernels
 
-    matrices = np.stack([v.matrix @ np.c_[v.rotation, -v.rotation @ v.center] for v in views])
-    centers = np.stack([view.center for view in views])
-    sizes = np.array([view.size for view in views])
-    starts = np.concatenate([[0], np.cumsum(sizes.prod(1))])
-    all_depths = np.concatenate([depth.ravel() for depth in depths])
-    all_known = np.concatenate([each.ravel() for each in known])
-    trusts = []
-    for owner, (view, depth) in enumerate(zip(views, depths, strict=True)):
-        rows, columns = np.nonzero(depth[::_STRIDE, ::_STRIDE] > 0)
-        v, u = rows * _STRIDE, columns * _STRIDE
-        normals = view_normals(view, depth)[v, u]
-        counts = np.zeros((-(-depth.shape[0] // _STRIDE), -(-depth.shape[1] // _STRIDE), 3), np.float32)
-        depth_kernels.votes(
-            owner, rows, columns, places(view, depth, v, u), normals, matrices, centers, sizes, starts, all_depths,
-            all_known, TOLERANCE, counts,
-        )  # fmt: skip
-        trusts.append(_upsampled(_trust(counts), depth))
-    return trusts
+    rows, columns = np.nonzero(depth[::_STRIDE, ::_STRIDE] > 0)
+    v, u = rows * _STRIDE, columns * _STRIDE
+    at = places(view, depth, v, u)
+    found = np.zeros((len(at), 3), np.float32)
+    depth_kernels.votes(
+        view.center, _asked(owner, at, photos), at, normals_at(view, depth, v, u), photos.matrices, photos.centers,
+        photos.sizes, photos.starts, photos.depths, known, photos.tolerances, found,
+    )  # fmt: skip
+    counts = np.zeros((-(-depth.shape[0] // _STRIDE), -(-depth.shape[1] // _STRIDE), 3), np.float32)
+    counts[rows, columns] = found
+    return _upsampled(_trust(counts), depth)
 
 
-def places(view: View, depth: np.ndarray, v: np.ndarray, u: np.ndarray) -> Float[np.ndarray, "n 3"]:
+def _asked(owner: int, at: Float[np.ndarray, "n 3"], photos: _Photos) -> Int[np.ndarray, " j"]:
+    """The photos to ask of a photo's places: those that have some of them before them and found anything at all."""
+    some = at[:: max(1, len(at) // SAMPLE)]
+    pixels = some @ photos.matrices[:, :, :3].transpose(0, 2, 1) + photos.matrices[:, None, :, 3]
+    depth = np.maximum(pixels[..., 2:], 1e-12)
+    inside = (pixels[..., 2] > 0) & ((pixels[..., :2] >= 0) & (pixels[..., :2] < depth * photos.sizes[:, None])).all(-1)
+    asked = np.flatnonzero(inside.any(1) & photos.find & (np.arange(len(inside)) != owner))
+    few = np.linspace(0, len(asked) - 1, min(len(asked), MOST_ASKED)).astype(np.int64)
+    return asked[few]
+
+
+def places(
+    view: View, depth: Float32[np.ndarray, "h w"], v: Int[np.ndarray, " n"], u: Int[np.ndarray, " n"]
+) -> Float[np.ndarray, "n 3"]:
     """Where the pixels of these rows and columns lie, in the frame."""
     pixels = np.stack([u + 0.5, v + 0.5, np.ones(len(u))], 1)
     rays = pixels @ np.linalg.inv(view.matrix).T
@@ -73,12 +110,14 @@ def places(view: View, depth: np.ndarray, v: np.ndarray, u: np.ndarray) -> Float
     return in_frame
 
 
-def view_normals(view: View, depth: np.ndarray) -> Float[np.ndarray, "h w 3"]:
-    """Unit normals of a depth map in the frame, towards the photo; 0 where they are not known."""
+def normals_at(
+    view: View, depth: Float32[np.ndarray, "h w"], v: Int[np.ndarray, " n"], u: Int[np.ndarray, " n"]
+) -> Float32[np.ndarray, "n 3"]:
+    """Unit normals in the frame of the pixels of these rows and columns, towards the photo; 0 where not known."""
     from stages.stereo import depth_kernels
 
-    normals = np.zeros((*depth.shape, 3), np.float32)
-    depth_kernels.normals_of(depth, view.matrix[:2], 3, normals)
+    normals = np.empty((len(v), 3), np.float32)
+    depth_kernels.normals_at(depth, v, u, view.matrix, _REACH_NORMAL, normals)
     in_frame: np.ndarray = normals @ view.rotation.astype(np.float32)
     return in_frame
 

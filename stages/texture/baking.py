@@ -26,9 +26,9 @@ from stages.geometry.cameras import PinholeCameras
 from stages.surface.triangle_mesh import face_areas
 from stages.texture.filling import face_neighbors, harmonic_offsets, vertex_means
 from stages.texture.gains import solve_gains
-from stages.texture.observing import blend_texels, gather_texels, sample_points
+from stages.texture.observing import STEPS_UNSIGNED, blend_texels, gather_texels, sample_points
 from stages.texture.padding import pad_charts
-from stages.texture.photo_views import BYTES_PER_PIXEL, View, prepare_view
+from stages.texture.photo_views import View, prepare_view
 from stages.texture.sharpness import BLURRED, sharpness_of_photos
 
 # (photo index) -> [H, W, 3] uint8 RGB and [H, W] bool mask or None.
@@ -117,6 +117,7 @@ def bake_texture(
         raise ValueError(f"expected charts covering texels of a {size}² texture, got none")
     colors = np.zeros((num_texels, 3), dtype=np.uint8)
     seen_by = np.zeros(num_texels, dtype=np.uint16)
+    views = min(views, num_views)
     per_band = max(BAND_BYTES // (16 * (views + 1)), _CHUNK)
     bands = [slice(start, min(start + per_band, num_texels)) for start in range(0, num_texels, per_band)]
     total, done = num_views * (1 + len(bands)) + 1, itertools.count(1)
@@ -173,16 +174,16 @@ class _Prepare:
 
     def __init__(self, atlas: AtlasMesh, cameras: PinholeCameras, load_photo: LoadPhoto, texel_side: float) -> None:
         self.atlas, self.cameras, self.load_photo, self.texel_side = atlas, cameras, load_photo, texel_side
-        pixels = np.cumsum(cameras.sizes[:, 0] * cameras.sizes[:, 1])
-        self.keep = int(np.searchsorted(pixels * BYTES_PER_PIXEL, KEPT_BYTES, side="right"))
         self.kept: dict[int, View] = {}
+        self.room = KEPT_BYTES
 
     def __call__(self, index: int) -> View:
         if index in self.kept:
             return self.kept[index]
         photo, mask = self.load_photo(index)
         view = prepare_view(self.cameras, index, photo, mask, self.atlas.vertices, self.atlas.faces, self.texel_side)
-        if index < self.keep:
+        if view.nbytes <= self.room:
+            self.room -= view.nbytes
             self.kept[index] = view
         return view
 
@@ -224,7 +225,7 @@ def _compare(
         tell("comparing photos")
     # From the photos themselves: their low bands mix neighbouring colours, more so in slanted views.
     gains = solve_gains(colors.transpose(1, 0, 2), weights.T)
-    return gains, sharpness_of_photos((colors - lows).mean(2).T, weights.T)
+    return gains, sharpness_of_photos((colors - lows / STEPS_UNSIGNED).mean(2).T, weights.T)
 
 
 def _blend(
