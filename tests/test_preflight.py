@@ -209,7 +209,7 @@ def test_needs_grow_with_photos_as_measured():
     assert most == of(200, 1600, **plain).memory_gib == pytest.approx(1.5 + 2 * 1.43, abs=0.01)
     # past densify.side stereo takes no more: 200 megapixels and their maps
     for side in (1200, 4000):
-        assert of(200, side).memory_gib == pytest.approx(0.65 + 200 * 0.021, abs=0.01)
+        assert of(200, side).memory_gib == pytest.approx(0.5 + 200 * 0.021, abs=0.01)
     assert of(47, 1600, workers=16).memory_gib > of(47, 1600).memory_gib  # each thread looks for features
     assert of(47, 554, **{"train.minutes": 20}).minutes == pytest.approx(21.0, abs=0.5)
 
