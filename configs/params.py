@@ -158,6 +158,16 @@ class UndistortParams(Section):
     )
 
 
+class DensifyParams(Section):
+    """Pinhole images to depth maps and a point cloud."""
+
+    method: Literal["auto", "off"] = Field(
+        "auto", description="auto: semi-global matching of neighbouring photos; off: no dense points"
+    )
+    side: int = Field(1000, ge=64, description="photos are compared at this longest side, pixels")
+    neighbors: int = Field(4, ge=1, le=20, description="photos that each photo is compared with")
+
+
 class ExtractParams(Section):
     """Neural field to mesh."""
 
@@ -262,6 +272,7 @@ class Config(Section):
     sfm: SfmParams = SfmParams()
     place: PlaceParams = PlaceParams()
     undistort: UndistortParams = UndistortParams()
+    densify: DensifyParams = DensifyParams()
     train: TrainParams = TrainParams()
     extract: ExtractParams = ExtractParams()
     cleanup: CleanupParams = CleanupParams()

@@ -97,6 +97,16 @@ class LossParams(Section):
         0.01, ge=0, description="the SDF must have changed sign this far before and behind SfM points, scene units"
     )
     sparse_batch: int = Field(256, ge=0, description="sightings of SfM points per step")
+    dense: float = Field(3.0, ge=0, description="weight of the dense stereo points' terms, times each point's trust")
+    dense_end: float = Field(
+        1.0, gt=0, le=1, description="part of that weight which is left at the end, falling evenly on a log scale"
+    )
+    dense_tolerance: float = Field(0.003, gt=0, description="dense points off by this count linearly, scene units")
+    dense_step: float = Field(
+        0.01, ge=0, description="the SDF must have changed sign this far before and behind dense points, scene units"
+    )
+    dense_batch: int = Field(512, ge=0, description="sightings of dense points per step")
+    normals: float = Field(0.03, ge=0, description="weight of the dense points' normals, times each point's trust")
 
 
 class AmbiguityParams(Section):

@@ -20,7 +20,18 @@ import numpy as np
 
 from configs.training import TrainParams
 from stages import artifacts
-from stages.artifacts import CAMERAS, FIELD, FIRST_SCENE, HELD_OUT, METRICS, PINHOLE_PHOTOS, PREVIEWS, SCENE, Pictures
+from stages.artifacts import (
+    CAMERAS,
+    FIELD,
+    FIRST_SCENE,
+    HELD_OUT,
+    METRICS,
+    PINHOLE_PHOTOS,
+    POINT_CLOUD,
+    PREVIEWS,
+    SCENE,
+    Pictures,
+)
 from stages.engine.manifest import load_manifest
 from stages.engine.stage import Stage, StageContext
 from stages.errors import ConfigError, InputError, ReconstructionError
@@ -82,7 +93,8 @@ def run(context: StageContext[TrainParams]) -> dict[str, Any]:
         "train_seconds": round(seconds, 1),
         "rays_per_second": round(training.steps_done * params.sampling.rays / max(seconds, 1e-9)),
         "photos": len(trainer.photos),
-        "sightings": len(trainer.sightings.weights),
+        "sightings": len(trainer.sightings),
+        "dense_sightings": len(trainer.dense),
         "region_grown": round(training.region.radius if training.region else 1.0, 3),
         **summary,
     }
@@ -256,8 +268,11 @@ def _make_trainer(context: StageContext[TrainParams], scene: PosedScene) -> Any:
     _check_hold_out(len(held_out), int(held_out.sum()), params.hold_out)
     images = _load_images(context.read(PINHOLE_PHOTOS), scene.cameras.names)
     photos = Photos(scene.cameras, *images, context.device, ~held_out)
-    sightings = Sightings.from_scene(scene, context.device, (~held_out).numpy())
-    return Trainer(photos, sightings, params, context.device)
+    training = (~held_out).numpy()
+    sightings = Sightings.from_scene(scene, context.device, training)
+    cloud = context.read(POINT_CLOUD).moved(scene.poses_from_scene.inverse())
+    dense = Sightings.from_cloud(cloud, scene.cameras.centers, context.device, training)
+    return Trainer(photos, sightings, dense, params, context.device)
 
 
 # ---------------------------------------------------------------- a region that grows
@@ -503,7 +518,7 @@ TRAIN: Stage[TrainParams] = Stage(
     version=6,
     settings=lambda config: config.train,
     run=run,
-    reads=(FIRST_SCENE, PINHOLE_PHOTOS),
+    reads=(FIRST_SCENE, PINHOLE_PHOTOS, POINT_CLOUD),
     writes=(FIELD, CAMERAS, SCENE, METRICS, PREVIEWS, HELD_OUT),
     continues=True,
     summary="learn a signed distance field and its colours from the posed images",

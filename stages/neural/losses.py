@@ -63,6 +63,12 @@ def inside_error(sdf: Float[Tensor, " n"], margin: float) -> Float[Tensor, " n"]
     return torch.relu(sdf + margin)
 
 
+def normal_error(gradients: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
+    """1 - cos of the angle between grad f and the unit normal that stereo found; zero where that is zero: unknown."""
+    along = (torch.nn.functional.normalize(gradients, dim=-1) * normals).sum(-1)
+    return (normals * normals).sum(-1) - along
+
+
 def mask_error(opacity: Float[Tensor, " r"], mask: Float[Tensor, " r"]) -> Float[Tensor, " r"]:
     """Binary cross-entropy per ray between the rendered opacity and the mask, both in [0, 1] (NeuS, L_mask)."""
     return torch.nn.functional.binary_cross_entropy(opacity.clamp(1e-3, 1 - 1e-3), mask, reduction="none")

@@ -59,8 +59,10 @@ def field_shape(params: TrainParams, num_images: int, background: bool) -> Field
 class Trainer:
     """Networks, optimiser, sampler and random state: all that a checkpoint must hold."""
 
-    def __init__(self, photos: Photos, sightings: Sightings, params: TrainParams, device: torch.device | str) -> None:
-        self.photos, self.sightings, self.params = photos, sightings, params
+    def __init__(
+        self, photos: Photos, sightings: Sightings, dense: Sightings, params: TrainParams, device: torch.device | str
+    ) -> None:
+        self.photos, self.sightings, self.dense, self.params = photos, sightings, dense, params
         self.device = torch.device(device)
         background = params.field.background and photos.masks is None
         self.fields = Fields(field_shape(params, len(photos), background), params.seed).to(device)
@@ -88,7 +90,7 @@ class Trainer:
         self.cache_step = -(10**9)
         self.replay = Replay(self.device, self.generator) if self._replays() else None
         # What a graph reads anew at each step: the density's scale, the weight of the sightings.
-        self._scale, self._sparse_weight = torch.zeros(2, device=self.device).unbind()
+        self._scale, self._sparse_weight, self._dense_weight = torch.zeros(3, device=self.device).unbind()
         self._prepare_rates()
 
     def start_from(self, distances: Float[np.ndarray, "g g g"]) -> float:
@@ -131,23 +133,27 @@ class Trainer:
         decay = schedules.warm_up_then_decay if schedule.lr_decay == "cosine" else schedules.warm_up_then_exponential
         self._set_rates(decay(progress, schedule.lr_warm_up, schedule.lr_final))
         sparse_weight = weights.sparse * schedules.fade_out(progress, weights.sparse_until)
+        dense_weight = schedules.exponential(progress, 1.0, weights.dense_end)
         if self.replay is None:
-            numbers = self._update(moment, sparse_weight)
+            numbers = self._update(moment, sparse_weight, dense_weight)
         else:
             self._scale.fill_(moment.scale)
             self._sparse_weight.fill_(sparse_weight)
+            self._dense_weight.fill_(dense_weight)
             current = replace(moment, scale=self._scale)
-            numbers = self.replay(lambda: self._update(current, self._sparse_weight), moment.levels)
+            numbers = self.replay(lambda: self._update(current, self._sparse_weight, self._dense_weight), moment.levels)
         self.step_index += 1
         return numbers
 
-    def _update(self, moment: Moment, sparse_weight: Tensor | float) -> dict[str, Tensor]:
+    def _update(self, moment: Moment, sparse_weight: Tensor | float, dense_weight: Tensor | float) -> dict[str, Tensor]:
         """Rays, losses, gradients, and the optimiser's step."""
         sampling, weights = self.params.sampling, self.params.losses
         batch = self.photos.draw(sampling.rays, self.generator)
-        places, sparse_weights = self.sightings.draw(weights.sparse_batch, weights.sparse_step, self.generator)
+        sparse = self.sightings.draw(weights.sparse_batch, weights.sparse_step, self.generator)
+        dense = self.dense.draw(weights.dense_batch, weights.dense_step, self.generator)
         anywhere = torch.rand(sampling.free_points, 3, generator=self.generator, device=self.device) * 2 - 1
-        rendered = self.renderer.render(batch, moment, torch.cat([places, anywhere]), self.generator)
+        extra = torch.cat([sparse.places, dense.places, anywhere])
+        rendered = self.renderer.render(batch, moment, extra, self.generator)
         exposed = rendered.colors * torch.exp(self.fields.log_gains[batch.images])
         nothing = torch.zeros((), device=self.device)
 
@@ -163,7 +169,15 @@ class Trainer:
             [omega * losses.eikonal_error(rendered.gradients), losses.eikonal_error(rendered.extra_gradients)]
         ).mean()
         of_terms = self.terms.losses(rendered, moment)
-        sparse_loss = sighting_loss(rendered.extra_sdf[: len(places)], sparse_weights, weights)
+        first, last = len(sparse.places), len(sparse.places) + len(dense.places)
+        sparse_loss = sighting_loss(
+            rendered.extra_sdf[:first], sparse.weights, weights.sparse_tolerance, weights.sparse_step
+        )
+        dense_loss = sighting_loss(
+            rendered.extra_sdf[first:last], dense.weights, weights.dense_tolerance, weights.dense_step
+        )
+        on_points = rendered.extra_gradients[first : first + len(dense.weights)]
+        normal_loss = (dense.weights * losses.normal_error(on_points, dense.normals)).sum() / max(len(on_points), 1)
         exposure_loss = losses.exposure_error(self.fields.log_gains).mean()
         proposal_loss = self._proposal_loss(rendered)
 
@@ -172,6 +186,7 @@ class Trainer:
             + weights.eikonal * eikonal_loss
             + sum(weight * term_loss for weight, term_loss in of_terms.values())
             + sparse_weight * sparse_loss
+            + dense_weight * (weights.dense * dense_loss + weights.normals * normal_loss)
             + weights.mask * mask_loss
             + weights.exposure * exposure_loss
             + proposal_loss
@@ -192,6 +207,8 @@ class Trainer:
                 "eikonal": eikonal_loss.detach(),
                 **{name: term_loss.detach() for name, (_, term_loss) in of_terms.items()},
                 "sparse": sparse_loss.detach(),
+                "dense": dense_loss.detach(),
+                "normals": normal_loss.detach(),
                 "mask": mask_loss.detach(),
                 "proposal": proposal_loss.detach(),
                 "psnr": -10 * torch.log10(mse.clamp(min=1e-10)),
