@@ -54,10 +54,12 @@ class IngestParams(Section):
 class SfmParams(Section):
     """Images to camera poses (COLMAP)."""
 
-    matcher: Literal["auto", "exhaustive", "sequential", "spatial"] = Field(
-        "auto", description="which image pairs are matched; auto: exhaustive up to `exhaustive_max` photos"
+    matcher: Literal["auto", "preemptive", "exhaustive", "sequential", "spatial"] = Field(
+        "auto",
+        description="which image pairs are matched; preemptive: those of which large features match; auto: so up to "
+        "`exhaustive_max` photos",
     )
-    exhaustive_max: int = Field(150, ge=2, description="auto matches all pairs up to this many photos")
+    exhaustive_max: int = Field(150, ge=2, description="auto looks at all pairs up to this many photos")
     mapper: Literal["incremental", "global"] = Field("incremental", description="how poses are solved")
     wanted: float = Field(
         0.95,
@@ -245,10 +247,18 @@ class BakeParams(Section):
 
 
 class ExportParams(Section):
-    """Textured mesh to files."""
+    """Textured mesh, and dense points, to files."""
 
-    formats: tuple[Literal["glb", "usdz", "obj", "ply", "stl"], ...] = Field(
-        ("glb", "usdz", "obj", "ply"), description="files to write; stl is the bare shape"
+    formats: tuple[Literal["glb", "usdz", "obj", "ply", "stl", "points"], ...] = Field(
+        ("glb", "usdz", "obj", "ply"),
+        description="files to write; stl is the bare shape, points the dense points as PLY and LAZ",
+    )
+    points_trust: float = Field(
+        0.5, ge=0, le=1, description="dense points that are trusted less, from 0 to 1, are left out of their files"
+    )
+    points_from: Literal["region", "everywhere"] = Field(
+        "region",
+        description="which dense points: those in the region of interest, as of the mesh, or all",
     )
     lods: int = Field(
         0, ge=0, le=4, description="lighter GLBs with the same textures, each with half the faces of the one before"

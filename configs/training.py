@@ -30,10 +30,11 @@ class FieldParams(Section):
         "analytic", description="SDF gradients by differentiation, or central differences one active voxel to each side"
     )
     sphere_radius: float = Field(0.5, gt=0, lt=1, description="the SDF is this sphere before training, scene units")
-    init: Literal["auto", "sphere", "room", "hull"] = Field(
+    init: Literal["auto", "sphere", "room", "hull", "carved"] = Field(
         "auto",
-        description="the SDF before training: that sphere, a room around the cameras, or the visual hull of masks (one "
-        "for each photo); auto: a room where most cameras stand in that sphere, else it",
+        description="the SDF before training: that sphere, a room around the cameras, the visual hull of masks (one "
+        "for each photo), or what the dense points' lines of sight carve; auto: a room where most cameras stand in "
+        "that sphere, else carved, or the sphere where there are no trusted points",
     )
     background: bool = Field(True, description="model what lies outside the region (never where masks exist)")
     background_log2_rows: int = Field(15, ge=8, le=24, description="rows per level of the background's encoding")
@@ -174,7 +175,16 @@ class TermParams(Section):
 class TrainParams(Section):
     """Posed images to a neural signed distance field."""
 
-    steps: int = Field(8000, ge=1, description="optimiser steps (ignored where `minutes` is set)")
+    steps: int = Field(
+        8000, ge=1, description="optimiser steps where stereo explains nothing (ignored where `minutes` is set)"
+    )
+    steps_if_explained: float = Field(
+        0.2,
+        gt=0,
+        le=1,
+        description="part of `steps` that is enough where trusted dense points cover all of the surface; in between by "
+        "the share that they cover",
+    )
     minutes: float | None = Field(None, gt=0, description="wall-clock budget in minutes instead of steps")
     seed: int = Field(0, ge=0, description="random seed")
     hold_out: int = Field(

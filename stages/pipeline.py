@@ -29,6 +29,6 @@ PIPELINE: tuple[Stage[Any], ...] = (
     CLEANUP,  # mesh -> clean, light mesh
     ATLAS,  # clean mesh -> UV charts
     BAKE,  # charts + photos -> texture
-    EXPORT,  # textured mesh -> GLB, USDZ, OBJ, PLY, STL
+    EXPORT,  # textured mesh -> GLB, USDZ, OBJ, PLY, STL; points -> PLY, LAZ
     REPORT,  # everything -> one HTML page
 )

@@ -82,7 +82,7 @@ def test_set_takes_yaml_values(text: str, expected: Any) -> None:
         ("train.minutes=-1", "`train.minutes` = -1 in", "must be > 0"),
         ("bake.views=many", "`bake.views` = 'many' in", "must be whole number >= 1, <= 32"),
         ("sfm.matcher=off", "`sfm.matcher` = 'off' in", "auto | exhaustive"),
-        ("export.formats=[glb, fbx]", "`export.formats` = 'fbx' in", "list of (glb | usdz | obj | ply | stl)"),
+        ("export.formats=[glb, fbx]", "`export.formats` = 'fbx' in", "list of (glb | usdz | obj | ply | stl | points)"),
         ("sfm=3", "`sfm` in --set sfm=3 is a section of settings", "`sfm.matcher`"),
         ("sfm.seed", "is not of the form section.key=value", "--set sfm.seed=1"),
         ("sfm.seed=[1", "the value is not valid YAML", "Quote it"),

@@ -165,7 +165,7 @@ def test_focal_priors_are_forgotten(tmp_path: Path):
 def test_names_with_spaces_survive_a_list_of_pairs(tmp_path: Path):
     import pycolmap
 
-    from stages.posing.workbench import _named_by_number
+    from stages.posing.pairs import _named_by_number
 
     path = database(tmp_path / "a.db", turntable(30), [])
     with _named_by_number(path), pycolmap.Database.open(path) as opened:
@@ -246,13 +246,13 @@ def test_the_rungs_are_those_that_the_capture_allows(tmp_path: Path, monkeypatch
     bench = workbench(tmp_path)
     names = [rung.name for rung in bench.rungs() if rung.applies(None)]
     assert names == [
-        "exhaustive matching", "features inside the masks", "affine features",
+        "preemptive matching", "all pairs", "features inside the masks", "affine features",
         "corners with learned descriptors", "guided matching", "global mapper", "relaxed thresholds",
     ]  # fmt: skip
     guessed = tuple(replace(record, made_mask="salient") for record in bench.image_set.images)
     bench.image_set = ImageSet(guessed)
     names = [rung.name for rung in bench.rungs() if rung.applies(None)]
-    assert names[1:3] == ["affine features", "features inside the masks"]
+    assert names[2:4] == ["affine features", "features inside the masks"]
     (tmp_path / "other").mkdir()
     bench = workbench(tmp_path / "other", focal=180.0, matcher="sequential", mapper="global", masks="never")
     names = [rung.name for rung in bench.rungs() if rung.applies(None)]

@@ -44,7 +44,7 @@ def test_rendered_capture_gives_back_its_cameras(tmp_path: Path):
     assert numbers["registered"] == len(poses)
     assert numbers["attempts"] == 1
     registration = artifacts.REGISTRATION.load(out)
-    assert registration.matcher == "exhaustive"
+    assert registration.matcher == "preemptive"
     assert [item.name for item in registration.unregistered] == [f"{len(poses):03d}.png"]
     assert "matches no other photo" in registration.unregistered[0].reason
     assert registration.mean_reprojection_error_px < 1.0

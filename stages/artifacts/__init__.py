@@ -16,6 +16,7 @@ from stages.artifacts.export import (
     collision_path,
     lod_path,
     obj_normal_map_path,
+    points_path,
 )
 from stages.artifacts.ingest import IMAGE_SET, LEFT_OUT, PHOTOS, ImageRecord, ImageSet, SkippedImage
 from stages.artifacts.json_files import read_json, write_json

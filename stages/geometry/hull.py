@@ -129,17 +129,22 @@ def hull_distances(
     Returns:
         Axes x, y, z; or None where nothing, or all, is inside.
     """
-    from scipy.ndimage import distance_transform_edt
-
-    cell = 2.0 / cells
     grid = cube(cells).reshape(-1, 3)
     inside = (_inside_silhouettes(cameras, masks, grid) & (np.linalg.norm(grid, axis=1) < 1)).reshape([cells] * 3)
     if not inside.any() or inside.all():
         return None
+    return distances_to(inside)
+
+
+def distances_to(inside: Bool[np.ndarray, "g g g"]) -> Float32[np.ndarray, "g g g"]:
+    """Signed distance to what some cells of a grid over [-1, 1]^3 fill, negative inside, at the cells' centres."""
+    from scipy.ndimage import distance_transform_edt
+
     # The transforms count to the nearest centre on the other side; the surface is half a cell before it.
     outside_by = np.maximum(distance_transform_edt(~inside) - 0.5, 0)
     inside_by = np.maximum(distance_transform_edt(inside) - 0.5, 0)
-    return (cell * (outside_by - inside_by)).astype(np.float32)
+    distances: np.ndarray = (2.0 / len(inside) * (outside_by - inside_by)).astype(np.float32)
+    return distances
 
 
 def room_distances(cells: int = DISTANCE_CELLS) -> Float32[np.ndarray, "{cells} {cells} {cells}"]:

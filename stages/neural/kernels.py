@@ -9,16 +9,19 @@ no atomics, and the order of additions never depends on the thread count, so gra
 
 A row is 4 floats wide and read whole. Corner index = 4 x + 2 y + z. Indices are unsigned where it is hot: numba tests
 signed ones for counting from the end, which costs as much as the read.
+
+The table is larger than a core's caches, and a point's rows lie anywhere in it: rows are asked for some points ahead.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from stages.compiling import njit, prange, uint32
+from stages.compiling import njit, prange, prefetch_row, uint32
 
 PRIME_Y, PRIME_Z = np.uint32(2654435761), np.uint32(805459861)
 CHUNK = 512  # points whose rows, features and Jacobian stay in a core's L2 cache
+AHEAD = 32  # points whose rows are on their way: 16 to 128 do, and 0 takes 2.7 times as long
 _OPTIONS = dict(cache=True, fastmath=True, nogil=True, error_model="numpy", boundscheck=False)
 
 
@@ -78,6 +81,14 @@ def _locate(points, first, count, resolution, offset, end, dense, rows, fraction
             _locate_one(points, uint32(first + q), q, resolution, False, mask, start, rows, fractions)
 
 
+@njit(inline="always")
+def _ask_for(table, rows, first, last):
+    """Rows of the table at rows[:, first:last] will be wanted."""
+    for q in range(first, last):
+        for corner in range(uint32(8)):
+            prefetch_row(table, rows[corner, q])
+
+
 @njit(**_OPTIONS)
 def _interleaved(index, levels):
     """The level a backward pass takes at `index`: first the even ones, then the odd ones.
@@ -92,7 +103,9 @@ def _interleaved(index, levels):
 @njit(**_OPTIONS)
 def _encode_chunk(table, first, count, column, scale, rows, fractions, features, jacobian):
     """One level's columns of features, and of jacobian unless it is None, for the located points."""
+    _ask_for(table, rows, 0, min(AHEAD, count))
     for q in range(count):
+        _ask_for(table, rows, q + AHEAD, min(q + AHEAD + 1, count))
         p = uint32(first + q)
         fx, fy, fz = fractions[0, q], fractions[1, q], fractions[2, q]
         r0, r1, r2, r3 = rows[0, q], rows[1, q], rows[2, q], rows[3, q]
@@ -142,7 +155,9 @@ def _encode_chunk_backward(
 ):
     """One level's additions to grad_table for the located points."""
     one = np.float32(1)
+    _ask_for(grad_table, rows, 0, min(AHEAD, count))
     for q in range(count):
+        _ask_for(grad_table, rows, q + AHEAD, min(q + AHEAD + 1, count))
         p = uint32(first + q)
         fx, fy, fz = fractions[0, q], fractions[1, q], fractions[2, q]
         r0, r1, r2, r3 = rows[0, q], rows[1, q], rows[2, q], rows[3, q]

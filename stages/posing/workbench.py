@@ -25,13 +25,14 @@ from stages.errors import InputError
 from stages.extras import package_file
 from stages.posing.adding import KnownPhotos, copy_features, known_model, renamed_model
 from stages.posing.evidence import MIN_PNP, MIN_VERIFIED
+from stages.posing.features import extract
 from stages.posing.joining import join_models
 from stages.posing.ladder import Rung, Solution, better
+from stages.posing.pairs import EXHAUSTIVE, PREEMPTIVE, likely_pairs, match_pairs
 from stages.posing.rigs import write_rigs
 from stages.posing.settings import (
     STATIONARY_PX,
     expect_corners,
-    feature_options,
     mapping_options,
     match_options,
     verification_options,
@@ -143,6 +144,8 @@ class Workbench:
             ]
             self.priors = {camera.camera_id: camera.mean_focal_length() for camera in cameras}
         self.matcher = choose_matcher(params, self.located, len(self.names))
+        if self.matcher == PREEMPTIVE and self._at_once > 1:  # of views of one place the best partners tell least
+            self.matcher = EXHAUSTIVE
 
     def database(self, base: Base | None = None) -> Path:
         """The file of one base; of the latest one without."""
@@ -170,7 +173,7 @@ class Workbench:
         guessed = any(record.made_mask == "salient" for record in records)
         return [
             self._rung_of(f"{self.matcher} matching", self.first),
-            self._rung_of("all pairs", self.all_pairs, lambda best: self.matcher != "exhaustive"),
+            self._rung_of("all pairs", self.all_pairs, lambda best: self.matcher != EXHAUSTIVE),
             self._rung_of("no focal priors", self.no_focal_priors, self.priors_are_doubtful),
             *((affine, inside) if guessed else (inside, affine)),
             # A plain plaster part before black: 38 of 47 photos, 1 % off in the median. Affine features place none, and
@@ -314,8 +317,11 @@ class Workbench:
         if not self._stationary and has_still_background(self.database(base)):
             log.info("the background stands still while the object turns: its matches are left out")
             self._stationary = True
+            if self.matcher == PREEMPTIVE:  # which went by the background
+                self.matcher = EXHAUSTIVE
+                self._match(base)
             self._verify_again(base)
-        if best is not None and self.matcher != "exhaustive":
+        if best is not None and self.matcher != EXHAUSTIVE:
             self._match_pairs(base, self._pairs_to_try(base, best))
         self._tell(PART_MATCHES, "poses")
 
@@ -429,17 +435,8 @@ class Workbench:
 
     def _extract(self, base: Base) -> None:
         """Features; finding them is deterministic with any number of threads."""
-        import pycolmap
-
-        reader = pycolmap.ImageReaderOptions()
-        if base.masked:
-            reader.mask_path = str(self.masks_folder)
-        pycolmap.extract_features(
-            self.database(base),
-            self.images_folder,
-            reader_options=reader,
-            **feature_options(self.params, self.workers, self.cuda, base.affine),
-        )
+        masks = self.masks_folder if base.masked else None
+        extract(self.database(base), self.images_folder, self.params, self.workers, self.cuda, base.affine, masks)
 
     def _matching(self) -> dict[str, Any]:
         options = match_options(self.params, self.threads, self.cuda, self._guided, self.verified, self._stationary)
@@ -464,6 +461,9 @@ class Workbench:
     def _match(self, base: Base) -> None:
         import pycolmap
 
+        if self.matcher == PREEMPTIVE:
+            self._match_pairs(base, likely_pairs(self.database(base)))
+            return
         options = self._matching()
         if self._at_once > 1 and self.matcher == "sequential":
             options["pairing_options"] = pairing = pycolmap.SequentialPairingOptions()
@@ -476,16 +476,8 @@ class Workbench:
 
     def _match_pairs(self, base: Base, pairs: Iterable[tuple[int, int]]) -> None:
         """Match and verify pairs of image ids; those that are verified already are left as they are."""
-        import pycolmap
-
         self._tell(PART_FEATURES, "matches")
-        path = self.database(base)
-        listed = path.with_suffix(".pairs.txt")
-        listed.write_text("".join(f"{first} {second}\n" for first, second in pairs), encoding="utf-8")
-        pairing = pycolmap.ImportedPairingOptions()
-        pairing.match_list_path = str(listed)
-        with _named_by_number(path):
-            pycolmap.match_image_pairs(path, pairing_options=pairing, **self._matching())
+        match_pairs(self.database(base), pairs, self._matching())
         self._tell(PART_MATCHES, "poses")
 
     def _verify_again(self, base: Base) -> None:
@@ -648,7 +640,7 @@ def count_located(positions: Sequence[np.ndarray]) -> int:
 
 
 def choose_matcher(params: Any, located: int, num_images: int) -> str:
-    """auto: all pairs of small sets, neighbours in space where most photos carry GPS, else in name.
+    """auto: likely pairs of small sets, neighbours in space where most photos carry GPS, else in name.
 
     Raises:
         InputError: spatial matching is asked for and no photo carries GPS.
@@ -661,7 +653,7 @@ def choose_matcher(params: Any, located: int, num_images: int) -> str:
     if params.matcher != "auto":
         return params.matcher
     if num_images <= params.exhaustive_max:
-        return "exhaustive"
+        return PREEMPTIVE
     return "spatial" if located > 0.9 * num_images else "sequential"
 
 
@@ -705,27 +697,6 @@ def has_still_background(path: Path) -> bool:
         matched += 1
         still += int((moved <= STATIONARY_PX).sum() >= MIN_VERIFIED)
     return matched > 0 and still > STATIONARY_SHARE * matched
-
-
-@contextmanager
-def _named_by_number(path: Path) -> Iterator[None]:
-    """Images carry their ids as names for a while: COLMAP's lists of pairs take no names with spaces."""
-    import pycolmap
-
-    def rename(names: dict[int, str]) -> None:
-        with pycolmap.Database.open(path) as database:
-            for image_id, name in names.items():
-                image = database.read_image(image_id)
-                image.name = name
-                database.update_image(image)
-
-    with pycolmap.Database.open(path) as database:
-        names = {image.image_id: image.name for image in database.read_all_images()}
-    rename({image_id: str(image_id) for image_id in names})
-    try:
-        yield
-    finally:
-        rename(names)
 
 
 def _names(model: Any) -> frozenset[str]:
