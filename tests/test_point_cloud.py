@@ -1,20 +1,20 @@
-"""Dense points: fused of depth maps, moved, chosen, what they carve, and how training is held to them."""
+"""Dense points: fused of depth maps, moved, chosen, what they explain, and how training is held to them."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 from stereo_scene import RADIUS, camera, cameras, draw, ring
 
-from stages.geometry.hull import cube
 from stages.geometry.point_cloud import PointCloud
 from stages.geometry.similarity import Similarity
-from stages.neural.losses import normal_error
 from stages.neural.sightings import Sightings
 from stages.stereo import depth_kernels
-from stages.stereo.carving import carved_distances
 from stages.stereo.depths import views_of
+from stages.stereo.explaining import explained_share
 from stages.stereo.fusion import fused
 
 
@@ -102,7 +102,7 @@ def test_points_moved_and_chosen():
     assert len(PointCloud.empty().moved(target)) == 0
 
 
-# ---------------------------------------------------------------- carving
+# ---------------------------------------------------------------- what they explain
 def test_votes_of_one_line_along_an_axis():
     votes = np.zeros((2, 16, 16, 16), np.float32)
     point, center = np.array([[0.3, 0.06, 0.06]]), np.array([[-5.0, 0.06, 0.06]])
@@ -118,37 +118,31 @@ def test_votes_of_one_line_along_an_axis():
     assert votes.sum() == expected.sum()
 
 
-def test_a_ball_carved_from_its_points():
+def test_points_all_around_a_ball_explain_it_and_few_on_one_half_do_not():
     cams = all_around()
-    found = carved_distances(ball_cloud(cams), cams.centers, 32)
-    assert found is not None
-    true = np.linalg.norm(cube(32), axis=-1) - RADIUS
-    near = np.abs(true) < 0.3
-    assert np.abs(found - true)[near].mean() < 2 / 32
-    assert (found[true > 0.12] > 0).all()
-    assert (found[true < -0.12] < 0).all()
+    cloud = ball_cloud(cams)
+    assert explained_share(cloud, cams.centers, None, 32) > 0.95
+    few_below = (cloud.points[:, 2] > 0) | (np.arange(len(cloud)) % 30 == 0)
+    assert 0.5 < explained_share(cloud.chosen(few_below), cams.centers, None, 32) < 0.7
 
 
-def test_nothing_trusted_carves_nothing():
+def test_what_is_not_trusted_explains_nothing():
     cams = all_around()
-    assert carved_distances(PointCloud.empty(), cams.centers, 16) is None
-    points = ball_cloud(cams, 50)
-    doubtful = PointCloud(**{**points.__dict__, "trust": np.full(len(points), 0.2)})
-    assert carved_distances(doubtful, cams.centers, 16) is None
+    assert explained_share(PointCloud.empty(), cams.centers, None, 16) == 0
+    assert explained_share(replace(ball_cloud(cams), trust=np.full(6000, 0.2)), cams.centers, None, 16) == 0
 
 
 # ---------------------------------------------------------------- training
 def test_sightings_of_a_cloud():
-    points = np.array([[0.5, 0, 0], [0, 0.3, 0], [0, 0, 2.0], [0, 0, 0.7]])
-    cloud = cloud_of(points, [[0, 1], [1, 2], [0, 2], [2]], np.array([0.5, 0.0, 1.0, 0.25]))
+    points = np.array([[0.5, 0, 0], [0, 0.3, 0], [0, 0, 2.0], [0, 0, 0.7], [0.1, 0.1, 0]])
+    cloud = cloud_of(points, [[0, 1], [1, 2], [0, 2], [0, 1, 2], [1]], np.array([0.5, 0.0, 1.0, 0.3, 1.0]))
     centers = np.array([[3.0, 0, 0], [0, 3, 0], [0, 0, 3]])
     found = Sightings.from_cloud(cloud, centers, "cpu")
-    assert found.points.tolist() == pytest.approx(np.array([[0.5, 0, 0], [0, 0, 0.7]]))  # no trust; outside the sphere
-    assert found.weights.tolist() == [0.5, 0.25]
-    assert found.normals.tolist() == [[1, 0, 0], [0, 0, 1]]
-    assert found.lines.tolist() == [[0, 0], [1, 0], [2, 1]]
+    assert found.points.tolist() == pytest.approx(np.array([[0.5, 0, 0], [0, 0, 0.7]]))  # no trust; outside; seen once
+    assert found.weights.tolist() == pytest.approx([0.5 * 1 / 2, 0.3 * 2 / 3])
+    assert found.lines.tolist() == [[0, 0], [1, 0], [0, 1], [1, 1], [2, 1]]
     held_out = Sightings.from_cloud(cloud, centers, "cpu", np.array([True, False, True]))
-    assert held_out.lines.tolist() == [[0, 0], [2, 1]]
+    assert held_out.lines.tolist() == [[0, 0], [0, 1], [2, 1]]
     drawn = found.draw(3, 0.01, torch.Generator().manual_seed(0))
     at, behind, before, free = drawn.places.view(4, 3, 3)
     for k in range(3):
@@ -160,11 +154,3 @@ def test_sightings_of_a_cloud():
         assert np.linalg.norm(free[k]) <= 1 + 1e-5
     nothing = Sightings.from_cloud(PointCloud.empty(), centers, "cpu")
     assert len(nothing.draw(5, 0.01, torch.Generator()).weights) == 0
-
-
-def test_error_of_normals():
-    gradients = torch.tensor([[0.0, 0, 2], [0, 0, -0.5], [1, 0, 0], [1, 2, 3]])
-    normals = torch.tensor([[0.0, 0, 1], [0, 0, 1], [0, 0, 1], [0, 0, 0]])
-    assert normal_error(gradients, normals).tolist() == pytest.approx([0, 2, 1, 0])
-    some = torch.randn(4, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0), requires_grad=True)
-    assert torch.autograd.gradcheck(lambda g: normal_error(g, normals.double()), (some,))
