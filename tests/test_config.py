@@ -82,7 +82,7 @@ def test_set_takes_yaml_values(text: str, expected: Any) -> None:
         ("sfm.max_features=3", "`sfm.max_features` = 3 in --set sfm.max_features=3 is out of bounds", ">= 100"),
         ("train.minutes=-1", "`train.minutes` = -1 in", "must be > 0"),
         ("bake.views=many", "`bake.views` = 'many' in", "must be whole number >= 1, <= 32"),
-        ("sfm.matcher=off", "`sfm.matcher` = 'off' in", "auto | preemptive"),
+        ("sfm.matcher=off", "`sfm.matcher` = 'off' in", "auto | preemptive | exhaustive"),
         ("export.formats=[glb, fbx]", "`export.formats` = 'fbx' in", "list of (glb | usdz | obj | ply | stl | points)"),
         ("sfm=3", "`sfm` in --set sfm=3 is a section of settings", "`sfm.matcher`"),
         ("sfm.seed", "is not of the form section.key=value", "--set sfm.seed=1"),
@@ -237,6 +237,7 @@ def test_a_stage_s_old_settings_compare_equal_to_the_same_ones_of_today():
     old = yaml.safe_load((Path(__file__).parent / "config_before_groups.yaml").read_text())
     added = {
         "undistort": {"subject"},
+        "extract": {"fit", "denoising"},
         "train": {
             "steps_if_explained", "losses.dense", "losses.dense_tolerance", "losses.dense_step", "losses.dense_batch",
             "sampling.samples_end", "sampling.needed_share", "schedule.deferred_from",

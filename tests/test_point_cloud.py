@@ -9,13 +9,14 @@ import pytest
 import torch
 from stereo_scene import RADIUS, camera, cameras, draw, ring
 
+from stages.geometry.plane import Plane
 from stages.geometry.point_cloud import PointCloud
 from stages.geometry.similarity import Similarity
 from stages.neural.sightings import Sightings
 from stages.stereo import depth_kernels
 from stages.stereo.depths import views_of
 from stages.stereo.explaining import explained_share
-from stages.stereo.fusion import fused
+from stages.stereo.fusion import _cells, fused
 
 
 def cloud_of(points: np.ndarray, lists: list[list[int]], trust: np.ndarray | float = 1.0) -> PointCloud:
@@ -46,7 +47,7 @@ def test_depths_of_one_place_become_one_point_seen_by_their_photos():
     cams = ring(1)
     view = views_of(cams, 1000)[0]
     true = draw(cams).depths[0].astype(np.float32)
-    trusts = [np.full(true.shape, t, np.float32) for t in (0.9, 0.3, 0.6)]
+    trusts = [np.float32(t) * (true > 0) for t in (0.9, 0.3, 0.6)]
     colors = [np.full((*true.shape, 3), c, np.uint8) for c in (100, 200, 0)]
     cloud = fused([view] * 3, [true] * 3, trusts, colors)
     np.testing.assert_array_equal(np.diff(cloud.starts), 3)
@@ -68,13 +69,21 @@ def test_a_close_up_keeps_its_detail():
     near, far = ring(1, focal=760.0), ring(1)
     views = [views_of(near, 1000)[0], views_of(far, 1000)[0]]
     depths = [draw(cams).depths[0].astype(np.float32) for cams in (near, far)]
-    trusts = [np.ones_like(depth) for depth in depths]
+    trusts = [(depth > 0).astype(np.float32) for depth in depths]
     colors = [np.zeros((120, 160, 3), np.uint8)] * 2
     both = fused(views, depths, trusts, colors)
     alone = [fused(views[k : k + 1], depths[k : k + 1], trusts[:1], colors[:1]) for k in range(2)]
     assert len(both) == len(alone[0]) + len(alone[1])  # two octaves apart, no cell is shared
     by_photo = np.bincount(both.photos)
     np.testing.assert_array_equal(by_photo, [len(each) for each in alone])
+
+
+def test_no_two_cells_have_one_number():
+    axis = np.arange(-20, 20) + 0.5
+    points = np.stack(np.meshgrid(axis, axis, axis), -1).reshape(-1, 3)
+    keys = [_cells(points * size, np.full(len(points), size)) for size in (0.5, 1.0, 2.0)]
+    assert len(np.unique(keys)) == 3 * len(points)
+    np.testing.assert_array_equal(_cells(points + 0.4, np.full(len(points), 1.0)), keys[1])
 
 
 def test_no_trust_gives_no_points():
@@ -102,7 +111,7 @@ def test_points_moved_and_chosen():
     assert len(PointCloud.empty().moved(target)) == 0
 
 
-# ---------------------------------------------------------------- what they explain
+# ---------------------------------------------------------------- what is explained
 def test_votes_of_one_line_along_an_axis():
     votes = np.zeros((2, 16, 16, 16), np.float32)
     point, center = np.array([[0.3, 0.06, 0.06]]), np.array([[-5.0, 0.06, 0.06]])
@@ -118,31 +127,31 @@ def test_votes_of_one_line_along_an_axis():
     assert votes.sum() == expected.sum()
 
 
-def test_points_all_around_a_ball_explain_it_and_few_on_one_half_do_not():
+def test_share_of_a_ball_that_points_explain():
     cams = all_around()
-    cloud = ball_cloud(cams)
-    assert explained_share(cloud, cams.centers, None, 32) > 0.95
-    few_below = (cloud.points[:, 2] > 0) | (np.arange(len(cloud)) % 30 == 0)
-    assert 0.5 < explained_share(cloud.chosen(few_below), cams.centers, None, 32) < 0.7
-
-
-def test_what_is_not_trusted_explains_nothing():
-    cams = all_around()
-    assert explained_share(PointCloud.empty(), cams.centers, None, 16) == 0
-    assert explained_share(replace(ball_cloud(cams), trust=np.full(6000, 0.2)), cams.centers, None, 16) == 0
+    whole = ball_cloud(cams)
+    assert explained_share(whole, cams.centers, None, 32) > 0.9
+    doubtful = replace(whole, trust=np.full(len(whole), 0.2))
+    for nothing in (PointCloud.empty(), doubtful):
+        assert explained_share(nothing, cams.centers, None, 32) == 0
+    # what the ground hides from the question is not asked for
+    ground = Plane(np.array([0.0, 0, 1]), 0.0, 0.01, 1.0)
+    assert explained_share(whole.chosen(np.abs(whole.points[:, 2]) > 0.1), cams.centers, ground, 32) > 0.9
 
 
 # ---------------------------------------------------------------- training
 def test_sightings_of_a_cloud():
-    points = np.array([[0.5, 0, 0], [0, 0.3, 0], [0, 0, 2.0], [0, 0, 0.7], [0.1, 0.1, 0]])
-    cloud = cloud_of(points, [[0, 1], [1, 2], [0, 2], [0, 1, 2], [1]], np.array([0.5, 0.0, 1.0, 0.3, 1.0]))
+    points = np.array([[0.5, 0, 0], [0, 0.3, 0], [0, 0, 2.0], [0, 0, 0.7]])
+    cloud = cloud_of(points, [[0, 1], [1, 2], [0, 2], [2, 0, 1, 0]], np.array([0.5, 0.0, 1.0, 0.2]))
     centers = np.array([[3.0, 0, 0], [0, 3, 0], [0, 0, 3]])
     found = Sightings.from_cloud(cloud, centers, "cpu")
-    assert found.points.tolist() == pytest.approx(np.array([[0.5, 0, 0], [0, 0, 0.7]]))  # no trust; outside; seen once
-    assert found.weights.tolist() == pytest.approx([0.5 * 1 / 2, 0.3 * 2 / 3])
-    assert found.lines.tolist() == [[0, 0], [1, 0], [0, 1], [1, 1], [2, 1]]
+    assert found.points.tolist() == pytest.approx(np.array([[0.5, 0, 0], [0, 0, 0.7]]))  # no trust; outside the sphere
+    assert found.weights.tolist() == pytest.approx([0.25, 0.15])  # times 1/2, of two photos; 3/4, of four
+    assert found.lines.tolist() == [[0, 0], [1, 0], [2, 1], [0, 1], [1, 1], [0, 1]]
+    alone = Sightings.from_cloud(cloud_of(points[:1], [[1]]), centers, "cpu")
+    assert len(alone.lines) == 0
     held_out = Sightings.from_cloud(cloud, centers, "cpu", np.array([True, False, True]))
-    assert held_out.lines.tolist() == [[0, 0], [0, 1], [2, 1]]
+    assert held_out.lines.tolist() == [[0, 0], [2, 1], [0, 1], [0, 1]]
     drawn = found.draw(3, 0.01, torch.Generator().manual_seed(0))
     at, behind, before, free = drawn.places.view(4, 3, 3)
     for k in range(3):

@@ -133,6 +133,8 @@ def _trust(counts: Float[np.ndarray, "a b 3"]) -> np.ndarray:
     support = agree / np.maximum(asked + around, 1)
     uncontradicted = agree / np.maximum(agree + through, 1)
     trust: np.ndarray = _ramp(support, *SUPPORT) * _ramp(uncontradicted, *UNCONTRADICTED)
+    alone = (counts[..., 1] == 0) | (counts[..., 2] > counts[..., 1])
+    trust[alone] = 0  # at an outline, what is around does not speak for it
     return trust
 
 
