@@ -58,7 +58,7 @@ BASE_SETTINGS = {
     "train.field.gradients": "analytic",
 }
 BACKBONES = ("neus2", "hfneus", "neuralangelo")
-NO_STEREO = {"train.losses.dense": "0", "train.losses.normals": "0", "train.field.init": "sphere"}
+NO_STEREO = {"train.losses.dense": "0"}
 TERMS = {f"train.terms.{term}.form": "stable" for term in ("ambiguity", "reflection", "planar", "eikonal")}
 
 
@@ -88,7 +88,7 @@ VARIANTS: dict[str, dict[str, str]] = {
     "all-paper": {**dict.fromkeys(TERMS, "paper"), "train.terms.ambiguity.visibility": "paper"},
     # the colours and the Eikonal term alone, as in NeuS: no points, no reflected direction
     "rgb+eikonal": {**NO_STEREO, "train.losses.sparse": "0", "train.field.radiance_inputs": "view"},
-    # as it was before dense stereo: from a sphere, held to the SfM points alone
+    # as it was before dense stereo: held to the SfM points alone
     "no-stereo": NO_STEREO,
     "density-neus": {"train.density.form": "neus"},
     "scale-learned": {"train.density.scale": "learned"},

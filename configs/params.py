@@ -188,6 +188,10 @@ class ExtractParams(Section):
         description="grid cells along the region of interest's side, fewer where photos show no more",
     )
     block: int = Field(64, ge=8, le=256, description="cells along a side of the blocks evaluated at a time")
+    fit: bool = Field(True, description="move the mesh, by parts of a cell, to where dense points of many photos lie")
+    denoising: int = Field(
+        5, ge=0, le=50, description="rounds of a filter that makes planes flat and keeps edges sharp; 0: none"
+    )
 
 
 class CleanupParams(Section):

@@ -65,7 +65,7 @@ class SamplingParams(Section):
         0.7, ge=0, le=1, description="part of the rays that goes where the surface is, and where colours are met worse"
     )
     free_points: int = Field(256, ge=0, description="points per step anywhere in the region, for the Eikonal term")
-    background_samples: int = Field(16, ge=1, description="samples per ray outside the region")
+    background_samples: int = Field(8, ge=1, description="samples per ray outside the region")
     sampler: Literal["grid", "proposal"] = Field(
         "grid", description="where samples go: near the surface of a cached grid, or as a proposal network says"
     )

@@ -43,9 +43,9 @@ SFM_BASE_GIB, SFM_GIB_PER_THREAD_MP = 0.25, 0.25  # finding features: 0.32 GiB a
 MEMORY_MARGIN = 1.3  # an estimate this near to what is there gets a warning
 SFM_CPU_S_PER_MP = 2.8  # 2.3 to 3.3 CPU seconds a megapixel looked at
 SFM_CPU_S_PER_PAIR = 0.01  # too little in those sets to be told from nothing; larger ones are quadratic
-STEREO_CPU_S_PER_MP_AND_NEIGHBOR = 0.33  # 0.9 to 1.6 CPU seconds a megapixel compared with four neighbours
-STEREO_BASE_GIB, STEREO_GIB_PER_MP = 0.7, 0.025  # 0.64 to 1.2 GiB at 12 to 30 megapixels; maps are kept for all photos
-EXPLAINED = 0.7  # share of the surface that dense points explain: EXPLAINED_RANGE
+STEREO_CPU_S_PER_MP_AND_NEIGHBOR = 0.28  # 1.0 to 1.2 CPU seconds a megapixel compared with four neighbours
+STEREO_BASE_GIB, STEREO_GIB_PER_MP = 0.5, 0.021  # 0.55 to 1.2 GiB at 11 to 29 megapixels; maps of all are held
+EXPLAINED = 0.6  # share of the surface that dense points cover: 0.16 of polished metal, 0.6 of plaster, 0.9 of a helmet
 TRAIN_CPU_S_PER_RAY_SAMPLE = 4.9e-6  # 317 to 329 CPU seconds for 8000 steps of 512 rays of 16 samples
 OTHER_CPU_S = 50.0  # everything after training: 37 to 47
 # Part of the work that cores share: two made training 1.53 to 1.80 times as fast, poses 1.7 times. What more cores
@@ -54,7 +54,7 @@ PARALLEL_SHARE = 0.8
 DISK_BASE_GB = 0.3  # checkpoint, meshes, textures, report: an allowance
 FEATURE_BYTES_PER_PIXEL = 1.2  # looked at: features and matches are kept for photos that are added later
 DISK_BYTES_PER_PIXEL = 2.0  # undistorted images are PNG: 1.4 to 2 bytes a pixel
-STEREO_BYTES_PER_PIXEL = 4.0  # compared: depth maps and points, 2 to 8
+STEREO_BYTES_PER_PIXEL = 6.0  # compared: depth maps and points, 3 to 8
 
 
 @dataclass(frozen=True)

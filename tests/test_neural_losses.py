@@ -39,17 +39,6 @@ def test_sparse_points_pull_evenly_beyond_the_tolerance():
     assert sdf.grad.tolist() == pytest.approx([0, 0.1, -1, 1])
 
 
-def test_normals_ask_for_the_direction_of_the_gradient_and_nothing_else():
-    gradients = torch.tensor([[0.0, 0, 3], [0, 0, -0.5], [2, 0, 0], [1, 0, 0]], dtype=torch.float64, requires_grad=True)
-    normals = torch.tensor([[0.0, 0, 1], [0, 0, 1], [0, 0, 1], [0, 0, 0]], dtype=torch.float64)
-    error = losses.normal_error(gradients, normals)
-    assert error.tolist() == pytest.approx([0, 2, 1, 0])
-    assert torch.autograd.gradcheck(lambda g: losses.normal_error(g, normals), (gradients,))
-    error.sum().backward()
-    assert gradients.grad[2].tolist() == pytest.approx([0, 0, -0.5])  # towards the normal, at the same length
-    assert gradients.grad[3].tolist() == [0, 0, 0]
-
-
 def test_relaxation_is_one_on_met_photos_and_bounded_below():
     error = torch.tensor([0.0, 0.1, 0.2, 5.0], requires_grad=True)
     omega = eikonal.eikonal_relaxation(error)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,8 +11,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from stages.neural.density import laplace_density, section_optical_depth
-from stages.neural.renderer import Renderer
-from stages.neural.rendering import composite, rendering_weights, sample_optical_depths, weights_from_optical_depth
+from stages.neural.rendering import (
+    composite,
+    ray_means,
+    rendering_weights,
+    sample_optical_depths,
+    weights_from_optical_depth,
+)
 from stages.neural.sampling import (
     Rays,
     SdfCache,
@@ -207,60 +211,48 @@ def test_half_of_the_laplace_depth_lies_on_each_side_of_a_wall():
 
 
 # ---------------------------------------------------------------- one colour a ray
-class Flat:
-    """A radiance field that answers in closed form: a linear function of what it is asked."""
-
-    def __call__(self, points, normals, view_dirs, features):
-        return 0.3 * points + 0.2 * normals + 0.1 * view_dirs + features[:, :3]
-
-
-def deferred_renderer(radiance) -> Renderer:
-    return Renderer(SimpleNamespace(radiance=radiance), None, None, None)
-
-
 def ray_values(num_rays: int = 5, num_samples: int = 7) -> dict[str, torch.Tensor]:
     generator = torch.Generator().manual_seed(0)
     points, gradients, features = (torch.randn(num_rays * num_samples, n, generator=generator) for n in (3, 3, 4))
     weights = torch.rand(num_rays, num_samples, generator=generator) / num_samples
-    return {"weights": weights, "points": points, "gradients": gradients, "features": features}
+    values = {"weights": weights, "points": points, "gradients": gradients, "features": features}
+    return {name: value.requires_grad_() for name, value in values.items()}
 
 
-def test_a_deferred_colour_is_that_of_the_mean_point_normal_and_features():
+def test_means_over_rays_match_a_slow_loop():
     values = ray_values()
-    directions = torch.nn.functional.normalize(torch.randn(5, 3, generator=torch.Generator().manual_seed(1)), dim=1)
-    colors = deferred_renderer(Flat())._deferred_colors(SimpleNamespace(directions=directions), **values)
+    opacity, points, normals, features = ray_means(**values)
     for r in range(5):
-        weights = values["weights"][r]
-        opacity = weights.sum()
-        rows = range(7 * r, 7 * r + 7)
-        point = sum(weights[k] * values["points"][row] for k, row in enumerate(rows)) / opacity
-        feature = sum(weights[k] * values["features"][row] for k, row in enumerate(rows)) / opacity
+        weights, rows = values["weights"][r], range(7 * r, 7 * r + 7)
+        total = sum(weights)
+        torch.testing.assert_close(opacity[r, 0], total)
         units = [values["gradients"][row] / values["gradients"][row].norm() for row in rows]
-        normal = sum(weights[k] * unit for k, unit in enumerate(units))
-        expected = opacity * (0.3 * point + 0.2 * normal / normal.norm() + 0.1 * directions[r] + feature[:3])
-        torch.testing.assert_close(colors[r], expected)
+        normal = sum(weight * unit for weight, unit in zip(weights, units, strict=True))
+        torch.testing.assert_close(normals[r], normal / normal.norm())
+        for means, name in ((points, "points"), (features, "features")):
+            summed = sum(weight * values[name][row] for weight, row in zip(weights, rows, strict=True))
+            torch.testing.assert_close(means[r], summed / total)
 
 
-def test_a_deferred_colour_of_one_sample_is_its_colour_and_pulls_at_all_it_is_made_of():
+def test_the_means_of_one_sample_are_it_and_pull_at_all_they_are_made_of():
     values = ray_values(5, 1)
-    batch = SimpleNamespace(directions=torch.zeros(5, 3))
-    for value in values.values():
-        value.requires_grad_()
-    colors = deferred_renderer(Flat())._deferred_colors(batch, **values)
-    normals = torch.nn.functional.normalize(values["gradients"], dim=1)
-    expected = values["weights"] * Flat()(values["points"], normals, batch.directions, values["features"])
-    torch.testing.assert_close(colors, expected)
-    colors.sum().backward()
+    opacity, points, normals, features = ray_means(**values)
+    torch.testing.assert_close((opacity, points, features), tuple(values[n] for n in ("weights", "points", "features")))
+    torch.testing.assert_close(normals, torch.nn.functional.normalize(values["gradients"], dim=1))
+    (opacity * torch.cat([points**2, normals, features], 1)).sum().backward()
     assert all(value.grad.abs().max() > 0 for value in values.values())
 
 
-def test_a_deferred_colour_of_an_empty_ray_is_black_and_its_gradient_finite():
-    values = {name: value.requires_grad_() for name, value in ray_values().items()}
-    empty = {**values, "weights": (0 * values["weights"])}
-    colors = deferred_renderer(Flat())._deferred_colors(SimpleNamespace(directions=torch.zeros(5, 3)), **empty)
-    assert colors.abs().max() == 0
-    colors.sum().backward()
-    assert all(torch.isfinite(value.grad).all() for value in values.values() if value.grad is not None)
+def test_the_means_of_a_ray_that_meets_nothing_have_finite_gradients():
+    values = ray_values()
+    weights = torch.zeros(5, 7, requires_grad=True)
+    opacity, *means = ray_means(**{**values, "weights": weights})
+    assert opacity.abs().max() == 0
+    assert all(mean.abs().max() == 0 for mean in means)
+    (opacity * torch.cat(means, 1)).sum().backward()
+    assert torch.isfinite(weights.grad).all()
+    none = ray_means(torch.zeros(0, 7), torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0, 4))
+    assert [tuple(part.shape) for part in none] == [(0, 1), (0, 3), (0, 3), (0, 4)]
 
 
 def test_samples_get_fewer_in_even_steps():

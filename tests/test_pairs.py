@@ -102,9 +102,11 @@ def test_the_largest_features_of_a_database_choose_the_pairs(tmp_path: Path, mon
             opened.write_keypoints(image_id, keypoints)
             opened.write_descriptors(image_id, pycolmap.FeatureDescriptors(pycolmap.FeatureExtractorType.SIFT, own))
     monkeypatch.setattr(pairs, "_connecting", lambda common: [])
+    monkeypatch.setattr(pairs, "NEXT", 0)
     assert likely_pairs(path) == [(1, 3)]
-    monkeypatch.setattr(pairs, "BEST", 1)
     monkeypatch.setattr(pairs, "NEXT", 1)
+    assert likely_pairs(path) == [(1, 2), (1, 3), (2, 3), (3, 4), (4, 5)]
+    monkeypatch.setattr(pairs, "BEST", 1)
     # next in name: 4 and 5 of photo 5; most in common: photo 1, the first of all that share nothing
     assert near_pairs(path, {"4 a.jpg"}) == [(1, 4), (1, 5), (4, 5)]
     assert near_pairs(path, {"0 a.jpg"}) == [(1, 2), (1, 3), (2, 3)]

@@ -73,18 +73,6 @@ def test_sightings_end_at_their_points_and_are_free_before(kind):
     assert torch.allclose((drawn.places[200:400] - drawn.places[:200]).norm(dim=1), torch.tensor(0.01), atol=1e-6)
 
 
-def test_dense_sightings_carry_normals_and_trust():
-    cloud = sphere_cloud(ring_of_cameras())
-    trust = np.where(cloud.points[:, 2] > 0, cloud.trust, 0).astype(np.float32)
-    trusted = Sightings.from_cloud(replace(cloud, trust=trust), ring_of_cameras().centers, "cpu")
-    assert 0 < len(trusted) < len(cloud.photos)
-    drawn = trusted.draw(100, 0.01, torch.Generator().manual_seed(0))
-    points = drawn.places[:100]
-    assert (points[:, 2] > 0).all()  # what has no trust says nothing
-    torch.testing.assert_close(drawn.normals, points / RADIUS, atol=1e-5, rtol=1e-5)
-    torch.testing.assert_close(drawn.weights, torch.where(points[:, 0] < 0, 0.5, 1.0))
-
-
 def test_photos_left_out_have_no_sightings():
     cameras = ring_of_cameras()
     training = np.arange(8) != 3
@@ -98,7 +86,7 @@ def test_photos_left_out_have_no_sightings():
 def test_sightings_of_nothing_are_drawn_and_cost_nothing():
     nothing = Sightings.from_cloud(PointCloud.empty(), ring_of_cameras().centers, "cpu")
     drawn = nothing.draw(50, 0.01, torch.Generator().manual_seed(0))
-    assert [len(part) for part in drawn] == [0, 0, 0]
+    assert [len(part) for part in drawn] == [0, 0]
     assert float(sighting_loss(torch.zeros(0), drawn.weights, 0.01, 0.01)) == 0
 
 
@@ -481,7 +469,7 @@ def test_the_hull_of_a_ball_is_a_little_more_than_the_ball():
 def test_training_can_start_from_the_hull():
     trainer = make_trainer(changed(TINY, {"field.sphere_radius": 0.8, "field.init": "hull"}), masks=True)
     cameras = ring_of_cameras()
-    train._start_from_shape(trainer, cameras, None)
+    train._start_from_shape(trainer, cameras)
     levels = trainer.moment(0.0).levels
     points = torch.nn.functional.normalize(torch.randn(300, 3, generator=torch.Generator().manual_seed(0)), dim=1)
     with torch.no_grad():
@@ -499,7 +487,7 @@ def test_cameras_inside_the_sphere_start_in_a_free_room(distance, room):
     pose = cameras.extrinsics.copy()
     pose[:, :, 3] *= distance / np.linalg.norm(cameras.centers, axis=1)[:, None]
     trainer = make_trainer()
-    train._start_from_shape(trainer, replace(cameras, extrinsics=pose), None)
+    train._start_from_shape(trainer, replace(cameras, extrinsics=pose))
     middle = torch.nn.functional.normalize(torch.randn(100, 3, generator=torch.Generator().manual_seed(0)), dim=1)
     with torch.no_grad():
         levels = trainer.moment(0.0).levels

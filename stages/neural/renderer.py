@@ -16,7 +16,7 @@ from stages.neural.acceleration import fixed_shapes
 from stages.neural.fields import BackgroundNetwork, Fields
 from stages.neural.proposal import proposal_distances
 from stages.neural.rendered import Rendered
-from stages.neural.rendering import composite, rendering_weights, weights_from_optical_depth
+from stages.neural.rendering import composite, ray_means, rendering_weights, weights_from_optical_depth
 from stages.neural.sampling import SdfCache, importance_distances, stratified
 from stages.neural.schedules import Moment
 from stages.neural.terms import Terms
@@ -27,8 +27,6 @@ if TYPE_CHECKING:
 
 # Samples that weigh less than this get no colour: together they change a pixel by less than one grey level.
 _COLOR_THRESHOLD = 2e-4
-# Keeps the mean over a ray finite where it meets nothing.
-_OPACITY_FLOOR = 1e-4
 # Progress until which a ray has all its samples: the surface is found by then.
 _FEWER_FROM = 0.3
 # Rays that let less than this through show nothing of the background: two grey levels at most.
@@ -138,18 +136,8 @@ class Renderer:
         gradients: Float[Tensor, "r*k 3"],
         features: Float[Tensor, "r*k g"],
     ) -> Float[Tensor, "r 3"]:
-        """Opacity of each ray times the colour at its mean point, of its mean normal and features.
-
-        C = W c(sum_k w_k x_k / W, sum_k w_k n_k / |.|, sum_k w_k z_k / W), W = sum_k w_k: one colour a ray (deferred
-        shading). Where W is 0 the colour weighs nothing, and its gradient is finite.
-        """
-        num_rays, num_samples = weights.shape
-        normals = torch.nn.functional.normalize(gradients, dim=1)
-        values = torch.cat([points, normals, features], 1).view(num_rays, num_samples, -1)
-        opacity = weights.sum(1, keepdim=True)
-        means = torch.bmm(weights[:, None], values).squeeze(1) / opacity.clamp(min=_OPACITY_FLOOR)
-        point, normal, feature = means.split([3, 3, features.shape[1]], 1)
-        normal = torch.nn.functional.normalize(normal, dim=1)
+        """Opacity of each ray times the colour at its mean point, of its mean normal and features: one colour a ray."""
+        opacity, point, normal, feature = ray_means(weights, points, gradients, features)
         return opacity * self.fields.radiance(point, normal, batch.directions, feature)
 
     def _background(

@@ -16,6 +16,9 @@ from stages.neural.density import FLAT, logistic_section_optical_depth, section_
 if TYPE_CHECKING:
     from jaxtyping import Float
 
+# Keeps the means over a ray finite where it meets nothing.
+_OPACITY_FLOOR = 1e-4
+
 
 def rendering_weights(
     sdf: Float[Tensor, "r k"],
@@ -69,6 +72,26 @@ def weights_from_optical_depth(tau: Float[Tensor, "r k"]) -> tuple[Float[Tensor,
 def composite(weights: Float[Tensor, "r k"], values: Float[Tensor, "r k d"]) -> Float[Tensor, "r d"]:
     """Sum over samples of weights times values."""
     return (weights.unsqueeze(-1) * values).sum(1)
+
+
+def ray_means(
+    weights: Float[Tensor, "r k"],
+    points: Float[Tensor, "r*k 3"],
+    gradients: Float[Tensor, "r*k 3"],
+    features: Float[Tensor, "r*k g"],
+) -> tuple[Float[Tensor, "r 1"], Float[Tensor, "r 3"], Float[Tensor, "r 3"], Float[Tensor, "r g"]]:
+    """Opacity W = sum_k w_k of each ray, and the mean point, unit normal and features of its samples.
+
+    sum_k w_k x_k / W, sum_k w_k n_k / |sum_k w_k n_k|, sum_k w_k z_k / W: where deferred shading asks for one colour.
+    A ray that meets nothing has means near 0 and finite gradients.
+    """
+    normals = torch.nn.functional.normalize(gradients, dim=1)
+    values = torch.cat([points, normals, features], 1)
+    values = values.view(*weights.shape, values.shape[1])
+    opacity = weights.sum(1, keepdim=True)
+    means = torch.bmm(weights[:, None], values).squeeze(1) / opacity.clamp(min=_OPACITY_FLOOR)
+    point, normal, feature = means.split([3, 3, features.shape[1]], 1)
+    return opacity, point, torch.nn.functional.normalize(normal, dim=1), feature
 
 
 class _KernelWeights(torch.autograd.Function):

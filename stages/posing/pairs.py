@@ -2,13 +2,13 @@
 
 The largest features of a photo say which others show the same [Wu, Towards Linear-time Incremental Structure from
 Motion, 3DV 2013: preemptive matching]. Matching all features of a pair takes a hundred times as long, or more. A photo
-is matched with the best of its clear partners, and with a few whatever they share; pairs that have most in common
-connect all photos.
+is matched with the best of its clear partners, with those next to it in name, and with a few whatever they share; pairs
+that have most in common connect all photos.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from itertools import combinations
 from pathlib import Path
@@ -24,16 +24,18 @@ LARGEST = 300  # features of each photo that are looked at
 # Photos that show nothing in common share two of these matches, and up to six; of pairs with 30 verified matches of
 # all features, 99 in 100 share six.
 CLEAR = 6
-MOST, LEAST = 16, 6  # partners of a photo: clear ones, and whatever they share
-BEST, NEXT = 3, 2  # near a photo: partners that share most, and photos to each side in the order of names
+MOST, LEAST = 12, 4  # partners of a photo: clear ones, and whatever they share
+NEXT = 2  # photos to each side in the order of names are partners, too: most captures are a walk
+BEST = 3  # partners that share most are near a photo, with those next to it
 # COLMAP's tests of a match, as angles between descriptors: to the nearest one, and to it over that to the second.
 MAX_ANGLE, MAX_RATIO = 0.7, 0.8
 
 
 def likely_pairs(database: Path) -> list[tuple[int, int]]:
     """Pairs of image ids, sorted, the first of each the smaller one."""
-    ids, _, common = common_in(database)
-    return [(ids[i], ids[j]) for i, j in choose_pairs(common)]
+    ids, names, common = common_in(database)
+    chosen = {*choose_pairs(common), *_next_in_name(names)}
+    return [(ids[i], ids[j]) for i, j in sorted(chosen)]
 
 
 def near_pairs(database: Path, left_out: Collection[str]) -> list[tuple[int, int]]:
@@ -43,14 +45,22 @@ def near_pairs(database: Path, left_out: Collection[str]) -> list[tuple[int, int
         Pairs of image ids, sorted, the first of each the smaller one.
     """
     ids, names, common = common_in(database)
-    by_name = sorted(range(len(ids)), key=names.__getitem__)
+    beside = _next_in_name(names)
     pairs = set[tuple[int, int]]()
-    for place, i in enumerate(by_name):
-        if names[i] in left_out:
-            group = {*by_name[max(0, place - NEXT) : place + NEXT + 1], i}
-            group |= set([int(j) for j in np.argsort(-common[i], kind="stable") if j != i][:BEST])
+    for i, name in enumerate(names):
+        if name in left_out:
+            best = [int(j) for j in np.argsort(-common[i], kind="stable") if j != i][:BEST]
+            group = {i, *best, *(j for pair in beside if i in pair for j in pair)}
             pairs |= set(combinations(sorted(group), 2))
     return [(ids[i], ids[j]) for i, j in sorted(pairs)]
+
+
+def _next_in_name(names: Sequence[str]) -> set[tuple[int, int]]:
+    """Pairs (i < j) of photos that are up to `NEXT` apart in the order of names."""
+    order = sorted(range(len(names)), key=names.__getitem__)
+    return {
+        (min(i, j), max(i, j)) for place, i in enumerate(order) for j in order[place + 1 : place + 1 + NEXT]
+    }  # fmt: skip
 
 
 def common_in(database: Path) -> tuple[list[int], list[str], Int[np.ndarray, "n n"]]:

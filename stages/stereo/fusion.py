@@ -16,8 +16,8 @@ if TYPE_CHECKING:
 
 # No more depths than this become points, evenly chosen of all: memory.
 MAX_DEPTHS = 4_000_000
-# Bits of a cell's place along an axis; with those of its size they fill 64. A cell is about a pixel wide: places that
-# share their last 19 bits are hundreds of photos apart.
+# Bits of a cell's place along an axis; with those of its size they fill 64. A cell is about a pixel wide, so that
+# places which share their last 19 bits are hundreds of photos apart.
 _BITS = 19
 
 

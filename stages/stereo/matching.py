@@ -21,6 +21,9 @@ UNIQUENESS, MAX_CHANGE = 8, 1
 SPECKLE, SPECKLE_RANGE = 60, 2
 # Standard deviation of grey values; with less there is nothing to even.
 LEAST_CONTRAST = 2.0
+# Photos of one exposure differ by less, in mean and contrast, by what they show: to even them costs a twentieth of the
+# surface.
+JUMP = 1.5
 # OpenCV's fixed point.
 STEPS = 16.0
 _HALF = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])
@@ -45,11 +48,18 @@ def evened(
     (mean_left, spread_left), (mean_right, spread_right) = (
         [float(each[0, 0]) for each in cv2.meanStdDev(photo, mask=both)] for photo in (left, right)
     )
-    if min(spread_left, spread_right) < LEAST_CONTRAST:
+    if (
+        min(spread_left, spread_right) < LEAST_CONTRAST
+        or max(_ratio(mean_left, mean_right), _ratio(spread_left, spread_right)) < JUMP
+    ):
         return left, right
     if spread_left < spread_right:
         return _stretched(left, spread_right / spread_left, mean_left, mean_right), right
     return left, _stretched(right, spread_left / spread_right, mean_right, mean_left)
+
+
+def _ratio(a: float, b: float) -> float:
+    return max(a, b) / max(min(a, b), 1e-6)
 
 
 def _stretched(photo: UInt8[np.ndarray, "a b"], factor: float, mean: float, onto: float) -> UInt8[np.ndarray, "a b"]:

@@ -25,13 +25,13 @@ _ONE = np.uintp(1)
 
 
 @njit(nogil=True, cache=True)
-def _project(points, normals, matrix, center, begin, u, v, depth, cos):  # pragma: no cover - compiled
-    """Fill pixel, depth and cosine to the normal, [_BLOCK] each, for the points from `begin` on.
+def _project(points, normals, matrix, center, u, v, depth, cos):  # pragma: no cover - compiled
+    """Fill pixel, depth and cosine to the normal, [_BLOCK] each, of as many points or fewer.
 
     Apart from `_weight`, into arrays of their own and without a branch, so that it runs on vectors.
     """
-    for k in range(min(_BLOCK, points.shape[0] - begin)):
-        px, py, pz = points[begin + k, 0], points[begin + k, 1], points[begin + k, 2]
+    for k in range(points.shape[0]):
+        px, py, pz = points[k, 0], points[k, 1], points[k, 2]
         dx, dy, dz = center[0] - px, center[1] - py, center[2] - pz
         distance = np.sqrt(dx * dx + dy * dy + dz * dz)
         z = matrix[2, 0] * px + matrix[2, 1] * py + matrix[2, 2] * pz + matrix[2, 3]
@@ -39,7 +39,7 @@ def _project(points, normals, matrix, center, begin, u, v, depth, cos):  # pragm
         u[k] = (matrix[0, 0] * px + matrix[0, 1] * py + matrix[0, 2] * pz + matrix[0, 3]) * per_depth - 0.5
         v[k] = (matrix[1, 0] * px + matrix[1, 1] * py + matrix[1, 2] * pz + matrix[1, 3]) * per_depth - 0.5
         depth[k] = z
-        facing = normals[begin + k, 0] * dx + normals[begin + k, 1] * dy + normals[begin + k, 2] * dz
+        facing = normals[k, 0] * dx + normals[k, 1] * dy + normals[k, 2] * dz
         cos[k] = facing / max(distance, 1e-12)
 
 
@@ -57,16 +57,14 @@ def _weight(u, v, z, cos, focal, inverse_depth, confidence):  # pragma: no cover
     right, below = x + _ONE, y + _ONE
     fx, fy = u - x, v - y
     trust = min(confidence[y, x], confidence[y, right], confidence[below, x], confidence[below, right])
-    if trust == 0:
-        return 0.0
     w = (inverse_depth[y, x] * (1 - fx) + inverse_depth[y, right] * fx) * (1 - fy) + (
         inverse_depth[below, x] * (1 - fx) + inverse_depth[below, right] * fx
     ) * fy
-    # Within two pixel sizes of the depth map, stretched along the line of sight on slanted surfaces.
-    if abs(z * w - 1.0) * focal * cos > DEPTH_PIXELS * w * z:
-        return 0.0
+    # Beyond two pixel sizes of the depth map, stretched along the line of sight on slanted surfaces. Trust and this are
+    # no ways out of their own: where they change, the processor guesses wrong, which takes longer than all the rest.
+    hidden = abs(z * w - 1.0) * focal * cos > DEPTH_PIXELS * w * z
     detail = focal * cos / z
-    return trust / 255.0 * detail * detail * cos
+    return 0.0 if hidden else trust / 255.0 * detail * detail * cos
 
 
 @njit(nogil=True, cache=True)
@@ -91,7 +89,8 @@ def sample_points(
     for i in range(points.shape[0]):
         k = i % _BLOCK
         if k == 0:
-            _project(points, normals, matrix, center, i, us, vs, depths, cosines)
+            block = slice(i, i + _BLOCK)
+            _project(points[block], normals[block], matrix, center, us, vs, depths, cosines)
         u, v = us[k], vs[k]
         weights[i] = _weight(u, v, depths[k], cosines[k], focal, inverse_depth, confidence)
         if weights[i] > 0:
@@ -122,7 +121,8 @@ def gather_texels(
     for i in range(points.shape[0]):
         k = i % _BLOCK
         if k == 0:
-            _project(points, normals, matrix, center, i, us, vs, depths, cosines)
+            block = slice(i, i + _BLOCK)
+            _project(points[block], normals[block], matrix, center, us, vs, depths, cosines)
         u, v = us[k], vs[k]
         weight = sharpness * _weight(u, v, depths[k], cosines[k], focal, inverse_depth, confidence)
         if weight <= 0:
@@ -158,16 +158,12 @@ def blend_texels(
     fades out before it leaves the set and no seam shows where it does.
     """
     places = best_weights.shape[1]
-    values = np.empty((places, 3))
-    highs = np.empty((places, 3))
-    weights = np.empty(places)
-    deviations = np.empty(places)
-    # Neighbours see the same photos in much the same order: each starts from the one before, which is nearly sorted.
-    by_value, by_deviation = np.arange(places), np.arange(places)
+    values, highs = np.empty((3, places), dtype=np.float32), np.empty((3, places), dtype=np.float32)
+    weights, deviations = np.empty(places, dtype=np.float32), np.empty(places, dtype=np.float32)
+    up_to = np.empty(places, dtype=np.float32)
     median = np.empty(3)
     low = np.empty(3)
     high = np.empty(3)
-    before = 0
     for i in range(best_weights.shape[0]):
         last, faded = -1, 0.0
         if best_weights[i, places - 1] > 0:
@@ -183,28 +179,27 @@ def blend_texels(
             # A little of each weight stays: with equal ones, nothing would be left.
             weights[count] = (1.001 * best_weights[i, slot] - faded) / most
             for c in range(3):
-                values[count, c] = best_lows[i, slot, c] / STEPS_UNSIGNED
-                highs[count, c] = best_highs[i, slot, c] / STEPS_SIGNED
+                values[c, count] = best_lows[i, slot, c] / STEPS_UNSIGNED
+                highs[c, count] = best_highs[i, slot, c] / STEPS_SIGNED
             count += 1
         if count == 0:
             continue
-        if count != before:
-            for k in range(count):
-                by_value[k] = by_deviation[k] = k
-            before = count
-        half = 0.5 * weights[:count].sum()
+        total = np.float32(0.0)
+        for k in range(count):
+            total += weights[k]
+        half = np.float32(0.5) * total
         for c in range(3):
-            median[c] = _weighted_middle(values[:count, c], weights[:count], half, by_value)
+            median[c] = _weighted_middle(values[c, :count], weights[:count], half, up_to)
         for k in range(count):
             deviations[k] = 0.0
             for c in range(3):
-                off = values[k, c] - median[c]
+                off = values[c, k] - median[c]
                 if off < 0:
                     off = -off
                 elif diffuse:
                     off *= 2.0
                 deviations[k] = max(deviations[k], off)
-        spread = max(1.4826 * _weighted_middle(deviations[:count], weights[:count], half, by_deviation), NOISE_FLOOR)
+        spread = max(1.4826 * _weighted_middle(deviations[:count], weights[:count], half, up_to), NOISE_FLOOR)
         low[:] = 0.0
         high[:] = 0.0
         low_total = high_total = 0.0
@@ -217,8 +212,8 @@ def blend_texels(
             low_total += low_weight
             high_total += high_weight
             for c in range(3):
-                low[c] += low_weight * values[k, c]
-                high[c] += high_weight * highs[k, c]
+                low[c] += low_weight * values[c, k]
+                high[c] += high_weight * highs[c, k]
         for c in range(3):
             color = low[c] / low_total if low_total > 0 else median[c]
             if detail and high_total > 0:
@@ -227,19 +222,19 @@ def blend_texels(
 
 
 @njit(nogil=True, cache=True)
-def _weighted_middle(values, weights, half, order):  # pragma: no cover - compiled
-    """Weighted median of P values, `half` being half of the weights' sum. `order` holds 0..P-1, and then sorts them."""
-    count = values.shape[0]
-    # By insertion: numpy's argsort takes several times as long for so few.
-    for i in range(1, count):
-        item, k = order[i], i
-        while k > 0 and values[order[k - 1]] > values[item]:
-            order[k] = order[k - 1]
-            k -= 1
-        order[k] = item
-    cumulative = 0.0
+def _weighted_middle(values, weights, half, up_to):  # pragma: no cover - compiled
+    """Weighted median of P values, `half` being half of the weights' sum. `up_to` [P] is scratch.
+
+    By comparing all pairs, which runs on vectors: sorting so few takes several times as long.
+    """
+    count, none, middle = values.shape[0], np.float32(0.0), np.float32(np.inf)
     for k in range(count):
-        cumulative += weights[order[k]]
-        if cumulative >= half:
-            return values[order[k]]
-    return values[order[count - 1]]
+        up_to[k] = none
+    for j in range(count):
+        value, weight = values[j], weights[j]
+        for k in range(count):
+            up_to[k] += weight if value <= values[k] else none
+    for k in range(count):
+        if up_to[k] >= half and values[k] < middle:
+            middle = values[k]
+    return middle
