@@ -3,7 +3,8 @@
 The largest features of a photo say which others show the same [Wu, Towards Linear-time Incremental Structure from
 Motion, 3DV 2013: preemptive matching]. Matching all features of a pair takes a hundred times as long, or more. A photo
 is matched with the best of its clear partners, with those next to it in name, and with a few whatever they share; pairs
-that have most in common connect all photos.
+that have most in common connect all photos. The best partners stand next to a photo: they tell little of depth, and of
+two passes around something they are all of the same one. So some of the further clear partners are matched, too.
 """
 
 from __future__ import annotations
@@ -24,7 +25,9 @@ LARGEST = 300  # features of each photo that are looked at
 # Photos that show nothing in common share two of these matches, and up to six; of pairs with 30 verified matches of
 # all features, 99 in 100 share six.
 CLEAR = 6
-MOST, LEAST = 12, 4  # partners of a photo: clear ones, and whatever they share
+MOST, LEAST = 12, 4  # partners of a photo that share most: clear ones, and whatever they share
+SPREAD, APART = 4, 4  # further clear partners: evenly from better to worse, and those that share least with the others
+TREES = 8  # pairs, at least, by which any some photos are connected with the rest
 NEXT = 2  # photos to each side in the order of names are partners, too: most captures are a walk
 BEST = 3  # partners that share most are near a photo, with those next to it
 # COLMAP's tests of a match, as angles between descriptors: to the nearest one, and to it over that to the second.
@@ -121,23 +124,39 @@ def count_matches(cosines: Float[np.ndarray, "k m"]) -> int:
 def choose_pairs(common: Int[np.ndarray, "n n"]) -> list[tuple[int, int]]:
     """Pairs (i < j) to match, given how many features each two photos have in common."""
     chosen = set(_connecting(common))
-    for i, own in enumerate(common):
-        partners = [int(j) for j in np.argsort(-own, kind="stable") if j != i]
-        chosen |= {
-            (min(i, j), max(i, j))
-            for rank, j in enumerate(partners[:MOST])
-            if rank < LEAST or own[j] >= CLEAR
-        }  # fmt: skip
+    for i in range(len(common)):
+        chosen |= {(min(i, j), max(i, j)) for j in _partners(common, i)}
     return sorted(chosen)
 
 
+def _partners(common: Int[np.ndarray, "n n"], i: int) -> list[int]:
+    """The best partners of one photo, and some of its further clear ones."""
+    own = common[i]
+    ranked = [int(j) for j in np.argsort(-own, kind="stable") if j != i]
+    clear = [j for j in ranked if own[j] >= CLEAR]
+    partners, further = ranked[: max(LEAST, min(MOST, len(clear)))], clear[MOST:]
+    if further:
+        partners += [further[k] for k in sorted(set(np.linspace(0, len(further) - 1, SPREAD).astype(int).tolist()))]
+    for _ in range(APART):
+        left = [j for j in further if j not in partners]
+        if not left:
+            break
+        shared = common[np.ix_(left, partners)].max(axis=1, initial=0)
+        partners.append(left[int(shared.argmin())])
+    return partners
+
+
 def _connecting(common: Int[np.ndarray, "n n"]) -> list[tuple[int, int]]:
-    """The spanning tree whose pairs have most in common."""
+    """Spanning trees whose pairs have most in common, one after another, each of pairs that those before left."""
     from scipy.sparse.csgraph import minimum_spanning_tree
 
     costs = np.triu(common.max(initial=0) + 1 - common, 1)  # above zero, which would be no edge
-    first, second = minimum_spanning_tree(costs).nonzero()
-    return [(min(i, j), max(i, j)) for i, j in zip(first.tolist(), second.tolist(), strict=True)]
+    found = []
+    for _ in range(TREES):
+        first, second = minimum_spanning_tree(costs).nonzero()
+        found += [(min(i, j), max(i, j)) for i, j in zip(first.tolist(), second.tolist(), strict=True)]
+        costs[first, second] = 0
+    return found
 
 
 # ---------------------------------------------------------------- matching
