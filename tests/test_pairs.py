@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from itertools import combinations
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from stages.posing import pairs
+from stages.posing.features import _pad_descriptors
 from stages.posing.pairs import choose_pairs, common_features, likely_pairs, near_pairs
 
 
@@ -142,6 +144,8 @@ def test_the_largest_features_of_a_database_choose_the_pairs(tmp_path: Path, mon
             keypoints[:, 2] = keypoints[:, 5] = sizes
             opened.write_keypoints(image_id, keypoints)
             opened.write_descriptors(image_id, pycolmap.FeatureDescriptors(pycolmap.FeatureExtractorType.SIFT, own))
+    with pycolmap.Database.open(path) as opened:  # larger ones without a descriptor count for nothing
+        _append_zeros(opened, sizes=30.0, number=25)
     monkeypatch.setattr(pairs, "_connecting", lambda common: [])
     monkeypatch.setattr(pairs, "NEXT", 0)
     assert likely_pairs(path) == [(1, 3)]
@@ -152,3 +156,13 @@ def test_the_largest_features_of_a_database_choose_the_pairs(tmp_path: Path, mon
     assert near_pairs(path, {"4 a.jpg"}) == [(1, 4), (1, 5), (4, 5)]
     assert near_pairs(path, {"0 a.jpg"}) == [(1, 2), (1, 3), (2, 3)]
     assert near_pairs(path, set()) == []
+
+
+def _append_zeros(opened: Any, sizes: float, number: int) -> None:
+    """As `stages.posing.features.append` does, to all images of an open database that have features."""
+    more = np.zeros((number, 6), np.float32)
+    more[:, 2] = more[:, 5] = sizes
+    ids = [image.image_id for image in opened.read_all_images() if opened.exists_keypoints(image.image_id)]
+    for i in ids:
+        opened.update_keypoints(i, np.concatenate([opened.read_keypoints(i), more]))
+    _pad_descriptors(opened, dict.fromkeys(ids, number))

@@ -78,13 +78,17 @@ def common_in(database: Path) -> tuple[list[int], list[str], Int[np.ndarray, "n 
 
 
 def largest_descriptors(database: Any, image_id: int) -> Float[np.ndarray, "k 128"]:
-    """Descriptors of the largest features of an image of an open COLMAP database, whole numbers."""
-    if not database.exists_descriptors(image_id):
+    """Descriptors of the largest features of an image of an open COLMAP database, whole numbers.
+
+    Features that match nothing (see `stages.posing.features.append`), whose descriptors are zero, are passed over.
+    """
+    if not database.num_descriptors_for_image(image_id):
         return np.zeros((0, 128), np.float32)
     keypoints = database.read_keypoints(image_id)
     areas = np.abs(keypoints[:, 2] * keypoints[:, 5] - keypoints[:, 3] * keypoints[:, 4])
-    order = np.argsort(-areas, kind="stable")[:LARGEST]
-    return np.asarray(database.read_descriptors(image_id).data)[order].astype(np.float32)
+    descriptors = np.asarray(database.read_descriptors(image_id).data)
+    order = np.argsort(-areas, kind="stable")
+    return descriptors[order[descriptors.any(axis=1)[order]][:LARGEST]].astype(np.float32)
 
 
 def common_features(descriptors: list[Float[np.ndarray, "_ 128"]]) -> Int[np.ndarray, "n n"]:
