@@ -147,7 +147,8 @@ class Workbench:
             ]
             self.priors = {camera.camera_id: camera.mean_focal_length() for camera in cameras}
         self.matcher = choose_matcher(params, self.located, len(self.names))
-        if self.matcher == PREEMPTIVE and self._at_once > 1:  # of views of one place the best partners tell least
+        if params.matcher == "auto" and self.matcher == PREEMPTIVE and self._at_once > 1:
+            # of views of one place the best partners tell least
             self.matcher = EXHAUSTIVE
 
     def database(self, base: Base | None = None) -> Path:
