@@ -9,8 +9,8 @@ A truth is a known surface (`gt_mesh.ply`, `transforms.json`), and the score is 
 known cameras (`cameras_sphere.npz`, with masks where there are any), and the score is the PSNR of photos that were left
 out of the training.
 
-Photos and poses are made ready once a set and shared by all its runs. A run is the stages train, extract and cleanup,
-called in a process of its own with one thread; as many run side by side as there are cores. Results go to
+Photos, poses and dense points are made ready once a set and shared by all its runs. A run is the stages train, extract
+and cleanup, called in a process of its own with one thread; as many run side by side as there are cores. Results go to
 benchmarks/results/ablation/SET-VARIANT-SEED-STEPS-POSES.json as each ends; runs that have one with the same steps,
 preset, settings and poses are skipped, so an interrupted call goes on where it stopped. Run folders lie in
 benchmarks/out/ablation/ until scored, and the log of a run that failed stays there.
@@ -58,6 +58,7 @@ BASE_SETTINGS = {
     "train.field.gradients": "analytic",
 }
 BACKBONES = ("neus2", "hfneus", "neuralangelo")
+NO_STEREO = {"train.losses.dense": "0"}
 TERMS = {f"train.terms.{term}.form": "stable" for term in ("ambiguity", "reflection", "planar", "eikonal")}
 
 
@@ -85,8 +86,10 @@ VARIANTS: dict[str, dict[str, str]] = {
     # its weight is made of the planar term's
     "eikonal-paper": {"train.terms.planar.form": "paper", "train.terms.eikonal.form": "paper"},
     "all-paper": {**dict.fromkeys(TERMS, "paper"), "train.terms.ambiguity.visibility": "paper"},
-    # the colours and the Eikonal term alone, as in NeuS: no SfM points, no reflected direction
-    "rgb+eikonal": {"train.losses.sparse": "0", "train.field.radiance_inputs": "view"},
+    # the colours and the Eikonal term alone, as in NeuS: no points, no reflected direction
+    "rgb+eikonal": {**NO_STEREO, "train.losses.sparse": "0", "train.field.radiance_inputs": "view"},
+    # as it was before dense stereo: held to the SfM points alone
+    "no-stereo": NO_STEREO,
     "density-neus": {"train.density.form": "neus"},
     "scale-learned": {"train.density.scale": "learned"},
     "gradients-numerical": {"train.field.gradients": "numerical"},
@@ -112,7 +115,7 @@ VARIANTS: dict[str, dict[str, str]] = {
 
 RUNS = RESULTS / "ablation"
 FOLDERS = OUT / "ablation"
-SHARED = "undistort"
+POSED, SHARED = ("undistort", "densify"), "densify"  # what trainings start from, and up to where all runs share it
 HOLDOUT = 8  # every so many photos one is left out, on sets whose score is the PSNR
 # Two runs with a thread each do more on two cores than one run with two.
 ONE_THREAD = {
@@ -140,8 +143,10 @@ class Plan:
     @property
     def sets(self) -> list[str]:
         """All that is set on top of the preset."""
-        # A budget of minutes would overrule that of steps; a preview at the end is enough.
-        budget = ["train.minutes=null", f"train.steps={self.steps}", "train.preview_every=1"]
+        # Minutes would overrule a budget of steps, dense points would shorten it; a preview at the end is enough.
+        budget = [
+            "train.minutes=null", f"train.steps={self.steps}", "train.steps_if_explained=1", "train.preview_every=1",
+        ]  # fmt: skip
         return [*self.settings, *budget, f"train.seed={self.seed}", f"train.hold_out={self.holdout}"]
 
 
@@ -153,7 +158,7 @@ class Run:
         plan: what was run.
         command: that ran it, with DATA for the folder of sets.
         machine: CPU, cores, versions, device, how many runs went side by side.
-        poses: hash of the undistorted photos and poses it started from.
+        poses: hash of the undistorted photos, poses and dense points it started from.
         code: hash of the sources in `stages/neural`.
         score: distances of the clean mesh, see `protocols.known_object`; None without a known surface.
         psnr: of the training's rays at its end, dB.
@@ -229,7 +234,7 @@ def make_plans(
 
 # ---------------------------------------------------------------- making ready
 def prepare(name: str, data: Path, preset: str) -> None:
-    """Make the photos and poses that all runs of a set share, unless they are there.
+    """Make the photos, poses and dense points that all runs of a set share, unless they are there.
 
     Raises:
         RuntimeError: `hineus` failed.
@@ -245,12 +250,15 @@ def prepare(name: str, data: Path, preset: str) -> None:
     run_hineus([*arguments, "--set", "sfm.deterministic=true", "--json"])
 
 
-def poses_hash(folder: Path) -> str:
-    """Hash of all files of an undistort folder."""
+def poses_hash(shared: Path) -> str:
+    """Hash of all files that the trainings of a set start from."""
     from stages.engine.fingerprint import digest
     from stages.engine.manifest import describe_outputs
 
-    return digest({path: file.sha256 for path, file in describe_outputs(folder).items()})[:12]
+    files = {
+        f"{stage}/{path}": file.sha256 for stage in POSED for path, file in describe_outputs(shared / stage).items()
+    }
+    return digest(files)[:12]
 
 
 def code_hash() -> str:
@@ -291,8 +299,10 @@ def measure(plan: Plan, data: Path, jobs: int = 1, keep: bool = False) -> Run:
     numbers: dict[str, dict[str, Any]] = {}
     wall: dict[str, float] = {}
     cpu: dict[str, float] = {}
-    for stage in measured_stages(data / plan.set):
-        inputs = {name: shared / name if name in (SHARED, "place") else folder / name for name in stage.needs}
+    measured = measured_stages(data / plan.set)
+    own = {stage.name for stage in measured}
+    for stage in measured:
+        inputs = {name: (folder if name in own else shared) / name for name in stage.needs}
         out, scratch = folder / stage.name, folder / f"{stage.name}.scratch"
         out.mkdir(parents=True)
         scratch.mkdir()
@@ -307,7 +317,7 @@ def measure(plan: Plan, data: Path, jobs: int = 1, keep: bool = False) -> Run:
         plan=plan,
         command=command(plan),
         machine={**machine(), "device": device, "jobs": str(jobs)},
-        poses=poses_hash(shared / SHARED),
+        poses=poses_hash(shared),
         code=code,
         score=score_clean_mesh(folder, shared, data / plan.set),
         psnr=trained.get("psnr"),
@@ -571,7 +581,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         for name in sets:
             try:
                 prepare(name, data, preset)
-                poses[name] = poses_hash(FOLDERS / name / "shared" / SHARED)
+                poses[name] = poses_hash(FOLDERS / name / "shared")
             except (RuntimeError, HineusError) as error:
                 print(f"{name}: {error}", file=sys.stderr)
                 failed += [plan.name for plan in plans if plan.set == name]

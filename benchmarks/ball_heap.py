@@ -9,11 +9,13 @@ from __future__ import annotations
 import numpy as np
 
 from stages.geometry.cameras import PinholeCameras, PosedScene
+from stages.geometry.point_cloud import PointCloud
 from stages.geometry.similarity import Similarity
+from stages.neural.sightings import Sightings
 
 WIDTH, HEIGHT, FOCAL = 600, 450, 620.0  # pixels; the unit sphere fills the frame
 NUM_PHOTOS = 47
-NUM_POINTS = 2000
+NUM_POINTS, NUM_DENSE = 2000, 20_000
 DISTANCE = 3.0
 GLOSS = 0.3
 _AROUND = 2 * np.pi * np.arange(5) / 5
@@ -76,11 +78,36 @@ def render(cameras: PinholeCameras, index: int) -> np.ndarray:
 
 def posed_scene(cameras: PinholeCameras) -> PosedScene:
     """The heap's scene, with sparse points exactly on it and the photos that see them."""
+    points, _ = _on_balls(NUM_POINTS)
+    return PosedScene(
+        cameras, Similarity.identity(), points.astype(np.float32), np.full(NUM_POINTS, 0.5, np.float32),
+        _observed(cameras, points).astype(np.int32), np.array([0.0, 0, 1]),
+    )  # fmt: skip
+
+
+def sightings(cameras: PinholeCameras, device: str) -> tuple[Sightings, Sightings]:
+    """Of sparse points and of dense ones, all trusted."""
+    points, normals = _on_balls(NUM_DENSE)
+    photo, point = _observed(cameras, points).T
+    order = np.argsort(point, kind="stable")
+    starts = np.searchsorted(point[order], np.arange(NUM_DENSE + 1))
+    grey, trust = np.full((NUM_DENSE, 3), 128, np.uint8), np.ones(NUM_DENSE)
+    cloud = PointCloud(points, normals, grey, trust, starts, photo[order])
+    dense = Sightings.from_cloud(cloud, cameras.centers, device)
+    return Sightings.from_scene(posed_scene(cameras), device), dense
+
+
+def _on_balls(count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Places [N, 3] on the heap, hidden ones among them, and their normals."""
     rng = np.random.default_rng(0)
-    normals = rng.normal(size=(NUM_POINTS, 3))
+    normals = rng.normal(size=(count, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    ball = rng.choice(len(RADII), NUM_POINTS, p=RADII**2 / (RADII**2).sum())
-    points = CENTERS[ball] + RADII[ball, None] * normals
+    ball = rng.choice(len(RADII), count, p=RADII**2 / (RADII**2).sum())
+    return CENTERS[ball] + RADII[ball, None] * normals, normals
+
+
+def _observed(cameras: PinholeCameras, points: np.ndarray) -> np.ndarray:
+    """Photo and point [M, 2] where a point [P, 3] is seen."""
     observations = []
     for i, center in enumerate(cameras.centers):
         offsets = points - center
@@ -88,7 +115,4 @@ def posed_scene(cameras: PinholeCameras) -> PosedScene:
         seen, _ = first_hit(np.broadcast_to(center, points.shape), offsets / distance[:, None])
         rows = np.flatnonzero(np.abs(seen - distance) < 1e-6)
         observations.append(np.stack([np.full_like(rows, i), rows], 1))
-    return PosedScene(
-        cameras, Similarity.identity(), points.astype(np.float32), np.full(NUM_POINTS, 0.5, np.float32),
-        np.concatenate(observations).astype(np.int32), np.array([0.0, 0, 1]),
-    )  # fmt: skip
+    return np.concatenate(observations)

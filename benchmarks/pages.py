@@ -17,8 +17,8 @@ DOCS = Path(__file__).parent.parent / "docs"
 NOT_MEASURED = "Not measured yet."
 # Each has `tables()`: names and Markdown.
 BENCHMARKS = (
-    "run_sets", "held_out", "textures", "hard_variants", "last_adjustment", "ablate", "suites", "growth", "regions",
-    "region_cuts", "auto_masks", "what_to_expect",
+    "run_sets", "stereo", "held_out", "textures", "hard_variants", "last_adjustment", "ablate", "suites", "growth",
+    "regions", "region_cuts", "auto_masks", "what_to_expect",
 )  # fmt: skip
 
 

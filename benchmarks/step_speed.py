@@ -34,7 +34,6 @@ from configs.load import load_config
 from configs.training import TrainParams
 from stages.neural import encodings, fields
 from stages.neural.encoding_shapes import HashGrid
-from stages.neural.sightings import Sightings
 from stages.neural.trainer import Trainer, field_shape
 from stages.neural.training_photos import Photos
 
@@ -137,13 +136,14 @@ def noise_trainer(params: TrainParams, device: str = "cpu") -> Trainer:
     cameras, rng = ball_heap.dome_of_cameras(), np.random.default_rng(0)
     images = (rng.integers(0, 255, (height, width, 3), dtype=np.uint8) for width, height in cameras.sizes)
     photos = Photos(cameras, images, None, device)
-    return Trainer(photos, Sightings.from_scene(ball_heap.posed_scene(cameras), device), params, device)
+    return Trainer(photos, *ball_heap.sightings(cameras, device), params, device)
 
 
 def points_of_step(params: TrainParams) -> int:
     """How many points a training step asks the distance of."""
-    sampling = params.sampling
-    return sampling.rays * sampling.samples + 4 * params.losses.sparse_batch + sampling.free_points
+    sampling, losses = params.sampling, params.losses
+    sightings = losses.sparse_batch + losses.dense_batch
+    return sampling.rays * sampling.samples + 4 * sightings + sampling.free_points
 
 
 def preset_for(device: str) -> str:
@@ -189,10 +189,10 @@ def variant_trainers(names: Sequence[str], device: str = "cpu") -> dict[str, Tra
     """
     cameras = ball_heap.dome_of_cameras()
     photos = Photos(cameras, [ball_heap.render(cameras, i) for i in range(len(cameras))], None, device)
-    sightings = Sightings.from_scene(ball_heap.posed_scene(cameras), device)
+    sightings = ball_heap.sightings(cameras, device)
     preset = preset_for(device)
     trainers = {
-        name: Trainer(photos, sightings, load_config(preset, None, settings_of(VARIANTS[name])).train, device)
+        name: Trainer(photos, *sightings, load_config(preset, None, settings_of(VARIANTS[name])).train, device)
         for name in names
     }
     first, *others = trainers.values()

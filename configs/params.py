@@ -54,10 +54,12 @@ class IngestParams(Section):
 class SfmParams(Section):
     """Images to camera poses (COLMAP)."""
 
-    matcher: Literal["auto", "exhaustive", "sequential", "spatial"] = Field(
-        "auto", description="which image pairs are matched; auto: exhaustive up to `exhaustive_max` photos"
+    matcher: Literal["auto", "preemptive", "exhaustive", "sequential", "spatial"] = Field(
+        "auto",
+        description="which image pairs are matched; preemptive: those of which large features match; auto: so up to "
+        "`exhaustive_max` photos",
     )
-    exhaustive_max: int = Field(150, ge=2, description="auto matches all pairs up to this many photos")
+    exhaustive_max: int = Field(150, ge=2, description="auto looks at all pairs up to this many photos")
     mapper: Literal["incremental", "global"] = Field("incremental", description="how poses are solved")
     wanted: float = Field(
         0.95,
@@ -158,6 +160,24 @@ class UndistortParams(Section):
     )
 
 
+class DensifyParams(Section):
+    """Pinhole images to depth maps and a point cloud."""
+
+    method: Literal["auto", "patch_match", "off"] = Field(
+        "auto",
+        description="auto: semi-global matching of neighbouring photos; patch_match: COLMAP's, which needs a GPU and a "
+        "pycolmap that was built with CUDA; off: no dense points",
+    )
+    side: int = Field(1000, ge=64, description="photos are compared at this longest side, pixels")
+    neighbors: int = Field(4, ge=1, le=20, description="photos that each photo is compared with")
+
+
+class HeldOutDensifyParams(DensifyParams):
+    """With `train.hold_out`, as it reaches the stage: photos held out from training make no dense points either."""
+
+    hold_out: int = 0
+
+
 class ExtractParams(Section):
     """Neural field to mesh."""
 
@@ -168,6 +188,10 @@ class ExtractParams(Section):
         description="grid cells along the region of interest's side, fewer where photos show no more",
     )
     block: int = Field(64, ge=8, le=256, description="cells along a side of the blocks evaluated at a time")
+    fit: bool = Field(True, description="move the mesh, by parts of a cell, to where dense points of many photos lie")
+    denoising: int = Field(
+        5, ge=0, le=50, description="rounds of a filter that makes planes flat and keeps edges sharp; 0: none"
+    )
 
 
 class CleanupParams(Section):
@@ -235,10 +259,18 @@ class BakeParams(Section):
 
 
 class ExportParams(Section):
-    """Textured mesh to files."""
+    """Textured mesh, and dense points, to files."""
 
-    formats: tuple[Literal["glb", "usdz", "obj", "ply", "stl"], ...] = Field(
-        ("glb", "usdz", "obj", "ply"), description="files to write; stl is the bare shape"
+    formats: tuple[Literal["glb", "usdz", "obj", "ply", "stl", "points"], ...] = Field(
+        ("glb", "usdz", "obj", "ply"),
+        description="files to write; stl is the bare shape, points the dense points as PLY and LAZ",
+    )
+    points_trust: float = Field(
+        0.5, ge=0, le=1, description="dense points that are trusted less, from 0 to 1, are left out of their files"
+    )
+    points_from: Literal["region", "everywhere"] = Field(
+        "region",
+        description="which dense points: those in the region of interest, as of the mesh, or all",
     )
     lods: int = Field(
         0, ge=0, le=4, description="lighter GLBs with the same textures, each with half the faces of the one before"
@@ -262,6 +294,7 @@ class Config(Section):
     sfm: SfmParams = SfmParams()
     place: PlaceParams = PlaceParams()
     undistort: UndistortParams = UndistortParams()
+    densify: DensifyParams = DensifyParams()
     train: TrainParams = TrainParams()
     extract: ExtractParams = ExtractParams()
     cleanup: CleanupParams = CleanupParams()

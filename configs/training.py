@@ -109,6 +109,12 @@ class LossParams(Section):
         0.01, ge=0, description="the SDF must have changed sign this far before and behind SfM points, scene units"
     )
     sparse_batch: int = Field(256, ge=0, description="sightings of SfM points per step")
+    dense: float = Field(3.0, ge=0, description="weight of the dense stereo points' terms, times each point's trust")
+    dense_tolerance: float = Field(0.003, gt=0, description="dense points off by this count linearly, scene units")
+    dense_step: float = Field(
+        0.01, ge=0, description="the SDF must have changed sign this far before and behind dense points, scene units"
+    )
+    dense_batch: int = Field(512, ge=0, description="sightings of dense points per step")
 
 
 class AmbiguityParams(Section):
@@ -176,7 +182,16 @@ class TermParams(Section):
 class TrainParams(Section):
     """Posed images to a neural signed distance field."""
 
-    steps: int = Field(8000, ge=1, description="optimiser steps (ignored where `minutes` is set)")
+    steps: int = Field(
+        8000, ge=1, description="optimiser steps where stereo explains nothing (ignored where `minutes` is set)"
+    )
+    steps_if_explained: float = Field(
+        0.25,
+        gt=0,
+        le=1,
+        description="part of `steps` that is enough where trusted dense points cover all of the surface; in between by "
+        "the share that they cover",
+    )
     minutes: float | None = Field(None, gt=0, description="wall-clock budget in minutes instead of steps")
     seed: int = Field(0, ge=0, description="random seed")
     hold_out: int = Field(

@@ -69,7 +69,7 @@ def _fitting_size(context: StageContext[AtlasParams], vertices: np.ndarray, face
 
 ATLAS: Stage[AtlasParams] = Stage(
     name="atlas",
-    version=2,
+    version=3,
     settings=lambda config: config.atlas,
     run=run,
     reads=(CAMERAS, CLEAN_MESH),

@@ -28,8 +28,9 @@ def run(context: StageContext[BakeParams]) -> dict[str, Any]:
     """Bake the textures. Returns `stages.texture.baking.Baked.numbers`, and how much of the normal map is known."""
     from stages.drawing.rasterizing import rasterize_atlas
     from stages.neural.trained_field import load_field
+    from stages.surface.triangle_mesh import median_edge
     from stages.texture.baking import bake_texture
-    from stages.texture.relief import bake_normals, bake_occlusion
+    from stages.texture.relief import bake_normals, bake_occlusion, relief_texels
     from stages.texture.vertex_quality import VertexWitness
 
     photos, cameras, held_out = context.read(PINHOLE_PHOTOS), context.read(CAMERAS), context.read(HELD_OUT)
@@ -64,8 +65,9 @@ def run(context: StageContext[BakeParams]) -> dict[str, Any]:
     write_png(context.to_write(PROVENANCE), baked.provenance)
     context.write(QUALITY, witness.quality(texels, baked.provenance))
     numbers = dict(baked.numbers)
+    full = context.read(CLEAN_FULL_MESH)
+    texels = relief_texels(atlas, texels, median_edge(*full))
     if params.normal_map:
-        full = context.read(CLEAN_FULL_MESH)
         normal_map, met = bake_normals(atlas, texels, *full, partial(context.progress, note="normals"))
         write_png(context.to_write(NORMAL_MAP), normal_map)
         numbers["normals_share"] = round(met, 4)
@@ -78,7 +80,7 @@ def run(context: StageContext[BakeParams]) -> dict[str, Any]:
 
 BAKE: Stage[BakeParams] = Stage(
     name="bake",
-    version=6,
+    version=7,
     settings=lambda config: config.bake,
     run=run,
     reads=(PINHOLE_PHOTOS, CAMERAS, FIELD, HELD_OUT, CLEAN_FULL_MESH, ATLAS_MESH),

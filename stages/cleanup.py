@@ -75,7 +75,7 @@ def run(context: StageContext[CleanupParams]) -> dict[str, Any]:
     if params.keep_closed:
         inside = selection.whole_pieces(faces, inside)
     keep(
-        inside, "outside_region", "Try `--set undistort.roi_scale=1.5`, or train for longer: `--set train.steps=6000`."
+        inside, "outside_region", "Try `--set undistort.roi_scale=1.5`, or train for longer: `--set train.steps=20000`."
     )
     region = context.read(GIVEN_REGION)
     sides = region.sides(scene.poses_from_scene) if region else []

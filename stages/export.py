@@ -1,7 +1,8 @@
-"""The textured mesh to GLB, USDZ, OBJ + MTL + PNG, PLY and STL, back in the world frame."""
+"""The textured mesh to GLB, USDZ, OBJ + MTL + PNG, PLY and STL, dense points to PLY and LAZ, all in the world frame."""
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,17 +12,31 @@ import numpy as np
 
 from configs.params import ExportParams
 from stages import artifacts
-from stages.artifacts import ASSET, ATLAS_MESH, BASE_COLOR, NORMAL_MAP, OCCLUSION, SCENE, WORLD_PLACE
+from stages.artifacts import (
+    ASSET,
+    ATLAS_MESH,
+    BASE_COLOR,
+    GIVEN_REGION,
+    NORMAL_MAP,
+    OCCLUSION,
+    POINT_CLOUD,
+    SCENE,
+    WORLD_PLACE,
+)
 from stages.engine.stage import Stage, StageContext
 from stages.engine.system import installed_version
 from stages.errors import ReconstructionError, SystemRequirementError
 from stages.geometry.cameras import PosedScene
-from stages.geometry.place import Place
+from stages.geometry.place import GivenRegion, Place
+from stages.geometry.point_cloud import PointCloud
 from stages.geometry.similarity import Similarity
 from stages.geometry.up import y_up_rotation
 
 if TYPE_CHECKING:
     from stages.files.contents import Textures
+
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -94,6 +109,10 @@ def run(context: StageContext[ExportParams]) -> dict[str, Any]:
         raise ReconstructionError(
             f"The mesh cannot be exported: {error}.", "Rebuild it: `hineus run PHOTOS --from cleanup`."
         ) from error
+    if "points" in params.formats:
+        about_points, of_points = _write_points(context, asset, place)
+        numbers |= about_points
+        sizes |= of_points
     return {**numbers, "bytes": sizes}
 
 
@@ -183,6 +202,62 @@ def _write_stl(asset: Asset) -> int:
     return artifacts.asset_path(asset.out, "stl").write_bytes(stl_bytes(mesh.vertices, mesh.faces, asset.note))
 
 
+def _write_points(
+    context: StageContext[ExportParams], asset: Asset, place: Place
+) -> tuple[dict[str, Any], dict[str, int]]:
+    """Numbers of the dense points, and bytes of each of their files; none where there are no points."""
+    from stages.files.points import laz_bytes, points_ply_bytes
+
+    found, region, params = context.read(POINT_CLOUD), context.read(GIVEN_REGION), context.params
+    chosen = found.chosen(asked_for(found, region, context.read(SCENE).poses_from_scene, params))
+    if not len(chosen):
+        return {"points": 0, "warnings": [_no_points(len(found))]}, {}
+    # in float64: poses that were given may be far from their origin, the world's is near
+    world = replace(
+        chosen,
+        points=place.world_from_poses.apply(chosen.points.astype(np.float64)),
+        normals=chosen.normals @ place.world_from_poses.rotation.T,
+    )
+    try:
+        laz = laz_bytes(world, place.offset or (0.0, 0.0, 0.0), place.crs, generator())
+    except ImportError as error:
+        raise SystemRequirementError(
+            f"Dense points are written as LAZ with laspy, lazrs and, on a map, pyproj: {error}.",
+            "Try `pip install laspy lazrs pyproj`, or take points out of `export.formats`.",
+        ) from error
+    files = {"ply": points_ply_bytes(world, asset.note), "laz": laz}
+    sizes = {f"points_{kind}": artifacts.points_path(asset.out, kind).write_bytes(files[kind]) for kind in files}
+    return {"points": len(chosen)}, sizes
+
+
+def asked_for(
+    cloud: PointCloud, region: GivenRegion | None, poses_from_scene: Similarity, params: ExportParams
+) -> np.ndarray:
+    """Which dense points the settings ask for [N] bool, cloud and `region` in the frame of the poses."""
+    rows = np.asarray(cloud.trust >= params.points_trust)
+    if params.points_from == "region" and region is not None:
+        rows &= region.holds(cloud.points)
+    elif params.points_from == "region":
+        rows &= np.linalg.norm(poses_from_scene.inverse().apply(cloud.points), axis=1) < 1
+    return rows
+
+
+def _no_points(found: int) -> dict[str, str]:
+    """For the report and the log: that no dense points are exported, of so many that were found."""
+    if not found:
+        sentence = (
+            "There are no dense points to export: no photos overlap enough, what they show is plain or shiny, or "
+            "`densify.method` is off."
+        )
+        log.warning("%s", sentence)
+        return {"sentence": sentence}
+    settings = "--set export.points_trust=0 --set export.points_from=everywhere"
+    return {
+        "sentence": f"No dense points are exported: of {found:,} none is trusted enough and in the region of interest.",
+        "command": f"hineus run --workspace WORKSPACE {settings}",
+    }
+
+
 def _write_georeference(asset: Asset, place: Place) -> None:
     """Where on Earth, or in the control points' frame, the files lie; nothing where that is not known."""
     from stages.files.georeference import georeference, metadata_xml
@@ -263,11 +338,11 @@ def provenance(scene: PosedScene, place: Place, gltf_from_world: np.ndarray, run
 
 EXPORT: Stage[ExportParams] = Stage(
     name="export",
-    version=7,
+    version=8,
     settings=lambda config: config.export,
     run=run,
-    reads=(SCENE, WORLD_PLACE, ATLAS_MESH, BASE_COLOR, NORMAL_MAP, OCCLUSION),
+    reads=(SCENE, WORLD_PLACE, GIVEN_REGION, POINT_CLOUD, ATLAS_MESH, BASE_COLOR, NORMAL_MAP, OCCLUSION),
     writes=(ASSET,),
     reads_manifests=("bake",),
-    summary="textured mesh -> GLB, USDZ, OBJ, PLY, STL",
+    summary="textured mesh -> GLB, USDZ, OBJ, PLY, STL; dense points -> PLY, LAZ",
 )

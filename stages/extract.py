@@ -1,4 +1,4 @@
-"""Neural field to a closed mesh: marching cubes at the resolution the photos support."""
+"""Neural field to a closed mesh: marching cubes at the resolution the photos support, then what dense points show."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from configs.params import ExtractParams
-from stages.artifacts import CAMERAS, FIELD, RAW_MESH
+from stages.artifacts import FIELD, POINT_CLOUD, RAW_MESH, SCENE
 from stages.engine.stage import Stage, StageContext
 from stages.errors import ReconstructionError
 from stages.geometry.cameras import PinholeCameras
@@ -26,10 +26,13 @@ def supported_resolution(cameras: PinholeCameras) -> int:
 
 def run(context: StageContext[ExtractParams]) -> dict[str, Any]:
     from stages.neural.trained_field import load_field
+    from stages.surface.denoising import denoised
+    from stages.surface.fitting import fit_to_points
     from stages.surface.solids import extract_solid
 
     field = load_field(context.read(FIELD), context.device)
-    supported = max(supported_resolution(context.read(CAMERAS)), MIN_RESOLUTION)
+    scene = context.read(SCENE)
+    supported = max(supported_resolution(scene.cameras), MIN_RESOLUTION)
     resolution = min(context.params.resolution, supported)
     surface = extract_solid(
         field.sdf,
@@ -42,25 +45,32 @@ def run(context: StageContext[ExtractParams]) -> dict[str, Any]:
         raise ReconstructionError(
             f"The field has no surface inside the region of interest: 0 faces at {resolution}^3 "
             f"(distance at the centre {centre:+.3f}).",
-            "Training ended too early or the region is wrong: try `--set train.steps=6000`, or "
+            "Training ended too early or the region is wrong: try `--set train.steps=20000`, or "
             "`--set undistort.roi_scale=1.5`.",
         )
-    context.write(RAW_MESH, (surface.vertices, surface.faces))
+    vertices, faces, used = surface.vertices, surface.faces, 0
+    if context.params.fit:
+        cloud = context.read(POINT_CLOUD).moved(scene.poses_from_scene.inverse())
+        fit = fit_to_points(vertices, faces, cloud, 2 / resolution)
+        vertices, used = fit.vertices, fit.used
+    vertices = denoised(vertices, faces, context.params.denoising)
+    context.write(RAW_MESH, (vertices, faces))
     return {
         "resolution": resolution,
         "supported_resolution": supported,
-        "vertices": len(surface.vertices),
-        "faces": len(surface.faces),
+        "vertices": len(vertices),
+        "faces": len(faces),
         "evaluated_points": surface.evaluated,
+        "points_fitted": used,
     }
 
 
 EXTRACT: Stage[ExtractParams] = Stage(
     name="extract",
-    version=2,
+    version=3,
     settings=lambda config: config.extract,
     run=run,
-    reads=(CAMERAS, FIELD),
+    reads=(SCENE, FIELD, POINT_CLOUD),
     writes=(RAW_MESH,),
-    summary="field to mesh",
+    summary="field to mesh, fitted to the dense points",
 )

@@ -50,6 +50,8 @@ REQUIRED = {
     "platformdirs": "platformdirs",
     "jinja2": "jinja2",
     "pxr": "usd-core",
+    "laspy": "laspy",
+    "lazrs": "lazrs",
 }
 OPTIONAL = {
     "rawpy": ("rawpy", "camera raw files are left out"),

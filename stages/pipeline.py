@@ -7,6 +7,7 @@ from typing import Any
 from stages.atlas import ATLAS
 from stages.bake import BAKE
 from stages.cleanup import CLEANUP
+from stages.densify import DENSIFY
 from stages.engine.stage import Stage
 from stages.export import EXPORT
 from stages.extract import EXTRACT
@@ -22,11 +23,12 @@ PIPELINE: tuple[Stage[Any], ...] = (
     SFM,  # images -> camera poses
     PLACE,  # poses -> metres, place and up of the world
     UNDISTORT,  # poses -> pinhole images in a normalised frame
+    DENSIFY,  # pinhole images -> depth maps, a dense point cloud
     TRAIN,  # posed images -> neural signed distance field
     EXTRACT,  # field -> mesh
     CLEANUP,  # mesh -> clean, light mesh
     ATLAS,  # clean mesh -> UV charts
     BAKE,  # charts + photos -> texture
-    EXPORT,  # textured mesh -> GLB, USDZ, OBJ, PLY, STL
+    EXPORT,  # textured mesh -> GLB, USDZ, OBJ, PLY, STL; points -> PLY, LAZ
     REPORT,  # everything -> one HTML page
 )

@@ -43,6 +43,9 @@ SFM_BASE_GIB, SFM_GIB_PER_THREAD_MP = 0.25, 0.25  # finding features: 0.32 GiB a
 MEMORY_MARGIN = 1.3  # an estimate this near to what is there gets a warning
 SFM_CPU_S_PER_MP = 2.8  # 2.3 to 3.3 CPU seconds a megapixel looked at
 SFM_CPU_S_PER_PAIR = 0.01  # too little in those sets to be told from nothing; larger ones are quadratic
+STEREO_CPU_S_PER_MP_AND_NEIGHBOR = 0.28  # 1.0 to 1.2 CPU seconds a megapixel compared with four neighbours
+STEREO_BASE_GIB, STEREO_GIB_PER_MP = 0.5, 0.021  # 0.55 to 1.2 GiB at 11 to 29 megapixels; maps of all are held
+EXPLAINED = 0.6  # share of the surface that dense points cover: 0.16 of polished metal, 0.6 of plaster, 0.9 of a helmet
 TRAIN_CPU_S_PER_RAY_SAMPLE = 4.9e-6  # 317 to 329 CPU seconds for 8000 steps of 512 rays of 16 samples
 OTHER_CPU_S = 50.0  # everything after training: 37 to 47
 # Part of the work that cores share: two made training 1.53 to 1.80 times as fast, poses 1.7 times. What more cores
@@ -51,6 +54,7 @@ PARALLEL_SHARE = 0.8
 DISK_BASE_GB = 0.3  # checkpoint, meshes, textures, report: an allowance
 FEATURE_BYTES_PER_PIXEL = 1.2  # looked at: features and matches are kept for photos that are added later
 DISK_BYTES_PER_PIXEL = 2.0  # undistorted images are PNG: 1.4 to 2 bytes a pixel
+STEREO_BYTES_PER_PIXEL = 6.0  # compared: depth maps and points, 3 to 8
 
 
 @dataclass(frozen=True)
@@ -203,29 +207,34 @@ def estimate(seen: Inspection, config: Config, device: str, workers: int) -> Nee
         return [width * height * min(1.0, most / max(width, height)) ** 2 for width, height in seen.sizes]
 
     looked_at = pixels(min(config.ingest.max_side, config.sfm.max_image_size))
-    trained_on = sum(pixels(min(config.ingest.max_side, config.undistort.max_side)))
+    side = min(config.ingest.max_side, config.undistort.max_side)
+    trained_on = sum(pixels(side))
+    compared = 0.0 if config.densify.method == "off" else sum(pixels(min(side, config.densify.side)))
     sfm_gib = SFM_BASE_GIB + workers * SFM_GIB_PER_THREAD_MP * max(looked_at, default=0) / 1e6
     masks_bytes = bytes_to_read_masks(seen.masks.files.values())
     read_gib = max([masks_bytes, *(photo.bytes_to_read for photo in seen.photos)]) / GIB
+    stereo_gib = STEREO_BASE_GIB + STEREO_GIB_PER_MP * compared / 1e6
     later_gib = MEMORY_BASE_GIB + MEMORY_OF_PHOTOS * 3 * trained_on / GIB
+    made_bytes = DISK_BYTES_PER_PIXEL * trained_on + STEREO_BYTES_PER_PIXEL * compared
     return Needs(
-        memory_gib=max(read_gib, sfm_gib, later_gib),
-        disk_gb=DISK_BASE_GB
-        + (seen.num_bytes + DISK_BYTES_PER_PIXEL * trained_on + FEATURE_BYTES_PER_PIXEL * sum(looked_at)) / 1e9,
-        minutes=_minutes(looked_at, config, workers) if device == "cpu" else None,
+        memory_gib=max(read_gib, sfm_gib, stereo_gib, later_gib),
+        disk_gb=DISK_BASE_GB + (seen.num_bytes + made_bytes + FEATURE_BYTES_PER_PIXEL * sum(looked_at)) / 1e9,
+        minutes=_minutes(looked_at, compared, config, workers) if device == "cpu" else None,
     )
 
 
-def _minutes(looked_at: list[float], config: Config, workers: int) -> float:
+def _minutes(looked_at: list[float], compared: float, config: Config, workers: int) -> float:
     count, train = len(looked_at), config.train
     pairs = count * (count - 1) / 2 if count <= config.sfm.exhaustive_max else 10 * count
     wall_per_cpu = 1 - PARALLEL_SHARE + PARALLEL_SHARE / workers
-    ray_samples = train.steps * train.sampling.rays * train.sampling.samples
+    part = 1 + EXPLAINED * (train.steps_if_explained - 1) if compared else 1.0
+    ray_samples = part * train.steps * train.sampling.rays * train.sampling.samples
     training_s = ray_samples * TRAIN_CPU_S_PER_RAY_SAMPLE * wall_per_cpu
     if train.minutes is not None:
         training_s = 60 * train.minutes
-    other_s = SFM_CPU_S_PER_MP * sum(looked_at) / 1e6 + SFM_CPU_S_PER_PAIR * pairs + OTHER_CPU_S
-    return (training_s + other_s * wall_per_cpu) / 60
+    sfm_s = SFM_CPU_S_PER_MP * sum(looked_at) / 1e6 + SFM_CPU_S_PER_PAIR * pairs
+    stereo_s = STEREO_CPU_S_PER_MP_AND_NEIGHBOR * config.densify.neighbors * compared / 1e6
+    return (training_s + (sfm_s + stereo_s + OTHER_CPU_S) * wall_per_cpu) / 60
 
 
 def _warnings(seen: Inspection, config: Config) -> list[str]:

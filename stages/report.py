@@ -25,6 +25,7 @@ from stages.artifacts import (
     PAGE,
     PHOTOS,
     PINHOLE_PHOTOS,
+    POINT_CLOUD,
     PREVIEWS,
     PROVENANCE,
     QUALITY,
@@ -40,6 +41,7 @@ from stages.engine.stage import Stage, StageContext
 from stages.errors import HineusError
 from stages.geometry.cameras import PosedScene
 from stages.geometry.place import GivenRegion, Place
+from stages.geometry.point_cloud import PointCloud
 
 T = TypeVar("T")
 
@@ -52,7 +54,7 @@ def run(context: StageContext[ReportParams]) -> dict[str, Any]:
     """Write report.html. Returns its size in bytes, and how the final mesh meets held-out photos."""
     import jinja2
 
-    from stages.reporting import control, curves, numbers, photo_table, pictures, poses
+    from stages.reporting import control, curves, numbers, photo_table, pictures, poses, stereo
     from stages.reporting.held_out_photos import compare_held_out
 
     scene, place, atlas = context.read(SCENE), context.read(WORLD_PLACE), context.read(ATLAS_MESH)
@@ -73,14 +75,19 @@ def run(context: StageContext[ReportParams]) -> dict[str, Any]:
     )
     context.progress(2, steps, "collecting the photos")
     image_set, registration = left(context, IMAGE_SET), left(context, REGISTRATION)
-    results = photo_table.photo_results(image_set, registration, context.read(MODEL), scene.cameras.names, held_out)
+    dense = manifests["densify"].numbers if "densify" in manifests else {}
+    results = photo_table.photo_results(
+        image_set, registration, context.read(MODEL), scene.cameras.names, held_out, dense.get("explained", {})
+    )
     page |= photo_table.describe_photos(
         results, image_set, registration, context.read(PHOTOS), context.params.thumbnails
     )
     context.progress(3, steps, "packing the 3D view")
     captions = photo_table.camera_captions(results, scene.cameras.names)
     region = context.read(GIVEN_REGION)
-    page |= describe_view(scene, place, region, atlas, texture, left(context, QUALITY), captions)
+    page |= describe_view(
+        scene, place, region, atlas, texture, left(context, QUALITY), left(context, POINT_CLOUD), captions
+    )
     context.progress(4, steps, "writing the page")
     placed = {name: manifests[name].numbers for name in ("undistort", "place", "train") if name in manifests}
     page |= {
@@ -88,6 +95,7 @@ def run(context: StageContext[ReportParams]) -> dict[str, Any]:
         "overview": overview_svg(scene, region_corners(scene, region)),
         "warnings": numbers.warnings(manifests),
         "where": numbers.describe_where(scene, place, placed),
+        "stereo": stereo.describe_stereo(results, dense),
         "control": control.describe_control(place),
         "poses": [*numbers.describe_history(manifests), *poses.describe_poses(registration, place)],
         "charts": curves.training_charts(context.read(METRICS)),
@@ -130,6 +138,7 @@ def describe_view(
     atlas: AtlasMesh,
     texture: np.ndarray,
     quality: VertexQuality | None,
+    cloud: PointCloud | None,
     captions: list[dict[str, Any]],
 ) -> dict[str, Any]:
     """The 3D view and, where the bake stage left its measures, their colours and the next photos to take."""
@@ -147,6 +156,7 @@ def describe_view(
             **view3d.pack_scene(scene, captions, advice.views if advice else (), shown),
             "region": view3d.pack_region(scene, place, region),
             "overlays": overlays,
+            "dense": cloud and view3d.pack_dense(cloud, scene),
         },
         "three": THREE.read_text(encoding="utf-8"),
     }
@@ -171,7 +181,7 @@ def replay(context: StageContext[ReportParams]) -> str:
 
 REPORT: Stage[ReportParams] = Stage(
     name="report",
-    version=9,
+    version=10,
     settings=lambda config: config.report,
     run=run,
     reads=(
@@ -183,6 +193,7 @@ REPORT: Stage[ReportParams] = Stage(
         GIVEN_REGION,
         SCENE,
         PINHOLE_PHOTOS,
+        POINT_CLOUD,
         METRICS,
         PREVIEWS,
         HELD_OUT,
@@ -192,7 +203,19 @@ REPORT: Stage[ReportParams] = Stage(
         QUALITY,
     ),
     writes=(PAGE,),
-    reads_manifests=("ingest", "sfm", "place", "undistort", "train", "extract", "cleanup", "atlas", "bake", "export"),
+    reads_manifests=(
+        "ingest",
+        "sfm",
+        "place",
+        "undistort",
+        "densify",
+        "train",
+        "extract",
+        "cleanup",
+        "atlas",
+        "bake",
+        "export",
+    ),
     reads_run=True,
     summary="everything -> one HTML page",
 )

@@ -11,7 +11,7 @@ import shutil
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -77,45 +77,106 @@ def run(context: StageContext[SfmParams]) -> dict[str, Any]:
     if "poses" in context.sources:
         return _from_known_poses(context)
 
-    params, photos, image_set = context.params, context.read(PHOTOS), context.read(IMAGE_SET)
-    _check_masks(image_set, params)
-    names = [record.name for record in image_set.images]
-    needed = _needed(len(names), params)
-    contents = _contents(photos, names)
+    photos, image_set = context.read(PHOTOS), context.read(IMAGE_SET)
+    _check_masks(image_set, context.params)
+    contents = _contents(photos, [record.name for record in image_set.images])
     known = _known_photos(context, contents, image_set)
-
     with _working(context) as work:
-        bench = Workbench(
-            work,
-            photos.images,
-            photos.masks,
-            image_set,
-            params,
-            threads=1 if params.deterministic else max(1, context.workers),
-            workers=context.workers,
-            cuda=context.device == "cuda",
-            progress=context.progress,
-            known=known,
-        )
-        wanted = photos_wanted(len(names), params.wanted)
-        best, steps = _solve(bench, wanted, max(needed, len(names) // 2), params)
-        evidence = Evidence(bench.database())
-        # of the same matches as at first, where nothing else was tried
-        depth = bench.depth if len(steps) == 1 else judge_depth(bench.database())
-        if best is not None and not best.base.corners:
-            _keep_features(bench.database(best.base), context.to_write(FEATURES))
+        bench = _bench(context, work, photos, image_set, known)
+        found = _find(bench, context.params)
+        if found.best is not None and not found.best.base.corners:
+            _keep_features(bench.database(found.best.base), context.to_write(FEATURES))
 
+    best, unregistered = _placed(found, bench)
+    relaxed = _is_relaxed(context, found.steps[-1])
+    _warn_of(found, best, unregistered, bench, relaxed)
+    kept = known if known is not None and found.steps[-1].rung == ADDED else None
+    last = _adjusted(context, best.model, bench.threads, kept)
+    others = len(best.others)
+    lineage, since = _since(context, last.model, known)
+    numbers = _publish(
+        context, last, best.registered, unregistered, context.params.mapper, bench.matcher, others, found.steps, relaxed
+    )
+    _keep_contents(context, contents, image_set, lineage)
+    warnings = [
+        *_place_warnings(from_one_place(found.depth.parallaxes), len(bench.names), last.model),
+        *_flat_warnings(found.depth, last, bench),
+        *_still_warnings(bench.stands_still, image_set),
+    ]
+    return {**numbers, **since, "warnings": warnings}
+
+
+# ---------------------------------------------------------------- finding poses
+@dataclass(frozen=True)
+class Found:
+    """What the attempts came to.
+
+    Attributes:
+        best: None where no photo was placed.
+        steps: all attempts. wanted: photos that would have ended them.
+        evidence, depth: what the matches say of each photo, and of the photos' parallax.
+    """
+
+    best: Solution | None
+    steps: list[Step]
+    wanted: int
+    evidence: Evidence
+    depth: Depth
+
+
+def _bench(
+    context: StageContext[SfmParams], work: Path, photos: Pictures, image_set: ImageSet, known: KnownPhotos | None
+) -> Workbench:
+    return Workbench(
+        work,
+        photos.images,
+        photos.masks,
+        image_set,
+        context.params,
+        threads=_threads(context),
+        workers=context.workers,
+        cuda=context.device == "cuda",
+        progress=context.progress,
+        known=known,
+    )
+
+
+def _threads(context: StageContext[SfmParams]) -> int:
+    """For what depends on their number."""
+    return 1 if context.params.deterministic else max(1, context.workers)
+
+
+def _find(bench: Workbench, params: SfmParams) -> Found:
+    """Attempts until enough photos are placed, or none is left."""
+    total = len(bench.names)
+    wanted = photos_wanted(total, params.wanted)
+    best, steps = _solve(bench, wanted, max(_needed(total, params), total // 2), params)
+    # of the same matches as at first, where nothing else was tried
+    depth = bench.depth if len(steps) == 1 else judge_depth(bench.database())
+    return Found(best, steps, wanted, Evidence(bench.database()), depth)
+
+
+def _placed(found: Found, bench: Workbench) -> tuple[Solution, tuple[Unregistered, ...]]:
+    """The best solution, and why photos are not in it.
+
+    Raises:
+        ReconstructionError: too few photos are.
+    """
+    best, steps, image_set, params = found.best, found.steps, bench.image_set, bench.params
+    names = [record.name for record in image_set.images]
     if best is None:
         if bench.stands_still:
             raise _nothing_moved(len(names), steps)
-        raise _nothing_matched(evidence, names, steps, params, _masks_advice(image_set, params))
+        raise _nothing_matched(found.evidence, names, steps, params, _masks_advice(image_set, params))
     unregistered = tuple(
         Unregistered(
-            name=name, reason=evidence.reason(name, best.registered, best.others, bench.verified, bench.agreeing)
+            name=name,
+            reason=found.evidence.reason(name, best.registered, best.others, bench.verified, bench.agreeing),
         )
         for name in names
         if name not in best.registered
     )
+    needed = _needed(len(names), params)
     if len(best.registered) < needed:
         raise _too_few(
             len(best.registered),
@@ -124,35 +185,27 @@ def run(context: StageContext[SfmParams]) -> dict[str, Any]:
             _tried(steps),
             _hint(steps, params) + _masks_advice(image_set, params),
         )
+    return best, unregistered
+
+
+def _warn_of(
+    found: Found, best: Solution, unregistered: tuple[Unregistered, ...], bench: Workbench, relaxed: bool
+) -> None:
+    """What the log says of the poses."""
     for item in unregistered:
         log.warning("not registered: %s: %s", item.name, item.reason)
-    if params.masks != "always" and max(map(len, best.others), default=0) >= SECOND_PASS * len(names):
+    if bench.params.masks != "always" and max(map(len, best.others), default=0) >= SECOND_PASS * len(bench.names):
         log.warning(
             "%d photos make a model of their own. If the object was moved in between, as turned over for a second "
             "pass, try `hineus run PHOTOS --moving-object`, with `--masks FOLDER` or without",
             max(map(len, best.others)),
         )
-    for prior, found in bench.contradicted(best):
-        log.warning("the EXIF focal length, %.0f px, is wrong: the poses say %.0f px", prior, found)
-    relaxed = _is_relaxed(context, steps[-1])
+    for prior, focal in bench.contradicted(best):
+        log.warning("the EXIF focal length, %.0f px, is wrong: the poses say %.0f px", prior, focal)
     if relaxed:
         log.warning("poses were found with relaxed thresholds only: they are rough, and some may be wrong")
-    if len(steps) > 1 and len(best.registered) < wanted and not learned_available():
+    if len(found.steps) > 1 and len(best.registered) < found.wanted and not learned_available():
         log.warning("`%s` adds a way to place photos of plain objects", FEATURES_EXTRA)
-    kept = known if known is not None and steps[-1].rung == ADDED else None
-    last = _adjusted(context, best.model, bench.threads, kept)
-    others = len(best.others)
-    lineage, since = _since(context, last.model, known)
-    numbers = _publish(
-        context, last, best.registered, unregistered, params.mapper, bench.matcher, others, steps, relaxed
-    )
-    _keep_contents(context, contents, image_set, lineage)
-    warnings = [
-        *_place_warnings(from_one_place(depth.parallaxes), len(names), last.model),
-        *_flat_warnings(depth, last, bench),
-        *_still_warnings(bench.stands_still, image_set),
-    ]
-    return {**numbers, **since, "warnings": warnings}
 
 
 # ---------------------------------------------------------------- photos that came or went
@@ -452,7 +505,7 @@ def _from_known_poses(context: StageContext[SfmParams]) -> dict[str, Any]:
             context.read(PHOTOS).images,
             cameras,
             params,
-            threads=1 if params.deterministic else max(1, context.workers),
+            threads=_threads(context),
             workers=context.workers,
             cuda=pycolmap.has_cuda and context.device == "cuda",
             progress=context.progress,
@@ -625,7 +678,7 @@ def _too_few(
 
 SFM: Stage[SfmParams] = Stage(
     name="sfm",
-    version=9,
+    version=10,
     settings=lambda config: config.sfm,
     run=run,
     reads=(PHOTOS, IMAGE_SET),

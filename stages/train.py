@@ -20,12 +20,24 @@ import numpy as np
 
 from configs.training import TrainParams
 from stages import artifacts
-from stages.artifacts import CAMERAS, FIELD, FIRST_SCENE, HELD_OUT, METRICS, PINHOLE_PHOTOS, PREVIEWS, SCENE, Pictures
+from stages.artifacts import (
+    CAMERAS,
+    FIELD,
+    FIRST_SCENE,
+    HELD_OUT,
+    METRICS,
+    PINHOLE_PHOTOS,
+    POINT_CLOUD,
+    PREVIEWS,
+    SCENE,
+    Pictures,
+)
 from stages.engine.manifest import load_manifest
 from stages.engine.stage import Stage, StageContext
 from stages.errors import ConfigError, InputError, ReconstructionError
 from stages.geometry.cameras import PinholeCameras, PosedScene
 from stages.geometry.normalisation import regrown
+from stages.geometry.point_cloud import PointCloud
 from stages.geometry.similarity import Similarity
 
 log = logging.getLogger(__name__)
@@ -82,7 +94,8 @@ def run(context: StageContext[TrainParams]) -> dict[str, Any]:
         "train_seconds": round(seconds, 1),
         "rays_per_second": round(training.steps_done * params.sampling.rays / max(seconds, 1e-9)),
         "photos": len(trainer.photos),
-        "sightings": len(trainer.sightings.weights),
+        "sightings": len(trainer.sightings),
+        "dense_sightings": len(trainer.dense),
         "region_grown": round(training.region.radius if training.region else 1.0, 3),
         **summary,
     }
@@ -107,6 +120,7 @@ class _Training:
     Attributes:
         region: the scene's, where it has grown. looked: no more to be asked whether it should.
         head_start: part of the budget that counts as spent, since what another training learned was there.
+        steps: the budget, where it is not minutes.
         spent: seconds before this process, or this scene.
         started: clock at its start.
     """
@@ -117,6 +131,7 @@ class _Training:
     region: _Region | None = None
     looked: bool = False
     head_start: float = 0.0
+    steps: int = 0
     spent: float = 0.0
     started: float = field(default_factory=time.monotonic)
 
@@ -131,7 +146,8 @@ class _Training:
             region = _Region(*saved["region"]) if saved["region"] else None
             scene = region.of(scene) if region else scene
             trainer = _make_trainer(context, scene)
-            training = cls(context, scene, trainer, region, saved["looked"], saved["head_start"], saved["seconds"])
+            kept = (saved["looked"], saved["head_start"], saved["steps"], saved["seconds"])
+            training = cls(context, scene, trainer, region, *kept)
             trainer.load_state(saved["trainer"])
             _cut_after(training.metrics, trainer.step_index)
             log.info("training goes on from step %d", trainer.step_index)
@@ -144,21 +160,22 @@ class _Training:
         from stages.neural.trained_field import load_field
 
         before = _last_scene(context, scene)
+        steps = _budget(context, scene)
         if before is None:
-            training = cls(context, scene, _make_trainer(context, scene), looked=not scene.growable)
+            training = cls(context, scene, _make_trainer(context, scene), looked=not scene.growable, steps=steps)
             _start_from_shape(training.trainer, scene.cameras)
             return training
         region = _kept_region(scene, before)
         kept = region.of(scene) if region else scene
         trainer = _make_trainer(context, kept)
         if _same_frame(kept, before) and _take_over(trainer, context, kept.contents, before.contents):
-            training = cls(context, kept, trainer, region, looked=True, head_start=KEPT_NETWORKS)
+            training = cls(context, kept, trainer, region, looked=True, head_start=KEPT_NETWORKS, steps=steps)
         else:
             trainer = _make_trainer(context, scene) if region else trainer
             earlier = load_field(_previous_field(context), context.device)
             error = trainer.start_from(_shape_within(earlier.sdf, scene.poses_from_scene, before.poses_from_scene))
             log.info("the SDF starts from the shape learned before, met to %.4f on average", error)
-            training = cls(context, scene, trainer, looked=not scene.growable, head_start=KEPT_SHAPE)
+            training = cls(context, scene, trainer, looked=not scene.growable, head_start=KEPT_SHAPE, steps=steps)
         trainer.step_index = training.first_step
         log.info(
             "training goes on from what was learned before: %.0f %% of the budget is kept", 100 * training.head_start
@@ -181,7 +198,7 @@ class _Training:
         error = trainer.start_from(shape)
         log.info("the SDF starts from the shape learned so far, met to %.4f on average", error)
         trainer.step_index = steps
-        training = _Training(self.context, scene, trainer, region, True, self.head_start, self.seconds)
+        training = _Training(self.context, scene, trainer, region, True, self.head_start, self.steps, self.seconds)
         training.save()
         return training
 
@@ -191,7 +208,8 @@ class _Training:
 
         partial = self.checkpoint.with_suffix(".partial")
         state = {"trainer": self.trainer.state(), "region": self.region and tuple(self.region), "looked": self.looked}
-        torch.save({**state, "head_start": self.head_start, "seconds": self.seconds}, partial)
+        spent = {"head_start": self.head_start, "steps": self.steps, "seconds": self.seconds}
+        torch.save({**state, **spent}, partial)
         os.replace(partial, self.checkpoint)
 
     @property
@@ -209,8 +227,7 @@ class _Training:
     @property
     def first_step(self) -> int:
         """Steps that count as taken before the first one here."""
-        params = self.context.params
-        return 0 if params.minutes else round(self.head_start * params.steps)
+        return 0 if self.context.params.minutes else round(self.head_start * self.steps)
 
     @property
     def steps_done(self) -> int:
@@ -222,7 +239,7 @@ class _Training:
         params = self.context.params
         if params.minutes:
             return self.head_start + self.seconds / (60 * params.minutes)
-        return float(self.trainer.step_index / params.steps)
+        return float(self.trainer.step_index / self.steps)
 
     def advance(self, until: float) -> None:
         """Train to this part of the budget; checkpoints, previews and metric lines on the way."""
@@ -256,8 +273,15 @@ def _make_trainer(context: StageContext[TrainParams], scene: PosedScene) -> Any:
     _check_hold_out(len(held_out), int(held_out.sum()), params.hold_out)
     images = _load_images(context.read(PINHOLE_PHOTOS), scene.cameras.names)
     photos = Photos(scene.cameras, *images, context.device, ~held_out)
-    sightings = Sightings.from_scene(scene, context.device, (~held_out).numpy())
-    return Trainer(photos, sightings, params, context.device)
+    training = (~held_out).numpy()
+    sightings = Sightings.from_scene(scene, context.device, training)
+    dense = Sightings.from_cloud(_cloud(context, scene), scene.cameras.centers, context.device, training)
+    return Trainer(photos, sightings, dense, params, context.device)
+
+
+def _cloud(context: StageContext[TrainParams], scene: PosedScene) -> PointCloud:
+    """The dense points in the frame of a scene."""
+    return context.read(POINT_CLOUD).moved(scene.poses_from_scene.inverse())
 
 
 # ---------------------------------------------------------------- a region that grows
@@ -391,6 +415,19 @@ def _load_images(
     return images, masks if masked == len(names) else None
 
 
+def _budget(context: StageContext[TrainParams], scene: PosedScene) -> int:
+    """Steps, fewer the more of the surface dense points explain."""
+    from stages.stereo.explaining import explained_share
+
+    params = context.params
+    if params.minutes:
+        return params.steps
+    explained = explained_share(_cloud(context, scene), scene.cameras.centers, scene.ground)
+    steps = max(1, round(params.steps * (1 + explained * (params.steps_if_explained - 1))))
+    log.info("dense points explain %.0f %% of the surface: %d steps", 100 * explained, steps)
+    return steps
+
+
 def _start_from_shape(trainer: Any, cameras: PinholeCameras) -> None:
     """Where training is not to start from a sphere: bring the SDF to a room, or to the visual hull of the masks."""
     from stages.geometry.hull import room_distances
@@ -500,10 +537,10 @@ def _last_numbers(metrics: Path) -> dict[str, float]:
 
 TRAIN: Stage[TrainParams] = Stage(
     name="train",
-    version=7,
+    version=8,
     settings=lambda config: config.train,
     run=run,
-    reads=(FIRST_SCENE, PINHOLE_PHOTOS),
+    reads=(FIRST_SCENE, PINHOLE_PHOTOS, POINT_CLOUD),
     writes=(FIELD, CAMERAS, SCENE, METRICS, PREVIEWS, HELD_OUT),
     continues=True,
     summary="learn a signed distance field and its colours from the posed images",

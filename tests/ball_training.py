@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from sphere_scene import RADIUS, render, ring_of_cameras, sphere_scene
+from sphere_scene import RADIUS, render, ring_of_cameras, sphere_cloud, sphere_scene
 from train_settings import changed, small
 
 from configs.training import TrainParams
+from stages.geometry.cameras import PinholeCameras
 from stages.neural.sightings import Sightings
 from stages.neural.trainer import Trainer
 from stages.neural.training_photos import Photos
@@ -15,7 +16,7 @@ from stages.neural.training_photos import Photos
 SMALL = {
     "steps": 60, "sampling.rays": 128, "sampling.samples": 12, "field.levels": 4, "field.log2_rows": 10,
     "field.coarsest": 8, "field.finest": 32, "field.sdf_width": 16, "field.radiance_width": 16,
-    "schedule.start_levels": 2, "sampling.free_points": 64, "losses.sparse_batch": 32,
+    "schedule.start_levels": 2, "sampling.free_points": 64, "losses.sparse_batch": 32, "losses.dense_batch": 32,
     "sampling.cache_resolution": 24, "sampling.cache_every": 16, "field.background_log2_rows": 9,
     "sampling.background_samples": 4,
 }  # fmt: skip
@@ -26,8 +27,13 @@ def make_trainer(params: TrainParams = TINY, masks: bool = False, device: str = 
     cameras = ring_of_cameras()
     views = [render(cameras, i) for i in range(len(cameras))]
     photos = Photos(cameras, [v[0] for v in views], [v[1] for v in views] if masks else None, device)
-    scene = sphere_scene(cameras)
-    return Trainer(photos, Sightings.from_scene(scene, device), params, device)
+    return Trainer(photos, *ball_sightings(cameras, device), params, device)
+
+
+def ball_sightings(cameras: PinholeCameras, device: str = "cpu") -> tuple[Sightings, Sightings]:
+    """Of sparse points and of dense ones on the ball."""
+    dense = Sightings.from_cloud(sphere_cloud(cameras), cameras.centers, device)
+    return Sightings.from_scene(sphere_scene(cameras), device), dense
 
 
 def assert_finds_the_ball(settings: dict[str, object]) -> None:

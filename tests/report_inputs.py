@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from rigs import scene_without_points
+from rigs import scene_without_points, shell
 
 from configs.params import ReportParams
 from stages import artifacts
@@ -120,10 +120,13 @@ def full_inputs(context: StageContext) -> StageContext:
     artifacts.WORLD_PLACE.save(inputs["place"], Place(still, True, "2 markers (8 sides)", 0.0042))
     region = given_region("box", BOX.ravel().tolist(), still)
     artifacts.GIVEN_REGION.save(inputs["place"], region)
+    artifacts.POINT_CLOUD.save(inputs["densify"], shell())
     artifacts.QUALITY.save(inputs["bake"], quality())
     artifacts.HELD_OUT.save(inputs["train"], ["a.png"])
     write_png(artifacts.Pictures(inputs["undistort"]).path("a.png"), np.full((16, 16, 3), 77, np.uint8))
-    return replace(context, manifests={name: manifest(name, faces=1234, share=0.123456) for name in REPORT.needs})
+    manifests = {name: manifest(name, faces=1234, share=0.123456) for name in REPORT.needs}
+    manifests["densify"] = manifest("densify", points=400, explained={"a.png": 0.42})
+    return replace(context, manifests=manifests)
 
 
 def page(context: StageContext) -> str:

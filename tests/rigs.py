@@ -1,4 +1,4 @@
-"""Captures of known geometry: poses, cameras, scenes and sparse points of the common ways to photograph."""
+"""Captures of known geometry: poses, cameras, scenes and points of the common ways to photograph."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 
 from stages.geometry.cameras import PinholeCameras, PosedScene
 from stages.geometry.normalisation import rotation_onto
+from stages.geometry.point_cloud import PointCloud
 from stages.geometry.similarity import Similarity
 
 EAST, NORTH, UP = np.eye(3)
@@ -190,3 +191,19 @@ def facade(seed: int = 0) -> tuple[PinholeCameras, np.ndarray]:
     wall = random.uniform([-10, 9.8, 0], [10, 10.2, 8], (2500, 3))
     behind = random.uniform([-200, 60, 0], [200, 300, 20], (150, 3))
     return capture(poses), np.concatenate([wall, behind])
+
+
+def shell(count: int = 400, radius: float = 0.7) -> PointCloud:
+    """Dense points of a sphere; the k-th is seen by k % 4 + 1 photos and has the trust k / count."""
+    random = np.random.default_rng(0)
+    normals = random.normal(size=(count, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    seen = np.arange(count) % 4 + 1
+    return PointCloud(
+        radius * normals,
+        normals,
+        random.integers(0, 256, (count, 3)).astype(np.uint8),
+        np.arange(count) / count,
+        np.concatenate([[0], np.cumsum(seen)]),
+        np.concatenate([np.arange(n) for n in seen]),
+    )

@@ -9,6 +9,7 @@ from PIL import Image
 
 from stages import artifacts
 from stages.geometry.cameras import PinholeCameras, PosedScene
+from stages.geometry.point_cloud import PointCloud
 from stages.geometry.similarity import Similarity
 
 RADIUS = 0.45
@@ -49,6 +50,19 @@ def sphere_scene(cameras: PinholeCameras) -> PosedScene:
     )
 
 
+def sphere_cloud(cameras: PinholeCameras) -> PointCloud:
+    """Dense points exactly on the ball, in the scene frame: the left half's are trusted half as much."""
+    rng = np.random.default_rng(1)
+    normals = rng.normal(size=(500, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    points = RADIUS * normals
+    point, photo = np.nonzero(points @ cameras.centers.T > RADIUS**2)
+    starts = np.searchsorted(point, np.arange(len(points) + 1))
+    colors = np.uint8(127.5 + 127.5 * normals)
+    trust = np.where(points[:, 0] < 0, 0.5, 1.0).astype(np.float32)
+    return PointCloud(points.astype(np.float32), normals.astype(np.float32), colors, trust, starts, photo)
+
+
 def render(cameras: PinholeCameras, index: int) -> tuple[np.ndarray, np.ndarray]:
     """Photo [H, W, 3] uint8 and mask [H, W] uint8: a ball with smooth colours on a grey ground."""
     width, height = cameras.sizes[index]
@@ -72,3 +86,10 @@ def write_undistorted(folder: Path, cameras: PinholeCameras, masks: bool = False
         Image.fromarray(photo).save(artifacts.Pictures(folder).path(name))
         if masks:
             Image.fromarray(mask).save(artifacts.Pictures(folder).mask_path(name))
+
+
+def write_densified(folder: Path, cloud: PointCloud | None = None) -> Path:
+    """The folder that the densify stage would have published of these points in the frame of the poses, or of none."""
+    folder.mkdir(parents=True, exist_ok=True)
+    artifacts.POINT_CLOUD.save(folder, cloud if cloud is not None else PointCloud.empty())
+    return folder

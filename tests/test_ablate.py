@@ -43,7 +43,8 @@ def here(tmp_path, monkeypatch):
     (tmp_path / "page.md").write_text("top\n<!-- table ablation -->\n<!-- end ablation -->\nbottom\n")
     for name in ("helmet", "scan"):
         (tmp_path / "data" / name / "images").mkdir(parents=True)
-        (tmp_path / "out" / name / "shared" / "undistort").mkdir(parents=True)
+        for stage in ("undistort", "densify"):
+            (tmp_path / "out" / name / "shared" / stage).mkdir(parents=True)
     for name in ("gt_mesh.ply", "transforms.json"):
         (tmp_path / "data" / "helmet" / name).write_text("")
     return tmp_path
@@ -232,7 +233,7 @@ def _stub_stages(monkeypatch):
         (context.out / "file").write_text("")
         return {"psnr": 31.25, "held_out_psnr": 28.5}
 
-    reads = {"train": (artifacts.FIRST_SCENE,), "extract": (artifacts.CAMERAS, artifacts.FIELD)}
+    reads = {"train": (artifacts.FIRST_SCENE, artifacts.POINT_CLOUD), "extract": (artifacts.CAMERAS, artifacts.FIELD)}
     stages = [
         Stage("train", 1, lambda config: config.train, run, reads["train"]),
         Stage("extract", 1, lambda config: config.extract, run, reads["extract"]),
@@ -249,7 +250,7 @@ def test_a_run_calls_the_stages_on_the_shared_poses_and_leaves_its_figures_only(
     plan = _plan("planar", 1, 9)
     run = ablate.measure(plan, here / "data", jobs=2)
     train, extract = calls
-    assert (dict(train.inputs), train.workers) == ({"undistort": shared}, 1)
+    assert (dict(train.inputs), train.workers) == ({name: shared.parent / name for name in ("undistort", "densify")}, 1)
     assert (train.params.terms.planar.form, train.params.seed, train.params.steps) == ("stable", 1, 9)
     assert extract.inputs["train"] == train.out
     assert (run.psnr, run.held_out_psnr, run.value, run.code) == (31.25, 28.5, 0.5, ablate.code_hash())
@@ -257,8 +258,11 @@ def test_a_run_calls_the_stages_on_the_shared_poses_and_leaves_its_figures_only(
     assert not train.out.exists()
     ablate.measure(plan, here / "data", keep=True)
     assert (train.out / "file").exists()
-    (shared / "scene.json").write_text("{ }")
-    assert ablate.measure(plan, here / "data").poses != run.poses
+    for made in (shared / "scene.json", shared.parent / "densify" / "cloud.npz"):
+        made.write_text("{ }")
+        other = ablate.measure(plan, here / "data")
+        assert other.poses != run.poses
+        run = other
     order = here / "order.json"
     order.write_text(json.dumps({"plan": asdict(plan), "data": str(here / "data"), "jobs": 2, "keep": False}))
     assert ablate.main(["--one", str(order)]) == 0
@@ -284,9 +288,9 @@ def test_poses_that_are_there_are_not_made_again(here, monkeypatch):
     monkeypatch.setattr(ablate, "run_hineus", calls.append)
     ablate.prepare("helmet", here / "data", "cpu")
     assert calls == []
-    (here / "out" / "helmet" / "shared" / "undistort").rmdir()
+    (here / "out" / "helmet" / "shared" / "densify").rmdir()
     ablate.prepare("helmet", here / "data", "cpu")
-    assert "undistort" in calls[0]
+    assert "densify" in calls[0]
     assert "--poses" not in calls[0]
 
 
@@ -296,7 +300,7 @@ def test_known_cameras_and_masks_are_taken(here, monkeypatch):
     scan = here / "data" / "scan"
     (scan / "mask").mkdir()
     (scan / "cameras_sphere.npz").write_bytes(b"")
-    (here / "out" / "scan" / "shared" / "undistort").rmdir()
+    (here / "out" / "scan" / "shared" / "densify").rmdir()
     ablate.prepare("scan", here / "data", "cpu")
     after = dict(itertools.pairwise(calls[0]))
     assert (after["--poses"], after["--masks"]) == (str(scan / "cameras_sphere.npz"), str(scan / "mask"))
@@ -327,7 +331,7 @@ def test_the_mesh_is_scored_in_the_world_frame(here, monkeypatch):
 @pytest.mark.slow
 def test_a_scene_without_sparse_points_trains(tmp_path):
     from rigs import scene_without_points
-    from sphere_scene import ring_of_cameras, write_undistorted
+    from sphere_scene import ring_of_cameras, write_densified, write_undistorted
     from train_settings import small
 
     from stages import train
@@ -343,6 +347,7 @@ def test_a_scene_without_sparse_points_trains(tmp_path):
         "field.log2_rows": 9, "field.coarsest": 8, "field.finest": 16, "field.sdf_width": 8, "field.radiance_width": 8,
         "sampling.cache_resolution": 16, "field.background": False,
     })  # fmt: skip
-    numbers = train.run(StageContext({"undistort": folder}, {}, out, scratch, params))
-    assert (numbers["steps"], numbers["sightings"]) == (2, 0)
+    inputs = {"undistort": folder, "densify": write_densified(tmp_path / "densify")}
+    numbers = train.run(StageContext(inputs, {}, out, scratch, params))
+    assert (numbers["steps"], numbers["sightings"], numbers["dense_sightings"]) == (2, 0, 0)
     assert artifacts.FIELD.load(out).exists()

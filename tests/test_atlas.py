@@ -14,7 +14,7 @@ from stages.engine.stage import StageContext
 from stages.errors import ReconstructionError
 from stages.surface.decimation import decimate
 from stages.surface.isosurface import extract_isosurface
-from stages.texture import charts
+from stages.texture import charts, xatlas_worker
 
 TEXTURE, PADDING = 512, 4
 
@@ -72,7 +72,10 @@ def claims(layout, size, scale=3):
 
 
 def areas(layout):
-    corners = layout.texels[layout.faces]
+    return flat_areas(layout.texels[layout.faces])
+
+
+def flat_areas(corners):
     edges = corners[:, 1:] - corners[:, :1]
     return (edges[:, 0, 0] * edges[:, 1, 1] - edges[:, 0, 1] * edges[:, 1, 0]) / 2
 
@@ -184,6 +187,25 @@ def test_normals_do_not_show_the_seams(layout, mesh):
     order = np.argsort(layout.source, kind="stable")
     same = layout.source[order][1:] == layout.source[order][:-1]
     np.testing.assert_array_equal(normals[order][1:][same], normals[order][:-1][same])
+
+
+def test_charts_fill_the_texture_at_one_scale(mesh):
+    cut = xatlas_worker._charts(*mesh, max_chart_area=0.1, resolution=2048)
+    texels = xatlas_worker._fitted(cut, TEXTURE, PADDING)
+    assert 0.95 * TEXTURE < texels.max() <= TEXTURE
+    before, after = (np.abs(flat_areas(flat[cut.faces])) for flat in (cut.texels, texels))
+    ratio = after[before > 1] / before[before > 1]
+    assert np.quantile(ratio, 0.95) < 1.15 * np.quantile(ratio, 0.05)  # but for sides stretched to whole texels
+
+
+def test_a_vertex_of_faces_without_area_lies_with_its_neighbours():
+    square = np.array([[0, 0], [400, 0], [400, 400], [0, 400], [200, 0], [900, 900]], dtype=float)
+    faces = np.array([[0, 2, 3], [0, 1, 2], [0, 4, 1], [5, 5, 5]])
+    texels, side = xatlas_worker._packed(xatlas_worker._Charts(np.arange(6), faces, square, 1), 0.1, PADDING)
+    assert texels[:4].max() > 35
+    assert texels.min() >= 0
+    assert texels.max() <= side
+    assert (texels[4] == texels[0]).all() or (texels[4] == texels[1]).all()
 
 
 def test_time_limit_stops_xatlas(mesh):

@@ -23,7 +23,7 @@ from stages.texture.baking import Baked, Provenance, bake_texture
 from stages.texture.filling import face_neighbors, harmonic_offsets
 from stages.texture.gains import solve_gains
 from stages.texture.padding import pad_charts
-from stages.texture.photo_views import low_pass, surface_links
+from stages.texture.photo_views import low_pass, prepare_view, surface_links
 
 WORKERS = min(2, os.cpu_count() or 1)
 SIZE = 192
@@ -223,6 +223,29 @@ def test_low_pass_keeps_the_mean_and_stops_at_edges():
 
 
 # ---------------------------------------------------------------- whole bake
+def test_a_photo_is_cut_to_what_shows_the_mesh(capture):
+    atlas, cameras, photos = capture
+    for i, photo in enumerate(photos):
+        view = prepare_view(cameras, i, photo, None, atlas.vertices, atlas.faces)
+        _, inverse_depth = depth_map(cameras, i, atlas.vertices, atlas.faces)
+        assert view.photo.size < photo.size
+        assert np.count_nonzero(view.inverse_depth) == np.count_nonzero(inverse_depth)
+        xy, _ = cameras.project(i, atlas.vertices.astype(np.float64))
+        cut = np.concatenate([atlas.vertices, np.ones((len(atlas.vertices), 1))], 1) @ view.matrix.T
+        shift = xy - cut[:, :2] / cut[:, 2:]
+        left, top = np.round(shift[0]).astype(int)
+        np.testing.assert_allclose(shift, np.broadcast_to((left, top), shift.shape), atol=1e-6)
+        height, width = view.photo.shape[:2]
+        np.testing.assert_array_equal(view.original, photo[top : top + height, left : left + width])
+
+
+def test_a_photo_that_shows_nothing_of_the_mesh_is_no_error(capture):
+    atlas, cameras, photos = capture
+    behind = atlas.vertices + 10 * (cameras.centers[0] - atlas.vertices.mean(0)).astype(np.float32)
+    view = prepare_view(cameras, 0, photos[0], None, behind, atlas.faces)
+    assert not view.confidence.any()
+
+
 def test_colours_are_recovered_and_numbers_add_up(capture, baked):
     mesh, _, _ = capture
     texels, points, truth = texel_truth(mesh)

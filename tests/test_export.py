@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from rigs import scene_without_points
+from rigs import scene_without_points, shell
 
 from configs.params import ExportParams
 from stages import artifacts
@@ -82,7 +82,7 @@ def exported(tmp_path) -> tuple[Path, dict]:
 def workspace(tmp_path: Path, params: ExportParams | None = None) -> StageContext:
     from stages.artifacts import write_png
 
-    folders = {name: tmp_path / name for name in ("train", "place", "atlas", "bake", "out", "scratch")}
+    folders = {name: tmp_path / name for name in ("densify", "train", "place", "atlas", "bake", "out", "scratch")}
     for folder in folders.values():
         folder.mkdir()
     atlas, texture = tetrahedron()
@@ -91,6 +91,8 @@ def workspace(tmp_path: Path, params: ExportParams | None = None) -> StageContex
     )
     artifacts.SCENE.save(folders["train"], scene_without_points(cameras, WORLD))
     artifacts.WORLD_PLACE.save(folders["place"], Place(Similarity.identity()))
+    artifacts.GIVEN_REGION.save(folders["place"], None)
+    artifacts.POINT_CLOUD.save(folders["densify"], shell().moved(WORLD))
     artifacts.ATLAS_MESH.save(folders["atlas"], atlas)
     write_png(artifacts.BASE_COLOR.load(folders["bake"]), texture)
     write_png(artifacts.NORMAL_MAP.load(folders["bake"]), np.full((32, 32, 3), (128, 128, 255), np.uint8))
@@ -538,3 +540,108 @@ def test_a_mesh_that_cannot_be_written_is_explained(tmp_path):
     )
     with pytest.raises(ReconstructionError, match="cannot be exported"):
         EXPORT.run(context)
+
+
+# ---------------------------------------------------------------- dense points
+POINTS = ExportParams(formats=("points",), points_trust=0.0)
+
+
+def test_dense_points_lie_where_the_mesh_lies(tmp_path):
+    import laspy
+    import open3d as o3d
+
+    context = workspace(tmp_path, POINTS)
+    place = Place(Similarity(3.0, rotation_about(UP, 0.4), np.array([1.0, 2, 3])), metric=True)
+    artifacts.WORLD_PLACE.save(context.inputs["place"], place)
+    numbers = EXPORT.run(context)
+    assert {path.name for path in context.out.iterdir()} == {"points.ply", "points.laz"}
+    assert numbers["points"] == 400
+    assert numbers["bytes"] == {f"points_{path.suffix[1:]}": path.stat().st_size for path in context.out.iterdir()}
+    expected = place.world_from_poses.compose(WORLD).apply(shell().points)
+    found = o3d.io.read_point_cloud(str(context.out / "points.ply"))
+    np.testing.assert_allclose(found.points, expected, atol=1e-4)
+    outward = shell().normals @ WORLD.rotation.T @ place.world_from_poses.rotation.T
+    np.testing.assert_allclose(found.normals, outward, atol=1e-5)
+    assert b"comment Lengths are in metres" in (context.out / "points.ply").read_bytes()
+    np.testing.assert_allclose(laspy.read(context.out / "points.laz").xyz, expected, atol=1e-4)
+
+
+def test_only_the_laz_has_the_map_s_own_coordinates(tmp_path):
+    import laspy
+    import open3d as o3d
+
+    context = workspace(tmp_path, POINTS)
+    offset = (465000.0, 5247000.0, 400.0)
+    # poses that were given in the map's coordinates
+    cloud = replace(shell(), points=shell().points + offset)
+    artifacts.POINT_CLOUD.save(context.inputs["densify"], cloud)
+    there = Similarity(1.0, np.eye(3), np.array(offset))
+    scene = artifacts.SCENE.load(context.inputs["train"])
+    artifacts.SCENE.save(context.inputs["train"], replace(scene, poses_from_scene=there))
+    place = Place(there.inverse(), metric=True, crs="EPSG:32632", offset=offset)
+    artifacts.WORLD_PLACE.save(context.inputs["place"], place)
+    EXPORT.run(context)
+    found = laspy.read(context.out / "points.laz")
+    assert found.header.parse_crs().to_epsg() == 32632
+    np.testing.assert_allclose(found.xyz, cloud.points, rtol=0, atol=1e-5)
+    near = np.asarray(o3d.io.read_point_cloud(str(context.out / "points.ply")).points)
+    np.testing.assert_allclose(near, shell().points, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("changes", "kept"),
+    [
+        ({"points_trust": 0.75}, lambda cloud, away: cloud.trust >= 0.75),
+        ({}, lambda cloud, away: away < 1),
+        ({"points_from": "everywhere"}, lambda cloud, away: away > 0),
+    ],
+)
+def test_untrusted_points_and_those_around_the_region_are_left_out(tmp_path, changes, kept):
+    import open3d as o3d
+
+    context = workspace(tmp_path, POINTS.model_copy(update=changes))
+    cloud = shell()
+    away = np.where(np.arange(400) % 2 > 0, 0.9, 1.1)
+    cloud = replace(cloud, points=cloud.points / 0.7 * away[:, None])
+    if "points_trust" in changes:
+        cloud, away = shell(), np.full(400, 0.7)
+    artifacts.POINT_CLOUD.save(context.inputs["densify"], cloud.moved(WORLD))
+    rows = kept(cloud, away)
+    assert 0 < EXPORT.run(context)["points"] == rows.sum()
+    found = np.asarray(o3d.io.read_point_cloud(str(context.out / "points.ply")).points)
+    np.testing.assert_allclose(found, WORLD.apply(cloud.points[rows]), atol=1e-4)
+
+
+def test_a_box_that_was_given_crops_the_points_as_the_mesh(tmp_path):
+    from stages.geometry.place import given_region
+
+    context = workspace(tmp_path, POINTS)
+    box = WORLD.translation + np.array([[-3, -3, -0.2], [3, 3, 0.5]])
+    artifacts.GIVEN_REGION.save(
+        context.inputs["place"], given_region("box", box.ravel().tolist(), Similarity.identity())
+    )
+    heights = shell().points @ WORLD.rotation[2] * WORLD.scale
+    assert 0 < EXPORT.run(context)["points"] == ((heights > -0.2) & (heights < 0.5)).sum() < 400
+
+
+def test_without_points_no_file_is_written_and_it_is_said_why(tmp_path):
+    from stages.geometry.point_cloud import PointCloud
+
+    context = workspace(tmp_path, ExportParams(formats=("points",), points_trust=1.0))
+    (warning,) = EXPORT.run(context)["warnings"]
+    assert "of 400 none is trusted enough" in warning["sentence"]
+    assert "--set export.points_trust=0 --set export.points_from=everywhere" in warning["command"]
+    artifacts.POINT_CLOUD.save(context.inputs["densify"], PointCloud.empty())
+    numbers = EXPORT.run(context)
+    assert (numbers["points"], numbers["bytes"]) == (0, {})
+    assert "no photos overlap enough" in numbers["warnings"][0]["sentence"]
+    assert list(context.out.iterdir()) == []
+
+
+def test_without_laspy_the_command_to_get_it_is_named(tmp_path, monkeypatch):
+    import sys
+
+    monkeypatch.setitem(sys.modules, "laspy", None)
+    with pytest.raises(SystemRequirementError) as caught:
+        EXPORT.run(workspace(tmp_path, POINTS))
+    assert "pip install laspy" in caught.value.hint

@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from sphere_scene import render, ring_of_cameras, sphere_scene, write_undistorted
+from ball_training import ball_sightings
+from sphere_scene import render, ring_of_cameras, write_densified, write_undistorted
 from train_settings import changed, small
 
 from stages import artifacts, train
@@ -19,7 +20,7 @@ from stages.neural.training_photos import Photos
 TINY = small({
     "steps": 50, "sampling.rays": 64, "sampling.samples": 8, "field.levels": 2, "field.log2_rows": 9,
     "field.coarsest": 8, "field.finest": 16, "field.sdf_width": 8, "field.radiance_width": 8,
-    "schedule.start_levels": 2, "sampling.free_points": 32, "losses.sparse_batch": 16,
+    "schedule.start_levels": 2, "sampling.free_points": 32, "losses.sparse_batch": 16, "losses.dense_batch": 16,
     "sampling.cache_resolution": 16, "field.background_log2_rows": 9, "sampling.background_samples": 4,
 })  # fmt: skip
 
@@ -35,7 +36,8 @@ def run_train(folder: Path, **settings) -> dict:
     write_undistorted(undistort, ring_of_cameras())
     out.mkdir()
     scratch.mkdir()
-    return train.run(StageContext({"undistort": undistort}, {}, out, scratch, changed(TINY, settings)))
+    inputs = {"undistort": undistort, "densify": write_densified(folder / "densify")}
+    return train.run(StageContext(inputs, {}, out, scratch, changed(TINY, settings)))
 
 
 def test_every_nth_photo_is_left_out_from_the_middle_of_the_first_n():
@@ -128,11 +130,10 @@ def test_the_stage_reports_the_photos_left_out_and_trains_on_the_others(tmp_path
 
 
 def test_judging_leaves_the_random_state_alone():
-    from stages.neural.sightings import Sightings
     from stages.neural.trainer import Trainer
 
     photos = make_photos()
-    trainer = Trainer(photos, Sightings.from_scene(sphere_scene(ring_of_cameras()), "cpu"), TINY, "cpu")
+    trainer = Trainer(photos, *ball_sightings(ring_of_cameras()), TINY, "cpu")
     trainer.step(0.1)
     before = trainer.generator.get_state(), torch.get_rng_state()
 

@@ -18,7 +18,7 @@ from stages.request import Request
 
 COARSE = (
     "train.steps=40", "sfm.deterministic=true", "sfm.wanted=0.9", "train.sampling.rays=64", "train.field.log2_rows=10",
-    "train.field.finest=64", "train.field.levels=4", "undistort.max_side=160",
+    "train.field.finest=64", "train.field.levels=4", "undistort.max_side=160", "train.steps_if_explained=1",
 )  # fmt: skip
 
 
@@ -67,6 +67,7 @@ def test_photos_that_came_and_went_are_told_and_the_rest_is_kept(tmp_path: Path,
     assert made["sfm"]["poses_stayed"]
     assert (made["sfm"]["known"], made["sfm"]["new"], made["sfm"]["gone"]) == (7, 1, 1)
     assert made["undistort"]["region_kept"] in (True, False)
+    assert "densify" in made
     assert made["train"]["kept_of_budget"] in (0.7, 0.2)
     assert made["train"]["steps_in_all"] == 40 + round(40 * (1 - made["train"]["kept_of_budget"]))
     assert made["train"]["photos"] == 8

@@ -54,15 +54,15 @@ def test_rungs_are_taken_until_enough_photos_are_placed_and_each_gets_the_best_s
     assert steps[0].error_px is None
 
 
-def test_two_fruitless_rungs_end_the_climb_where_enough_is_placed_and_only_there():
-    _, steps = climb(Stub(12, 12, 11, 20).rungs, 20, 10)
-    assert len(steps) == 3
-    best, steps = climb(Stub(8, 8, 7, 20).rungs, 20, 10)
+def test_three_fruitless_rungs_end_the_climb_where_enough_is_placed_and_only_there():
+    _, steps = climb(Stub(12, 12, 11, 12, 20).rungs, 20, 10)
     assert len(steps) == 4
+    best, steps = climb(Stub(8, 8, 7, 8, 20).rungs, 20, 10)
+    assert len(steps) == 5
     assert len(best.registered) == 20
     # one that places a photo begins the count anew
-    _, steps = climb(Stub(12, 12, 13, 13, 13, 20).rungs, 20, 10)
-    assert len(steps) == 5
+    _, steps = climb(Stub(12, 12, 13, 13, 13, 13, 20).rungs, 20, 10)
+    assert len(steps) == 6
 
 
 def test_no_rung_finds_anything():
@@ -165,7 +165,7 @@ def test_focal_priors_are_forgotten(tmp_path: Path):
 def test_names_with_spaces_survive_a_list_of_pairs(tmp_path: Path):
     import pycolmap
 
-    from stages.posing.workbench import _named_by_number
+    from stages.posing.pairs import _named_by_number
 
     path = database(tmp_path / "a.db", turntable(30), [])
     with _named_by_number(path), pycolmap.Database.open(path) as opened:
@@ -175,8 +175,9 @@ def test_names_with_spaces_survive_a_list_of_pairs(tmp_path: Path):
 
 
 def test_every_base_has_a_database_of_its_own():
-    bases = [Base(*flags) for flags in product((False, True), repeat=4) if flags[:2] != (True, True)]
-    assert len({base.file for base in bases}) == 12
+    bases = [Base(*flags) for flags in product((False, True), repeat=5) if flags[:2] != (True, True)]
+    assert len({base.file for base in bases}) == 24
+    assert all(Base.of_file(base.file) == base for base in bases)
 
 
 def test_always_inside_the_masks_needs_masks(tmp_path: Path):
@@ -246,13 +247,13 @@ def test_the_rungs_are_those_that_the_capture_allows(tmp_path: Path, monkeypatch
     bench = workbench(tmp_path)
     names = [rung.name for rung in bench.rungs() if rung.applies(None)]
     assert names == [
-        "exhaustive matching", "features inside the masks", "affine features",
+        "preemptive matching", "all pairs", "features inside the masks", "affine features",
         "corners with learned descriptors", "guided matching", "global mapper", "relaxed thresholds",
     ]  # fmt: skip
     guessed = tuple(replace(record, made_mask="salient") for record in bench.image_set.images)
     bench.image_set = ImageSet(guessed)
     names = [rung.name for rung in bench.rungs() if rung.applies(None)]
-    assert names[1:3] == ["affine features", "features inside the masks"]
+    assert names[2:4] == ["affine features", "features inside the masks"]
     (tmp_path / "other").mkdir()
     bench = workbench(tmp_path / "other", focal=180.0, matcher="sequential", mapper="global", masks="never")
     names = [rung.name for rung in bench.rungs() if rung.applies(None)]
@@ -279,6 +280,15 @@ def test_a_focal_length_that_the_poses_contradict_is_noticed(tmp_path: Path):
     assert bench.priors_are_doubtful(found(360.0, 3))
     assert bench.priors_are_doubtful(found(180.0, 1))
     assert not bench.priors_are_doubtful(found(180.0, 2))
+
+
+def test_few_photos_left_out_are_helped_and_many_are_not(tmp_path: Path):
+    bench = workbench(tmp_path)
+    bench.names = frozenset(f"{i}.jpg" for i in range(10))
+    assert bench.few_are_left_out(replace(solution(8), base=Base(masked=True)))
+    assert not bench.few_are_left_out(replace(solution(7), base=Base()))
+    assert not bench.few_are_left_out(replace(solution(8), base=Base(affine=True)))
+    assert not bench.few_are_left_out(None)
 
 
 @pytest.mark.parametrize(("wrong", "kept"), [(1, "ab"), (0, "abc")])

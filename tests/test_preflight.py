@@ -193,14 +193,23 @@ def test_needs_grow_with_photos_as_measured():
         config = load_config("cpu", sets=[f"{key}={value}" for key, value in sets.items()])
         return estimate(seen, config, "cpu", workers)
 
-    small = of(47, 554)  # 47 photos of 0.31 megapixels: docs/benchmarks had 3.9 to 4.1 minutes and 1.45 to 1.62 GiB
-    assert small.minutes == pytest.approx(4.0, abs=0.4)
+    small = of(47, 554)  # 47 photos of 0.31 megapixels: docs/benchmarks had 1.45 to 1.62 GiB, without stereo 4 minutes
+    without = of(47, 554, **{"densify.method": "off"})
+    assert without.minutes == pytest.approx(4.0, abs=0.4)
+    assert small.minutes == pytest.approx(2.8, abs=0.3)
+    assert of(47, 554, **{"densify.neighbors": 8}).minutes > small.minutes
+    assert small.disk_gb > without.disk_gb
     # one core takes 1.5 to 1.8 times as long, and no number of cores does it in no time
     assert 1.5 < of(47, 554, workers=1).minutes / small.minutes < 1.8
     assert 1.0 < of(47, 554, workers=64).minutes < of(47, 554, workers=8).minutes < small.minutes
     assert small.memory_gib == pytest.approx(1.55, abs=0.1)
     # past undistort.max_side a photo takes no more memory; 200 photos of 1600 x 1600 are 1.43 GiB
-    assert of(200, 4000).memory_gib == of(200, 1600).memory_gib == pytest.approx(1.5 + 2 * 1.43, abs=0.01)
+    plain = {"densify.method": "off"}
+    most = of(200, 4000, **plain).memory_gib
+    assert most == of(200, 1600, **plain).memory_gib == pytest.approx(1.5 + 2 * 1.43, abs=0.01)
+    # past densify.side stereo takes no more: 200 megapixels and their maps
+    for side in (1200, 4000):
+        assert of(200, side).memory_gib == pytest.approx(0.5 + 200 * 0.021, abs=0.01)
     assert of(47, 1600, workers=16).memory_gib > of(47, 1600).memory_gib  # each thread looks for features
     assert of(47, 554, **{"train.minutes": 20}).minutes == pytest.approx(21.0, abs=0.5)
 

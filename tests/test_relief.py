@@ -9,7 +9,7 @@ import pytest
 
 from stages.artifacts import AtlasMesh
 from stages.drawing.rasterizing import Texels, rasterize_atlas
-from stages.texture.relief import FLAT, bake_normals, bake_occlusion, sky_seen, spread_samples
+from stages.texture.relief import FLAT, bake_normals, bake_occlusion, relief_texels, sky_seen, spread_samples
 from stages.texture.tangents import to_tangent_space, vertex_tangents
 
 SIZE = 64
@@ -63,6 +63,14 @@ def shaded_normals(atlas: AtlasMesh, image: np.ndarray) -> tuple[np.ndarray, np.
 
 def angles_deg(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.degrees(np.arccos(np.clip((a * b).sum(1), -1, 1)))
+
+
+def test_maps_have_half_the_side_where_the_full_mesh_shows_no_more():
+    atlas = sheet()
+    large, small = texels_of(atlas, 2048), texels_of(atlas, 1024)
+    assert relief_texels(atlas, large, edge=4.1 / 2048).size == 1024
+    assert relief_texels(atlas, large, edge=3.9 / 2048) is large
+    assert relief_texels(atlas, small, edge=1.0) is small
 
 
 # u and v along x and y, turned by a quarter, and mirrored

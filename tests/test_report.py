@@ -14,12 +14,12 @@ import numpy as np
 import pytest
 from globe import globe
 from report_inputs import BOX, UP, bare_inputs, full_inputs, manifest, page, pyramid, quality
-from rigs import scene_without_points, three_rings
+from rigs import scene_without_points, shell, three_rings
 
 from configs.load import load_config
 from configs.params import ReportParams
 from stages import artifacts
-from stages.artifacts import VertexQuality
+from stages.artifacts import ImageRecord, VertexQuality
 from stages.drawing.overview import overview_svg
 from stages.engine.stage import StageContext
 from stages.engine.workspace import Record
@@ -31,8 +31,18 @@ from stages.report import THREE, region_corners
 from stages.reporting import view3d
 from stages.reporting.curves import line_chart
 from stages.reporting.numbers import describe_history, describe_where, duration
+from stages.reporting.photo_table import PhotoResult
 from stages.reporting.pictures import draw_stills
-from stages.reporting.view3d import NO_VALUE, light_enough, pack_mesh, pack_overlays, pack_region, pack_scene
+from stages.reporting.stereo import describe_stereo
+from stages.reporting.view3d import (
+    NO_VALUE,
+    light_enough,
+    pack_dense,
+    pack_mesh,
+    pack_overlays,
+    pack_region,
+    pack_scene,
+)
 
 ROOT = Path(__file__).parents[1]
 
@@ -109,6 +119,10 @@ def test_the_page_says_it_all_and_refers_to_nothing_outside(full):
         "Where to stand for the next photos",
         "From a side that no photo shows",
         'data-state="held" data-name="a.png"',
+        "42 % of the photos' pixels, by 400 dense points".replace("'", "&#39;"),
+        "stereo explains 42 %",
+        '<option value="explained">',
+        'data-layer="dense"',
     ):
         assert text in html, text
     assert html.count("<polyline") == 2  # psnr and loss; rgb is never a number, mask never changes
@@ -203,7 +217,7 @@ def test_measures_are_packed_between_their_ends_and_unknown_ones_marked():
 
 
 def caption() -> dict[str, object]:
-    return {"name": "a.jpg", "held_out": True, "error": 0.5, "points": 7}
+    return {"name": "a.jpg", "held_out": True, "error": 0.5, "points": 7, "explained": None}
 
 
 def test_drawn_cameras_look_where_the_photos_look(full):
@@ -254,6 +268,46 @@ def test_points_that_a_small_region_leaves_out_are_drawn(full):
     many = packed_times(100)
     assert many["points_each"] == 3
     assert len(decode(many["points"]["positions"], "<u2", 3)) == pytest.approx(98_000 / 3, abs=1)
+
+
+def test_trusted_dense_points_are_packed_with_their_colours(full, monkeypatch):
+    scene = replace(full.read(artifacts.SCENE), poses_from_scene=Similarity(2.0, np.eye(3), np.array([3.0, -4, 7])))
+    cloud = shell().moved(scene.poses_from_scene)
+    packed = pack_dense(cloud, scene)
+    trusted = cloud.trust >= 0.5
+    assert (packed["shown"], packed["total"]) == (trusted.sum(), 400) == (200, 400)
+    positions = packed["low"] + decode(packed["positions"], "<u2", 3) / 65535 * packed["size"]
+    expected = shell().points[trusted] @ y_up_rotation(UP).T
+    nearest = np.linalg.norm(positions[:, None] - expected, axis=2).argmin(1)  # they are shuffled
+    assert len(set(nearest)) == 200
+    np.testing.assert_allclose(positions, expected[nearest], atol=1e-4)
+    np.testing.assert_array_equal(decode(packed["colors"], "u1", 3), cloud.colors[trusted][nearest])
+    monkeypatch.setattr(view3d, "MAX_DENSE", 50)
+    monkeypatch.setattr(view3d, "MAX_AROUND", 20)
+    assert pack_dense(cloud, scene)["shown"] == 50
+    around = pack_dense(shell(radius=1.5).moved(scene.poses_from_scene), scene)
+    assert around["shown"] == len(decode(around["positions"], "<u2", 3)) == 20
+    assert pack_dense(cloud.chosen(~trusted), scene) is None
+    far = Similarity(1.0, np.eye(3), np.array([2 * view3d.POINTS_REACH, 0, 0]))
+    assert pack_dense(shell().moved(scene.poses_from_scene.compose(far)), scene) is None
+
+
+def results(*explained: float | None) -> list[PhotoResult]:
+    return [
+        PhotoResult(ImageRecord(f"{i}.jpg", f"{i}.jpg", 40, 30, None, "0", 5.0, False, "00"), "", None, i, False, share)
+        for i, share in enumerate(explained)
+    ]
+
+
+def test_it_is_said_how_far_stereo_explains_the_photos_and_what_to_do():
+    (plain,) = describe_stereo(results(0.5, 0.3, None), {"points": 1234})
+    assert plain == "Stereo explains 40 % of the photos' pixels, by 1,234 dense points."
+    _, advice = describe_stereo(results(0.05, 0.03), {"points": 9})
+    assert advice.startswith("That is little")
+    _, blurred = describe_stereo(results(*[0.5] * 8, *[0.0] * 7), {"points": 9})
+    assert "next to nothing of 8.jpg, 9.jpg, 10.jpg, 11.jpg, 12.jpg and 2 more" in blurred
+    assert len(describe_stereo(results(0.0, 0.0), {"points": 0})) == 2  # not each by its name
+    assert describe_stereo(results(None), {"points": 9}) == describe_stereo(results(0.5), {}) == []
 
 
 def test_a_mesh_too_heavy_for_the_page_is_decimated_with_its_measures(monkeypatch):

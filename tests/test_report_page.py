@@ -21,6 +21,7 @@ from stages.engine.stage import StageContext
 from stages.engine.workspace import Workspace
 from stages.geometry.normalisation import rotation_onto
 from stages.geometry.place import GivenRegion, Place, given_region
+from stages.geometry.point_cloud import PointCloud
 from stages.geometry.similarity import Similarity
 
 BROWSER = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
@@ -67,6 +68,32 @@ def test_the_model_is_drawn_and_a_measure_changes_its_colours(full):
     assert ((red > 180) & (green < 90) & (blue < 90)).sum() == 0
     assert ((red > 140) & (green > 120) & (blue < 80)).sum() > 500  # yellow: made up
     assert ((red < 80) & (green < 40) & (blue > 40)).sum() > 50  # violet: the tip was seen
+
+
+LOOK = """<script>
+setTimeout(() => {
+  document.querySelector('[data-layer="dense"]').click();
+  document.getElementById("surface").value = "none";
+  document.getElementById("surface").dispatchEvent(new Event("change"));
+}, 2000);
+</script></body>"""
+
+
+def test_dense_points_are_drawn_alone_in_their_colours(full):
+    normals = np.array([[1.0, 0, 0], [-1, 0, 0]])
+    random = np.random.default_rng(0)
+    points = np.repeat(normals * 0.4, 20_000, axis=0) + random.uniform(-0.3, 0.3, (40_000, 3))
+    colors = np.repeat(np.array([[20, 200, 40], [230, 120, 20]], np.uint8), 20_000, axis=0)
+    starts, photos = np.arange(40_001), np.zeros(40_000, np.int32)
+    cloud = PointCloud(points, np.repeat(normals, 20_000, 0), colors, np.ones(40_000), starts, photos)
+    artifacts.POINT_CLOUD.save(full.inputs["densify"], cloud)
+    report = artifacts.PAGE.load(full.out)
+    report.write_text(page(full).replace("</body>", LOOK))
+    shown = screenshot(full.scratch, report.as_uri())
+    for color in ((20, 200, 40), (230, 120, 20)):  # as in the photos: no light falls on them
+        assert (np.abs(shown - color).max(2) < 8).sum() > 2000
+    red, green, blue = shown.transpose(2, 0, 1)
+    assert ((red > 180) & (green < 90) & (blue < 90)).sum() == 0  # the mesh is hidden
 
 
 PRESS = """<script>

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -17,7 +18,7 @@ from stages.engine.stage import StageContext
 from stages.errors import InputError, ReconstructionError
 from stages.posing.evidence import Evidence
 from stages.posing.ladder import Step
-from stages.posing.workbench import camera_params, choose_matcher, count_located
+from stages.posing.workbench import Workbench, camera_params, choose_matcher, count_located
 from stages.sfm import SFM
 
 
@@ -44,7 +45,7 @@ def test_rendered_capture_gives_back_its_cameras(tmp_path: Path):
     assert numbers["registered"] == len(poses)
     assert numbers["attempts"] == 1
     registration = artifacts.REGISTRATION.load(out)
-    assert registration.matcher == "exhaustive"
+    assert registration.matcher == "preemptive"
     assert [item.name for item in registration.unregistered] == [f"{len(poses):03d}.png"]
     assert "matches no other photo" in registration.unregistered[0].reason
     assert registration.mean_reprojection_error_px < 1.0
@@ -104,6 +105,41 @@ def test_two_deterministic_runs_give_the_same_model_bit_for_bit(tmp_path: Path):
         models.append({path.name: path.read_bytes() for path in sorted(artifacts.MODEL.load(out).iterdir())})
     assert len(models[0]) >= 3
     assert models[0] == models[1]
+
+
+@pytest.mark.slow
+def test_a_photo_left_out_is_placed_by_affine_features_beside_those_all_have(tmp_path: Path):
+    photos = [render(pose, i) for i, pose in enumerate(orbit(5, 12))]
+    ingest = ingested(tmp_path / "ingest", photos, FOCAL)
+    (tmp_path / "work").mkdir()
+    bench = Workbench(
+        tmp_path / "work",
+        artifacts.Pictures(ingest).images,
+        artifacts.Pictures(ingest).masks,
+        artifacts.IMAGE_SET.load(ingest),
+        SfmParams(),
+        threads=1,
+        workers=1,
+        cuda=False,
+        progress=lambda done, total, note: None,
+    )
+    whole = bench.first(None)
+    assert len(whole.registered) == 5
+    left_out = replace(whole, registered=whole.registered - {"004.png"})
+    assert bench.few_are_left_out(left_out)
+    helped = bench.help_left_out(left_out)
+    assert len(helped.registered) == 5
+    assert helped.error_px < 1
+    assert helped.points > whole.points
+    plain, affine = (keypoint_counts(bench.database(base)) for base in (whole.base, replace(whole.base, affine=True)))
+    assert keypoint_counts(bench.database(helped.base)) == {name: plain[name] + affine[name] for name in plain}
+
+
+def keypoint_counts(path: Path) -> dict[str, int]:
+    import pycolmap
+
+    with pycolmap.Database.open(path) as opened:
+        return {image.name: opened.num_keypoints_for_image(image.image_id) for image in opened.read_all_images()}
 
 
 def test_photos_of_plain_walls(tmp_path: Path):

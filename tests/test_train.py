@@ -11,8 +11,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from ball_training import TINY, assert_finds_the_ball, make_trainer
-from sphere_scene import RADIUS, render, ring_of_cameras, sphere_scene, write_undistorted
+from ball_training import TINY, assert_finds_the_ball, ball_sightings, make_trainer
+from sphere_scene import (
+    RADIUS,
+    render,
+    ring_of_cameras,
+    sphere_cloud,
+    sphere_scene,
+    write_densified,
+    write_undistorted,
+)
 from train_settings import changed
 
 from configs.training import TrainParams
@@ -22,11 +30,12 @@ from stages.errors import InputError
 from stages.geometry.cameras import PosedScene
 from stages.geometry.hull import cube, hull_distances
 from stages.geometry.normalisation import regrown
+from stages.geometry.point_cloud import PointCloud
 from stages.geometry.similarity import Similarity
 from stages.neural import acceleration, encodings
 from stages.neural import fields as fields_module
 from stages.neural.fields import contract
-from stages.neural.sightings import Sightings
+from stages.neural.sightings import Sightings, sighting_loss
 from stages.neural.trained_field import load_field
 from stages.neural.trainer import Trainer
 from stages.neural.training_photos import Photos
@@ -49,14 +58,52 @@ def test_rays_see_the_pixels_they_were_drawn_from():
         assert np.allclose(batch.colors[row].numpy(), expected, atol=1e-6)
 
 
-def test_sightings_end_at_their_points_and_are_free_before():
-    sightings = make_trainer().sightings
-    assert len(sightings.weights) > 200
-    assert torch.allclose(sightings.points.norm(dim=1), torch.tensor(RADIUS), atol=1e-5)
-    for share in (0.1, 0.5, 1.0):
-        places = sightings.points - share * sightings.free[:, None] * sightings.directions
-        assert (places.norm(dim=1) > RADIUS).all()
-    assert torch.allclose(places.norm(dim=1), torch.tensor(1.0), atol=1e-4)  # the whole length ends on the sphere
+@pytest.mark.parametrize("kind", [0, 1], ids=["sparse", "dense"])
+def test_sightings_end_at_their_points_and_are_free_before(kind):
+    sightings = ball_sightings(ring_of_cameras())[kind]
+    assert len(sightings) > 200
+    drawn = sightings.draw(200, 0.01, torch.Generator().manual_seed(0))
+    on_point, behind, before, free = drawn.places.norm(dim=1).view(4, 200)
+    assert torch.allclose(on_point, torch.tensor(RADIUS), atol=1e-5)
+    assert (before > RADIUS).all()
+    assert (free > RADIUS).all()
+    assert free.max() < 1 + 1e-5
+    assert free.max() > 0.9
+    assert (behind < RADIUS).float().mean() > 0.9  # the others only graze the ball
+    assert torch.allclose((drawn.places[200:400] - drawn.places[:200]).norm(dim=1), torch.tensor(0.01), atol=1e-6)
+
+
+def test_photos_left_out_have_no_sightings():
+    cameras = ring_of_cameras()
+    training = np.arange(8) != 3
+    for sightings in (
+        Sightings.from_scene(sphere_scene(cameras), "cpu", training),
+        Sightings.from_cloud(sphere_cloud(cameras), cameras.centers, "cpu", training),
+    ):
+        assert set(sightings.lines[:, 0].tolist()) == {0, 1, 2, 4, 5, 6, 7}
+
+
+def test_sightings_of_nothing_are_drawn_and_cost_nothing():
+    nothing = Sightings.from_cloud(PointCloud.empty(), ring_of_cameras().centers, "cpu")
+    drawn = nothing.draw(50, 0.01, torch.Generator().manual_seed(0))
+    assert [len(part) for part in drawn] == [0, 0]
+    assert float(sighting_loss(torch.zeros(0), drawn.weights, 0.01, 0.01)) == 0
+
+
+def test_a_sighting_costs_where_the_field_contradicts_it():
+    """f = 0 on the points, +0.01 before and on the free lines, -0.01 behind: nothing to correct."""
+    right = torch.tensor([0.0, -0.01, 0.01, 0.01])
+    weights = torch.tensor([1.0, 0.5])
+    of_both = right.repeat_interleave(2)
+    assert float(sighting_loss(of_both, weights, 0.01, 0.01)) == 0
+    assert float(sighting_loss(-of_both, weights, 0.01, 0.01)) > 0.01
+    costs = []
+    for one in (0, 1):  # the same error costs half where half is trusted
+        wrong = of_both.clone()
+        wrong[one] = 0.1
+        costs.append(float(sighting_loss(wrong, weights, 0.01, 0.01)))
+    assert costs[0] == pytest.approx(2 * costs[1])
+    assert costs[0] > 0
 
 
 def test_the_field_is_a_sphere_before_training():
@@ -140,7 +187,8 @@ def context(tmp_path: Path, name: str, params: TrainParams) -> StageContext:
     out, scratch = tmp_path / name, tmp_path / f"{name}_scratch"
     out.mkdir(exist_ok=True)
     scratch.mkdir(exist_ok=True)
-    return StageContext(inputs={"undistort": folder}, sources={}, out=out, scratch=scratch, params=params)
+    inputs = {"undistort": folder, "densify": write_densified(tmp_path / "densify")}
+    return StageContext(inputs=inputs, sources={}, out=out, scratch=scratch, params=params)
 
 
 def metric_lines(path: Path) -> list[dict]:
@@ -262,11 +310,10 @@ def test_a_step_on_cuda_matches_the_cpu(settings):
         TINY, {**settings, "density.scale": "scheduled", "sampling.sampler": "grid", "precision": "float32"}
     )
     cameras = ring_of_cameras()
-    scene = sphere_scene(cameras)
     rendered = []
     for device in ("cpu", "cuda"):
         photos = Photos(cameras, [render(cameras, i)[0] for i in range(8)], None, device)
-        trainer = Trainer(photos, Sightings.from_scene(scene, device), params, device)
+        trainer = Trainer(photos, *ball_sightings(cameras, device), params, device)
         trainer._refresh_cache(trainer.moment(0.3))
         images = torch.arange(8, device=device).repeat(10)
         pixels = torch.tensor([[24.0, 20.0]], device=device).repeat(80, 1)
@@ -450,13 +497,8 @@ def test_cameras_inside_the_sphere_start_in_a_free_room(distance, room):
 
 
 def test_a_hull_without_masks_is_refused(tmp_path):
-    write_undistorted(tmp_path / "undistort", ring_of_cameras(), masks=False)
-    for name in ("out", "scratch"):
-        (tmp_path / name).mkdir()
-    params = changed(TINY, {"field.init": "hull"})
-    context = StageContext({"undistort": tmp_path / "undistort"}, {}, tmp_path / "out", tmp_path / "scratch", params)
     with pytest.raises(InputError, match="needs masks for all 8 photos"):
-        train.TRAIN.run(context)
+        train.TRAIN.run(context(tmp_path, "out", changed(TINY, {"field.init": "hull"})))
 
 
 # ---------------------------------------------------------------- photos that came or went

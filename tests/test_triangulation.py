@@ -57,7 +57,7 @@ def test_poses_stay_and_points_are_found(tmp_path: Path, exhaustive_max: int):
     poses = write_poses(tmp_path, [f"images/{i:03d}" for i in range(len(POSES))])
     numbers, out = run_sfm(ingest, poses, tmp_path, exhaustive_max=exhaustive_max)
     assert numbers["registered"] == len(POSES)
-    assert numbers["matcher"] == ("exhaustive" if exhaustive_max > len(POSES) else "spatial")
+    assert numbers["matcher"] == ("preemptive" if exhaustive_max > len(POSES) else "spatial")
     assert numbers["poses_from"] == "transforms.json"
     assert numbers["mean_reprojection_error_px"] < 0.5
     model = pycolmap.Reconstruction(str(artifacts.MODEL.load(out)))

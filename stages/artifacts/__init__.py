@@ -7,6 +7,7 @@ finished workspace loads them from the folder of the stage that owns them: `arti
 from stages.artifacts.artifact import Artifact
 from stages.artifacts.atlas import ATLAS_MESH, AtlasMesh
 from stages.artifacts.bake import BASE_COLOR, NORMAL_MAP, OCCLUSION, PROVENANCE, QUALITY, VertexQuality
+from stages.artifacts.densify import DEPTH_MAPS, POINT_CLOUD, DepthMaps
 from stages.artifacts.export import (
     ASSET,
     GEOREFERENCE,
@@ -15,6 +16,7 @@ from stages.artifacts.export import (
     collision_path,
     lod_path,
     obj_normal_map_path,
+    points_path,
 )
 from stages.artifacts.ingest import IMAGE_SET, LEFT_OUT, PHOTOS, ImageRecord, ImageSet, SkippedImage
 from stages.artifacts.json_files import read_json, write_json

@@ -8,12 +8,17 @@ from stages.artifacts.artifact import in_folder
 
 GEOREFERENCE, METADATA = "georeference.json", "metadata.xml"
 
-ASSET = in_folder("export", ("model*", GEOREFERENCE, METADATA), lambda folder: folder)
+ASSET = in_folder("export", ("model*", "points.*", GEOREFERENCE, METADATA), lambda folder: folder)
 
 
 def asset_path(folder: Path, kind: str) -> Path:
     """The file of a format: glb, usdz, obj, ply or stl; mtl and png (material and texture) go with the OBJ."""
     return folder / f"model.{kind}"
+
+
+def points_path(folder: Path, kind: str) -> Path:
+    """The dense points: ply or laz."""
+    return folder / f"points.{kind}"
 
 
 def obj_normal_map_path(folder: Path) -> Path:

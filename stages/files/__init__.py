@@ -1,1 +1,1 @@
-"""Meshes to the bytes of other programs: GLB, USDZ, OBJ, PLY, STL. No stage, no path."""
+"""Meshes and points to the bytes of other programs: GLB, USDZ, OBJ, PLY, STL, LAZ. No stage, no path."""

@@ -27,6 +27,7 @@ def georeference(place: Place, gltf_from_world: Float[np.ndarray, "3 3"]) -> dic
         "axes": {
             "obj, ply, stl": "x east, y north, z up" if place.origin or place.crs else "as those of the control points",
             "glb, usdz": "those of the OBJ, turned by gltf_from_world_rotation",
+            "points.laz": "those of the OBJ, with the offset added where there is one",
         },
         "gltf_from_world_rotation": gltf_from_world.tolist(),
         "control_residual_m": place.control_residual,

@@ -62,8 +62,10 @@ def field_shape(params: TrainParams, num_images: int, background: bool) -> Field
 class Trainer:
     """Networks, optimiser, sampler and random state: all that a checkpoint must hold."""
 
-    def __init__(self, photos: Photos, sightings: Sightings, params: TrainParams, device: torch.device | str) -> None:
-        self.photos, self.sightings, self.params = photos, sightings, params
+    def __init__(
+        self, photos: Photos, sightings: Sightings, dense: Sightings, params: TrainParams, device: torch.device | str
+    ) -> None:
+        self.photos, self.sightings, self.dense, self.params = photos, sightings, dense, params
         self.device = torch.device(device)
         background = params.field.background and photos.masks is None
         self.fields = Fields(field_shape(params, len(photos), background), params.seed).to(device)
@@ -150,9 +152,11 @@ class Trainer:
         """Rays, losses, gradients, and the optimiser's step."""
         sampling, weights = self.params.sampling, self.params.losses
         batch, cells = self.needed.draw(sampling.rays, self.generator)
-        places, sparse_weights = self.sightings.draw(weights.sparse_batch, weights.sparse_step, self.generator)
+        sparse = self.sightings.draw(weights.sparse_batch, weights.sparse_step, self.generator)
+        dense = self.dense.draw(weights.dense_batch, weights.dense_step, self.generator)
         anywhere = torch.rand(sampling.free_points, 3, generator=self.generator, device=self.device) * 2 - 1
-        rendered = self.renderer.render(batch, moment, torch.cat([places, anywhere]), self.generator)
+        extra = torch.cat([sparse.places, dense.places, anywhere])
+        rendered = self.renderer.render(batch, moment, extra, self.generator)
         exposed = rendered.colors * torch.exp(self.fields.log_gains[batch.images])
         nothing = torch.zeros((), device=self.device)
 
@@ -169,7 +173,13 @@ class Trainer:
             [omega * losses.eikonal_error(rendered.gradients), losses.eikonal_error(rendered.extra_gradients)]
         ).mean()
         of_terms = self.terms.losses(rendered, moment)
-        sparse_loss = sighting_loss(rendered.extra_sdf[: len(places)], sparse_weights, weights)
+        first, last = len(sparse.places), len(sparse.places) + len(dense.places)
+        sparse_loss = sighting_loss(
+            rendered.extra_sdf[:first], sparse.weights, weights.sparse_tolerance, weights.sparse_step
+        )
+        dense_loss = sighting_loss(
+            rendered.extra_sdf[first:last], dense.weights, weights.dense_tolerance, weights.dense_step
+        )
         exposure_loss = losses.exposure_error(self.fields.log_gains).mean()
         proposal_loss = self._proposal_loss(rendered)
 
@@ -178,6 +188,7 @@ class Trainer:
             + weights.eikonal * eikonal_loss
             + sum(weight * term_loss for weight, term_loss in of_terms.values())
             + sparse_weight * sparse_loss
+            + weights.dense * dense_loss
             + weights.mask * mask_loss
             + weights.exposure * exposure_loss
             + proposal_loss
@@ -198,6 +209,7 @@ class Trainer:
                 "eikonal": eikonal_loss.detach(),
                 **{name: term_loss.detach() for name, (_, term_loss) in of_terms.items()},
                 "sparse": sparse_loss.detach(),
+                "dense": dense_loss.detach(),
                 "mask": mask_loss.detach(),
                 "proposal": proposal_loss.detach(),
                 "psnr": -10 * torch.log10(mse.clamp(min=1e-10)),

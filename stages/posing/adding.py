@@ -94,15 +94,20 @@ def copy_features(before: Path, database: Path, names: Mapping[str, str]) -> Non
         now = {image.name: image.image_id for image in new.read_all_images()}
         new_id = {then[was]: now[name] for name, was in names.items() if was in then and name in now}
         with pycolmap.DatabaseTransaction(new):
-            for i, j in new_id.items():
-                if not new.exists_keypoints(j):
-                    new.write_keypoints(j, old.read_keypoints(i))
-                    new.write_descriptors(j, old.read_descriptors(i))
+            copy_keypoints(old, new, new_id)
             for i, j in old_pairs(old, set(new_id)):
                 pair = new_id[i], new_id[j]
                 if not new.exists_matches(*pair):
                     new.write_matches(*pair, old.read_matches(i, j))
                     new.write_two_view_geometry(*pair, old.read_two_view_geometry(i, j))
+
+
+def copy_keypoints(old: Any, new: Any, new_id: Mapping[int, int]) -> None:
+    """Features of images (id in `new` by id in `old`, both open) that have none in the new database."""
+    for i, j in new_id.items():
+        if not new.exists_keypoints(j):
+            new.write_keypoints(j, old.read_keypoints(i))
+            new.write_descriptors(j, old.read_descriptors(i))
 
 
 def old_pairs(database: Any, images: set[int]) -> list[tuple[int, int]]:

@@ -1,13 +1,14 @@
-"""Poses of a COLMAP model: cameras, images and points3D, as .bin or .txt."""
+"""COLMAP models: the poses of those that are given (cameras, images and points3D, as .bin or .txt), and new ones."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from stages.geometry.cameras import PinholeCameras
 from stages.inputs.texts import read_text
 from stages.posing.known import KnownCamera, KnownPoses, reading
 
@@ -33,6 +34,33 @@ def read_colmap(folder: Path) -> KnownPoses:
         read = _read_binary if (folder / "cameras.bin").is_file() else _read_text
         found = tuple(read(folder))
     return KnownPoses(folder, found)
+
+
+def pinhole_model(cameras: PinholeCameras, pixels: Sequence[np.ndarray]) -> Any:
+    """A pycolmap model without points. Photo k is image k + 1; photos of the same intrinsics share a camera.
+
+    Args:
+        pixels: for each photo the places [p, 2] in it that tracks of points will refer to.
+    """
+    import pycolmap
+
+    model = pycolmap.Reconstruction()
+    camera_ids: dict[tuple[Any, ...], int] = {}
+    for i, name in enumerate(cameras.names):
+        (width, height), pose = cameras.sizes[i].tolist(), cameras.extrinsics[i]
+        params = cameras.intrinsics[i][[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
+        key = (width, height, *params)
+        if key not in camera_ids:
+            camera_ids[key] = len(camera_ids) + 1
+            model.add_camera_with_trivial_rig(
+                pycolmap.Camera(model="PINHOLE", width=width, height=height, params=params, camera_id=camera_ids[key])
+            )
+        places = pycolmap.Point2DList([pycolmap.Point2D(xy) for xy in pixels[i]])
+        model.add_image_with_trivial_frame(
+            pycolmap.Image(name, places, camera_ids[key], i + 1),
+            pycolmap.Rigid3d(pycolmap.Rotation3d(pose[:, :3]), pose[:, 3]),
+        )
+    return model
 
 
 def _read_binary(folder: Path) -> Iterator[KnownCamera]:

@@ -16,6 +16,7 @@ from stages import artifacts
 from stages.geometry.cameras import PosedScene
 from stages.geometry.normalisation import into_frame
 from stages.geometry.place import Place
+from stages.posing.colmap_model import pinhole_model
 from stages.posing.undistortion import registered_photos
 
 log = logging.getLogger(__name__)
@@ -103,27 +104,13 @@ def undistorted_model(scene: PosedScene, in_world: Place, sfm: Path, images_fold
     source = pycolmap.Reconstruction(str(artifacts.MODEL.load(sfm)))
     photos = registered_photos(source)
     cameras = into_frame(scene.cameras, scene.world_from_scene(in_world).inverse())
-    model = pycolmap.Reconstruction()
-    camera_ids: dict[tuple[Any, ...], int] = {}
-    for i, (photo, name) in enumerate(zip(photos, cameras.names, strict=True)):
-        K, (width, height) = cameras.intrinsics[i], cameras.sizes[i].tolist()
-        params = K[[0, 1, 0, 1], [0, 1, 2, 2]]
-        key = (width, height, *params)
-        if key not in camera_ids:
-            camera_ids[key] = len(camera_ids) + 1
-            model.add_camera_with_trivial_rig(
-                pycolmap.Camera(
-                    model="PINHOLE", width=width, height=height, params=list(params), camera_id=camera_ids[key]
-                )
-            )
+    pixels = []
+    for photo, K in zip(photos, cameras.intrinsics, strict=True):
         seen = np.array([point.xy for point in photo.points2D]).reshape(-1, 2)
         rays = np.asarray(source.cameras[photo.camera_id].cam_from_img(seen)).reshape(-1, 2)
-        pixels = np.nan_to_num(rays * params[:2] + params[2:], nan=-1.0)  # a lens may not reach the photo's corners
-        pose = cameras.extrinsics[i]
-        model.add_image_with_trivial_frame(
-            pycolmap.Image(name, pycolmap.Point2DList([pycolmap.Point2D(xy) for xy in pixels]), camera_ids[key], i + 1),
-            pycolmap.Rigid3d(pycolmap.Rotation3d(pose[:, :3]), pose[:, 3]),
-        )
+        # a lens may not reach the photo's corners
+        pixels.append(np.nan_to_num(rays * K[[0, 1], [0, 1]] + K[:2, 2], nan=-1.0))
+    model = pinhole_model(cameras, pixels)
     index_of = {photo.image_id: i + 1 for i, photo in enumerate(photos)}
     points = scene.world_from_scene(in_world).apply(scene.points.astype(np.float64))
     for point_id, xyz in zip(sorted(source.points3D), points, strict=True):

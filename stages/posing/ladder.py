@@ -15,7 +15,7 @@ from typing import Any
 log = logging.getLogger(__name__)
 
 # This many attempts in a row that place no further photo end the climb, once enough photos are placed to go on with.
-PATIENCE = 2
+PATIENCE = 3
 
 
 @dataclass(frozen=True)

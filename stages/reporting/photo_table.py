@@ -1,8 +1,8 @@
-"""What became of each photo: placed, left out or held out, its fit to the sparse points, its thumbnail."""
+"""What became of each photo: placed, left out or held out, its fit to the points, how far stereo explains it."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -24,6 +24,7 @@ class PhotoResult:
         fit: to the sparse points, where it has a pose and the model can be read.
         camera: its number among the scene's cameras, or None.
         held_out: whether it was held out from training and texture.
+        explained: share (0..1) of its pixels whose depth stereo found and trusts; None where it has no depth map.
     """
 
     record: ImageRecord
@@ -31,6 +32,7 @@ class PhotoResult:
     fit: PhotoFit | None
     camera: int | None
     held_out: bool
+    explained: float | None
 
     @property
     def state(self) -> str:
@@ -44,6 +46,7 @@ def photo_results(
     model: Path,
     cameras: Sequence[str],
     held_out: Sequence[str],
+    explained: Mapping[str, float],
 ) -> list[PhotoResult]:
     """All photos, by name; none where their list is missing.
 
@@ -51,6 +54,7 @@ def photo_results(
         model: folder of the COLMAP model.
         cameras: names of the scene's cameras: the photos' with `.png`.
         held_out: those of them that were held out.
+        explained: share (0..1) of the pixels of each of them that stereo explains.
     """
     if image_set is None:
         return []
@@ -65,9 +69,11 @@ def photo_results(
     for record in sorted(image_set.images, key=lambda record: record.name):
         short = PurePosixPath(record.name).with_suffix(".png").as_posix()
         camera = next((numbers[name] for name in (f"{record.name}.png", short) if name in numbers), None)
-        is_held_out = camera is not None and cameras[camera] in held_out
-        reason = reasons.get(record.name, "")
-        results.append(PhotoResult(record, reason, fits.get(record.name), None if reason else camera, is_held_out))
+        pinhole = "" if camera is None else cameras[camera]
+        reason, fit = reasons.get(record.name, ""), fits.get(record.name)
+        results.append(
+            PhotoResult(record, reason, fit, None if reason else camera, pinhole in held_out, explained.get(pinhole))
+        )
     return results
 
 
@@ -90,6 +96,7 @@ def describe_photos(
             "reason": result.reason,
             "error": result.fit.error_px if result.fit else None,
             "points": result.fit.points if result.fit else None,
+            "explained": result.explained,
             "camera": result.camera,
         }
         for number, result in enumerate(ordered)
@@ -123,6 +130,7 @@ def camera_captions(results: Sequence[PhotoResult], cameras: Sequence[str]) -> l
                 "held_out": result is not None and result.held_out,
                 "error": fit.error_px and round(fit.error_px, 3) if fit else None,
                 "points": fit.points if fit else None,
+                "explained": result.explained if result else None,
             }
         )
     return captions

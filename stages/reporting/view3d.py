@@ -1,4 +1,4 @@
-"""What the page's 3D view gets: mesh, measures per vertex, cameras, sparse points, ground, region, next photos.
+"""What the page's 3D view gets: mesh, measures per vertex, cameras, points, ground, region, next photos.
 
 Everything is turned +Y up. Arrays are packed as base64, positions and UVs in 16 bits, normals and measures in 8.
 """
@@ -16,6 +16,7 @@ from stages.drawing.rendering import look_at
 from stages.geometry.cameras import PinholeCameras, PosedScene
 from stages.geometry.normalisation import perpendicular
 from stages.geometry.place import GivenRegion, Place
+from stages.geometry.point_cloud import PointCloud
 from stages.geometry.similarity import Similarity
 from stages.geometry.up import y_up_rotation
 from stages.reporting.next_views import NextView
@@ -25,6 +26,8 @@ from stages.reporting.pictures import jpeg_uri, shrink
 MAX_FACES = 400_000
 TEXTURE_SIDE = 2048
 MAX_POINTS = 40_000
+# Dense points: at most so many in the region and around it, which add 0.6 MB to the page; none that is trusted less.
+MAX_DENSE, MAX_AROUND, MIN_TRUST = 40_000, 10_000, 0.5
 # Measures are packed as 0..254; this says that a vertex has none.
 NO_VALUE = 255
 # All sparse points within this many radii of the region are drawn, and of all together the nearest, but for this share:
@@ -115,6 +118,24 @@ def pack_scene(
         **_pack_points(scene.points, turn),
         "ground": _plain(_ground_grid(scene, atlas) @ turn.T) if scene.ground is not None else None,
     }
+
+
+def pack_dense(cloud: PointCloud, scene: PosedScene) -> dict[str, Any] | None:
+    """Dense points, a random choice where they are many: positions, colours in 8 bits; None where there are none.
+
+    Args:
+        cloud: in the frame of the poses.
+    """
+    moved, random = cloud.moved(scene.poses_from_scene.inverse()), np.random.default_rng(0)
+    distances = np.where(moved.trust >= MIN_TRUST, np.linalg.norm(moved.points, axis=1), np.inf)
+    inside, around = distances <= 1, (distances > 1) & (distances <= POINTS_REACH)
+    rows = np.concatenate(
+        [random.permutation(np.flatnonzero(some))[:most] for some, most in ((inside, MAX_DENSE), (around, MAX_AROUND))]
+    )
+    if not len(rows):
+        return None
+    positions = _pack_positions(moved.points[rows] @ y_up_rotation(scene.up).T)
+    return {**positions, "colors": _encode(moved.colors[rows]), "shown": len(rows), "total": len(cloud)}
 
 
 def pack_region(scene: PosedScene, place: Place, given: GivenRegion | None) -> dict[str, Any]:

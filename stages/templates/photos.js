@@ -12,6 +12,7 @@
     name: (a, b) => a.dataset.name.localeCompare(b.dataset.name),
     error: (a, b) => number(b, "error") - number(a, "error"),
     points: (a, b) => number(a, "points") - number(b, "points"),
+    explained: (a, b) => number(a, "explained") - number(b, "explained"),
   };
   const arrange = () => {
     grid.append(...[...all].sort(orders[order.value]));

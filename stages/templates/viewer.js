@@ -1,5 +1,5 @@
 // The page's 3D view, on three.js (global THREE): the mesh with its texture or a measure per vertex in colours, the
-// cameras as pyramids, sparse points, ground, region, and the next photos to take. Drawn when something changes only.
+// cameras as pyramids, sparse and dense points, ground, region, and the next photos to take. Drawn when something changes only.
 (function () {
   "use strict";
   const canvas = document.getElementById("viewer");
@@ -77,6 +77,7 @@
   });
   const show = (what) => {
     const overlay = data.overlays.find((each) => each.key === what);
+    mesh.visible = what !== "none";
     mesh.material = overlay ? materials.measure : materials[what] || materials.texture;
     const legend = element("view-legend");
     legend.hidden = !overlay;
@@ -89,7 +90,7 @@
       element("legend-missing").hidden = !overlay.missing;
       element("legend-missing-label").textContent = overlay.missing;
     }
-    element("surface").value = overlay || materials[what] ? what : "texture";
+    element("surface").value = overlay || materials[what] || !mesh.visible ? what : "texture";
     redraw();
   };
 
@@ -111,6 +112,19 @@
     ),
   };
   layers.points.geometry.setAttribute("position", new THREE.BufferAttribute(new Float32Array(sparse), 3));
+  if (data.dense) {
+    const painted = new Float32Array(3 * data.dense.shown);
+    const color = new THREE.Color();
+    const shades = new Uint8Array(bytes(data.dense.colors));
+    for (let i = 0; i < painted.length; i += 3) {
+      const [r, g, b] = shades.subarray(i, i + 3);
+      color.setRGB(r / 255, g / 255, b / 255, THREE.SRGBColorSpace).toArray(painted, i);
+    }
+    const material = region.dim(new THREE.PointsMaterial({ vertexColors: true, size: 2, sizeAttenuation: false }));
+    layers.dense = new THREE.Points(new THREE.BufferGeometry(), material);
+    layers.dense.geometry.setAttribute("position", new THREE.BufferAttribute(positions(data.dense), 3));
+    layers.dense.geometry.setAttribute("color", new THREE.BufferAttribute(painted, 3));
+  }
   scene.add(...Object.values(layers));
   const chosen = lines(new Array(48).fill(0), paint("--ink"));
   chosen.visible = false;
@@ -166,7 +180,8 @@
   const describe = (marker) => {
     if (marker.sentence) return marker.sentence;
     const fit = marker.error === null ? "" : `reprojection error ${marker.error.toFixed(2)} px, ${marker.points} points`;
-    return [marker.held_out ? "held out from training and texture" : "used", fit].filter(Boolean).join("; ");
+    const explained = marker.explained === null ? "" : `stereo explains ${(100 * marker.explained).toFixed(0)} %`;
+    return [marker.held_out ? "held out from training and texture" : "used", fit, explained].filter(Boolean).join("; ");
   };
   const choose = (key) => {
     current = markers.find((marker) => marker.key === key) || null;

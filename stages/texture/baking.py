@@ -11,7 +11,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
@@ -26,9 +25,9 @@ from stages.geometry.cameras import PinholeCameras
 from stages.surface.triangle_mesh import face_areas
 from stages.texture.filling import face_neighbors, harmonic_offsets, vertex_means
 from stages.texture.gains import solve_gains
-from stages.texture.observing import blend_texels, gather_texels, sample_points
+from stages.texture.observing import STEPS_UNSIGNED, blend_texels, gather_texels, sample_points
 from stages.texture.padding import pad_charts
-from stages.texture.photo_views import BYTES_PER_PIXEL, View, prepare_view
+from stages.texture.photo_views import View, prepare_view
 from stages.texture.sharpness import BLURRED, sharpness_of_photos
 
 # (photo index) -> [H, W, 3] uint8 RGB and [H, W] bool mask or None.
@@ -41,8 +40,10 @@ Visitor = Callable[[int, View, np.ndarray], None]
 
 # Texels that take part in comparing photos.
 SAMPLES = 20_000
-# Texels blended at a time: the buffers take 16 bytes a texel and kept view. More texels go over the photos again.
+# Texels blended at a time: the buffers take 16 bytes a texel and kept view. Each band goes over the photos again, so
+# bands are small only where all photos stay in memory.
 BAND_BYTES = 1 << 30
+SMALL_BAND_BYTES = 1 << 28
 # Prepared photos that stay in memory for the next pass; the others are made again.
 KEPT_BYTES = 1 << 30
 # Texels handed to a thread at a time.
@@ -117,13 +118,14 @@ def bake_texture(
         raise ValueError(f"expected charts covering texels of a {size}² texture, got none")
     colors = np.zeros((num_texels, 3), dtype=np.uint8)
     seen_by = np.zeros(num_texels, dtype=np.uint16)
-    per_band = max(BAND_BYTES // (16 * (views + 1)), _CHUNK)
-    bands = [slice(start, min(start + per_band, num_texels)) for start in range(0, num_texels, per_band)]
-    total, done = num_views * (1 + len(bands)) + 1, itertools.count(1)
+    views = min(views, num_views)
+    done = 0.0
 
-    def tell(note: str) -> None:
+    def tell(note: str, photos: float = 1.0) -> None:
+        nonlocal done
+        done += photos
         if listener is not None:
-            listener(next(done), total, note)
+            listener(done, 2 * num_views + 1, note)
 
     with ThreadPoolExecutor(max_workers=max(1, workers)) as pool:
         texel_side = float(np.sqrt(face_areas(atlas.vertices, atlas.faces).sum() / num_texels))  # mean, scene units
@@ -131,6 +133,7 @@ def bake_texture(
         gains, sharpness = _compare(atlas, texels, _prefetch(pool, prepare, num_views, workers), num_views, tell)
         if not gain:
             gains = np.ones((num_views, 3))
+        bands = _bands(num_texels, views, SMALL_BAND_BYTES if len(prepare.kept) == num_views else BAND_BYTES)
         blend = partial(blend_texels, detail=detail, robust_sigma=robust_sigma, diffuse=diffuse)
         for number, band in enumerate(bands):
             prepared = _prefetch(pool, prepare, num_views, workers)
@@ -138,7 +141,7 @@ def bake_texture(
                 prepared = _visited(prepared, visit, gains)
             _blend(
                 pool, *surface_points(atlas, texels.face_ids[band], texels.corner[band]), gains, sharpness,
-                prepared, views, blend, colors[band], seen_by[band], tell,
+                prepared, views, blend, colors[band], seen_by[band], partial(tell, "blending photos", 1 / len(bands)),
             )  # fmt: skip
         prepare.kept.clear()
 
@@ -168,21 +171,27 @@ def bake_texture(
     )
 
 
+def _bands(num_texels: int, views: int, room: int) -> list[slice]:
+    """Texels that are blended together, within `room` bytes."""
+    length = max(room // (16 * (views + 1)), _CHUNK)
+    return [slice(start, min(start + length, num_texels)) for start in range(0, num_texels, length)]
+
+
 class _Prepare:
     """Makes photos ready for sampling, and keeps the first ones for the next pass."""
 
     def __init__(self, atlas: AtlasMesh, cameras: PinholeCameras, load_photo: LoadPhoto, texel_side: float) -> None:
         self.atlas, self.cameras, self.load_photo, self.texel_side = atlas, cameras, load_photo, texel_side
-        pixels = np.cumsum(cameras.sizes[:, 0] * cameras.sizes[:, 1])
-        self.keep = int(np.searchsorted(pixels * BYTES_PER_PIXEL, KEPT_BYTES, side="right"))
         self.kept: dict[int, View] = {}
+        self.room = KEPT_BYTES
 
     def __call__(self, index: int) -> View:
         if index in self.kept:
             return self.kept[index]
         photo, mask = self.load_photo(index)
         view = prepare_view(self.cameras, index, photo, mask, self.atlas.vertices, self.atlas.faces, self.texel_side)
-        if index < self.keep:
+        if view.nbytes <= self.room:
+            self.room -= view.nbytes
             self.kept[index] = view
         return view
 
@@ -224,7 +233,7 @@ def _compare(
         tell("comparing photos")
     # From the photos themselves: their low bands mix neighbouring colours, more so in slanted views.
     gains = solve_gains(colors.transpose(1, 0, 2), weights.T)
-    return gains, sharpness_of_photos((colors - lows).mean(2).T, weights.T)
+    return gains, sharpness_of_photos((colors - lows / STEPS_UNSIGNED).mean(2).T, weights.T)
 
 
 def _blend(
@@ -238,7 +247,7 @@ def _blend(
     blend: Callable[..., None],
     colors: np.ndarray,
     seen_by: np.ndarray,
-    tell: Callable[[str], None],
+    tell: Callable[[], None],
 ) -> None:
     """Fill colors [T, 3] uint8 and the number of photos that see each texel [T]."""
     count = len(points)
@@ -257,7 +266,7 @@ def _blend(
 
     for index, view in enumerate(prepared):
         list(pool.map(partial(offer, view, index), chunks))
-        tell("blending photos")
+        tell()
 
     def finish(part: slice) -> None:
         blend(best_weights[part], best_lows[part], best_highs[part], colors=colors[part])

@@ -18,53 +18,66 @@ STEPS_UNSIGNED = 64.0
 STEPS_SIGNED = 32.0
 # Robust spread (colour levels) never counts as less than this: photo noise.
 NOISE_FLOOR = 3.0
-# What photos count in the mean of either band is a power of their weight. Low: many photos, for sheen moves from one
-# to the next and none of them is right. High: rather those that resolve the most. See docs/benchmarks/textures.md.
-LOW_POWER, HIGH_POWER = 0.5, 1.0
+# Points projected at a time.
+_BLOCK = 512
+# Unsigned, or numba would look at each index whether it counts from the end, at a fifth of the time.
+_ONE = np.uintp(1)
 
 
 @njit(nogil=True, cache=True)
-def observe(px, py, pz, nx, ny, nz, matrix, center, focal, inverse_depth, confidence):  # pragma: no cover - compiled
-    """Weight with which a photo sees a point, and the pixel; weight 0: it does not.
+def _project(points, normals, matrix, center, u, v, depth, cos):  # pragma: no cover - compiled
+    """Fill pixel, depth and cosine to the normal, [_BLOCK] each, of as many points or fewer.
+
+    Apart from `_weight`, into arrays of their own and without a branch, so that it runs on vectors.
+    """
+    for k in range(points.shape[0]):
+        px, py, pz = points[k, 0], points[k, 1], points[k, 2]
+        dx, dy, dz = center[0] - px, center[1] - py, center[2] - pz
+        distance = np.sqrt(dx * dx + dy * dy + dz * dz)
+        z = matrix[2, 0] * px + matrix[2, 1] * py + matrix[2, 2] * pz + matrix[2, 3]
+        per_depth = 1.0 / z
+        u[k] = (matrix[0, 0] * px + matrix[0, 1] * py + matrix[0, 2] * pz + matrix[0, 3]) * per_depth - 0.5
+        v[k] = (matrix[1, 0] * px + matrix[1, 1] * py + matrix[1, 2] * pz + matrix[1, 3]) * per_depth - 0.5
+        depth[k] = z
+        facing = normals[k, 0] * dx + normals[k, 1] * dy + normals[k, 2] * dz
+        cos[k] = facing / max(distance, 1e-12)
+
+
+@njit(nogil=True, cache=True)
+def _weight(u, v, z, cos, focal, inverse_depth, confidence):  # pragma: no cover - compiled
+    """Weight with which a photo sees a point at depth z on pixel (u, v); 0: it does not.
 
     weight = confidence · (focal cos θ / depth)² cos θ: pixels on a unit of surface, times a further fall-off
     with the angle θ between normal and line of sight, because slanted views blur and mirror.
     """
-    dx, dy, dz = center[0] - px, center[1] - py, center[2] - pz
-    distance = np.sqrt(dx * dx + dy * dy + dz * dz)
-    cos = (nx * dx + ny * dy + nz * dz) / max(distance, 1e-12)
-    if cos < MIN_COS:
-        return 0.0, 0.0, 0.0
-    z = matrix[2, 0] * px + matrix[2, 1] * py + matrix[2, 2] * pz + matrix[2, 3]
-    if z <= 0:
-        return 0.0, 0.0, 0.0
-    u = (matrix[0, 0] * px + matrix[0, 1] * py + matrix[0, 2] * pz + matrix[0, 3]) / z - 0.5
-    v = (matrix[1, 0] * px + matrix[1, 1] * py + matrix[1, 2] * pz + matrix[1, 3]) / z - 0.5
     height, width = inverse_depth.shape
-    if not (u >= 0 and v >= 0 and u < width - 1 and v < height - 1):
-        return 0.0, 0.0, 0.0
-    x, y = int(u), int(v)
+    if not (cos >= MIN_COS and z > 0 and u >= 0 and v >= 0 and u < width - 1 and v < height - 1):
+        return 0.0
+    x, y = np.uintp(u), np.uintp(v)
+    right, below = x + _ONE, y + _ONE
     fx, fy = u - x, v - y
-    trust = min(confidence[y, x], confidence[y, x + 1], confidence[y + 1, x], confidence[y + 1, x + 1])
-    if trust <= 0:
-        return 0.0, 0.0, 0.0
-    w = (inverse_depth[y, x] * (1 - fx) + inverse_depth[y, x + 1] * fx) * (1 - fy) + (
-        inverse_depth[y + 1, x] * (1 - fx) + inverse_depth[y + 1, x + 1] * fx
+    trust = min(confidence[y, x], confidence[y, right], confidence[below, x], confidence[below, right])
+    w = (inverse_depth[y, x] * (1 - fx) + inverse_depth[y, right] * fx) * (1 - fy) + (
+        inverse_depth[below, x] * (1 - fx) + inverse_depth[below, right] * fx
     ) * fy
-    # Within two pixel sizes of the depth map, stretched along the line of sight on slanted surfaces.
-    if abs(z * w - 1.0) * focal * cos > DEPTH_PIXELS * w * z:
-        return 0.0, 0.0, 0.0
+    # Beyond two pixel sizes of the depth map, stretched along the line of sight on slanted surfaces. Trust and this are
+    # no ways out of their own: where they change, the processor guesses wrong, which takes longer than all the rest.
+    hidden = abs(z * w - 1.0) * focal * cos > DEPTH_PIXELS * w * z
     detail = focal * cos / z
-    return trust * detail * detail * cos, u, v
+    return 0.0 if hidden else trust / 255.0 * detail * detail * cos
 
 
 @njit(nogil=True, cache=True)
-def _bilinear(image, u, v, c):  # pragma: no cover - compiled
-    x, y = int(u), int(v)
+def _bilinear(image, u, v):  # pragma: no cover - compiled
+    """The three channels of an image between four pixels."""
+    x, y = np.uintp(u), np.uintp(v)
+    right, below = x + _ONE, y + _ONE
     fx, fy = u - x, v - y
-    top = image[y, x, c] * (1 - fx) + image[y, x + 1, c] * fx
-    bottom = image[y + 1, x, c] * (1 - fx) + image[y + 1, x + 1, c] * fx
-    return top * (1 - fy) + bottom * fy
+    w00, w01, w10, w11 = (1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy, fx * fy
+    red = w00 * image[y, x, 0] + w01 * image[y, right, 0] + w10 * image[below, x, 0] + w11 * image[below, right, 0]
+    green = w00 * image[y, x, 1] + w01 * image[y, right, 1] + w10 * image[below, x, 1] + w11 * image[below, right, 1]
+    blue = w00 * image[y, x, 2] + w01 * image[y, right, 2] + w10 * image[below, x, 2] + w11 * image[below, right, 2]
+    return red, green, blue
 
 
 @njit(nogil=True, cache=True)
@@ -72,15 +85,25 @@ def sample_points(
     points, normals, matrix, center, focal, inverse_depth, confidence, image, weights, colors
 ):  # pragma: no cover - compiled
     """Fill weights [P] and bilinear colours [P, 3] of one photo (or a band of it) at points [P, 3]."""
+    us, vs, depths, cosines = np.empty(_BLOCK), np.empty(_BLOCK), np.empty(_BLOCK), np.empty(_BLOCK)
     for i in range(points.shape[0]):
-        weight, u, v = observe(
-            points[i, 0], points[i, 1], points[i, 2], normals[i, 0], normals[i, 1], normals[i, 2],
-            matrix, center, focal, inverse_depth, confidence,
-        )  # fmt: skip
-        weights[i] = weight
-        if weight > 0:
-            for c in range(3):
-                colors[i, c] = _bilinear(image, u, v, c)
+        k = i % _BLOCK
+        if k == 0:
+            block = slice(i, i + _BLOCK)
+            _project(points[block], normals[block], matrix, center, us, vs, depths, cosines)
+        u, v = us[k], vs[k]
+        weights[i] = _weight(u, v, depths[k], cosines[k], focal, inverse_depth, confidence)
+        if weights[i] > 0:
+            colors[i, 0], colors[i, 1], colors[i, 2] = _bilinear(image, u, v)
+
+
+@njit(nogil=True, cache=True)
+def _least(values):  # pragma: no cover - compiled
+    least = 0
+    for k in range(1, values.shape[0]):
+        if values[k] <= values[least]:
+            least = k
+    return least
 
 
 @njit(nogil=True, cache=True)
@@ -88,34 +111,33 @@ def gather_texels(
     points, normals, matrix, center, focal, inverse_depth, confidence, low, photo, gain, sharpness,
     best_weights, best_lows, best_highs, seen_by,
 ):  # fmt: skip # pragma: no cover - compiled
-    """Offer one photo to texels [T].
+    """Offer one photo, with its low band in `STEPS_UNSIGNED` a level, to texels [T].
 
-    Keeps each texel's best K views in best_weights [T, K] (descending), their low bands in best_lows [T, K, 3] uint16
-    and high bands in best_highs [T, K, 3] int16, and counts views in seen_by [T].
+    Keeps each texel's best K views in best_weights [T, K] (in no order, 0 where there are fewer), their low bands in
+    best_lows [T, K, 3] uint16 and high bands in best_highs [T, K, 3] int16, and counts views in seen_by [T].
     """
     keep = best_weights.shape[1]
+    us, vs, depths, cosines = np.empty(_BLOCK), np.empty(_BLOCK), np.empty(_BLOCK), np.empty(_BLOCK)
     for i in range(points.shape[0]):
-        weight, u, v = observe(
-            points[i, 0], points[i, 1], points[i, 2], normals[i, 0], normals[i, 1], normals[i, 2],
-            matrix, center, focal, inverse_depth, confidence,
-        )  # fmt: skip
-        weight *= sharpness
+        k = i % _BLOCK
+        if k == 0:
+            block = slice(i, i + _BLOCK)
+            _project(points[block], normals[block], matrix, center, us, vs, depths, cosines)
+        u, v = us[k], vs[k]
+        weight = sharpness * _weight(u, v, depths[k], cosines[k], focal, inverse_depth, confidence)
         if weight <= 0:
             continue
+        slot = seen_by[i]
         seen_by[i] += 1
-        if weight <= best_weights[i, keep - 1]:
-            continue
-        slot = keep - 1
-        while slot > 0 and best_weights[i, slot - 1] < weight:
-            best_weights[i, slot] = best_weights[i, slot - 1]
-            for c in range(3):
-                best_lows[i, slot, c] = best_lows[i, slot - 1, c]
-                best_highs[i, slot, c] = best_highs[i, slot - 1, c]
-            slot -= 1
+        if slot >= keep:
+            slot = _least(best_weights[i])
+            if weight <= best_weights[i, slot]:
+                continue
         best_weights[i, slot] = weight
+        low_values, values = _bilinear(low, u, v), _bilinear(photo, u, v)
         for c in range(3):
-            low_value = _bilinear(low, u, v, c)
-            high = (_bilinear(photo, u, v, c) - low_value) * gain[c]
+            low_value = low_values[c] / STEPS_UNSIGNED
+            high = (values[c] - low_value) * gain[c]
             best_lows[i, slot, c] = np.uint16(min(low_value * gain[c], 1020.0) * STEPS_UNSIGNED + 0.5)
             best_highs[i, slot, c] = np.int16(np.floor(min(max(high, -1020.0), 1020.0) * STEPS_SIGNED + 0.5))
 
@@ -130,41 +152,54 @@ def blend_texels(
     1.4826 * MAD and beyond count nothing, nearer ones (1 - (./d)^2)^2 (Tukey's biweight). With `diffuse`, a view
     that is brighter than the median is twice as far from it: a highlight adds light, and moves from photo to photo.
 
-    Low band: mean of the views with weight^LOW_POWER, high band: with weight^HIGH_POWER. The last of the kept views
-    counts nothing and its weight is taken off the others', so that a view fades out before it leaves the set and no
-    seam shows where it does.
+    Low band: mean of the views with the root of their weight, for sheen moves from one photo to the next and none of
+    them is right. High band: with the weight, rather those that resolve the most (docs/benchmarks/textures.md). Where
+    all places for views are taken, the least one counts nothing and its weight is taken off the others', so that a view
+    fades out before it leaves the set and no seam shows where it does.
     """
-    keep = best_weights.shape[1] - 1
-    values = np.empty((keep, 3))
-    weights = np.empty(keep)
-    deviations = np.empty(keep)
-    order = np.empty(keep, dtype=np.int64)
+    places = best_weights.shape[1]
+    values, highs = np.empty((3, places), dtype=np.float32), np.empty((3, places), dtype=np.float32)
+    weights, deviations = np.empty(places, dtype=np.float32), np.empty(places, dtype=np.float32)
+    up_to = np.empty(places, dtype=np.float32)
     median = np.empty(3)
     low = np.empty(3)
     high = np.empty(3)
     for i in range(best_weights.shape[0]):
+        last, faded = -1, 0.0
+        if best_weights[i, places - 1] > 0:
+            last = _least(best_weights[i])
+            faded = best_weights[i, last]
+        most = best_weights[i].max()
         count = 0
-        while count < keep and best_weights[i, count] > 0:
+        for slot in range(places):
+            if best_weights[i, slot] <= 0:
+                break
+            if slot == last:
+                continue
             # A little of each weight stays: with equal ones, nothing would be left.
-            weights[count] = (1.001 * best_weights[i, count] - best_weights[i, keep]) / best_weights[i, 0]
+            weights[count] = (1.001 * best_weights[i, slot] - faded) / most
             for c in range(3):
-                values[count, c] = best_lows[i, count, c] / STEPS_UNSIGNED
+                values[c, count] = best_lows[i, slot, c] / STEPS_UNSIGNED
+                highs[c, count] = best_highs[i, slot, c] / STEPS_SIGNED
             count += 1
         if count == 0:
             continue
-        half = 0.5 * weights[:count].sum()
+        total = np.float32(0.0)
+        for k in range(count):
+            total += weights[k]
+        half = np.float32(0.5) * total
         for c in range(3):
-            median[c] = _weighted_middle(values[:count, c], weights[:count], half, order)
+            median[c] = _weighted_middle(values[c, :count], weights[:count], half, up_to)
         for k in range(count):
             deviations[k] = 0.0
             for c in range(3):
-                off = values[k, c] - median[c]
+                off = values[c, k] - median[c]
                 if off < 0:
                     off = -off
                 elif diffuse:
                     off *= 2.0
                 deviations[k] = max(deviations[k], off)
-        spread = max(1.4826 * _weighted_middle(deviations[:count], weights[:count], half, order), NOISE_FLOOR)
+        spread = max(1.4826 * _weighted_middle(deviations[:count], weights[:count], half, up_to), NOISE_FLOOR)
         low[:] = 0.0
         high[:] = 0.0
         low_total = high_total = 0.0
@@ -172,13 +207,13 @@ def blend_texels(
             near = 1.0 - (deviations[k] / (robust_sigma * spread)) ** 2
             if near <= 0:
                 continue
-            low_weight = near * near * weights[k] ** LOW_POWER
-            high_weight = near * near * weights[k] ** HIGH_POWER
+            low_weight = near * near * np.sqrt(weights[k])
+            high_weight = near * near * weights[k]
             low_total += low_weight
             high_total += high_weight
             for c in range(3):
-                low[c] += low_weight * values[k, c]
-                high[c] += high_weight * best_highs[i, k, c] / STEPS_SIGNED
+                low[c] += low_weight * values[c, k]
+                high[c] += high_weight * highs[c, k]
         for c in range(3):
             color = low[c] / low_total if low_total > 0 else median[c]
             if detail and high_total > 0:
@@ -187,19 +222,19 @@ def blend_texels(
 
 
 @njit(nogil=True, cache=True)
-def _weighted_middle(values, weights, half, order):  # pragma: no cover - compiled
-    """Weighted median of a few values, `half` being half of the weights' sum. `order` is scratch of their number."""
-    count = values.shape[0]
-    # By insertion: numpy's argsort takes several times as long for so few.
-    for i in range(count):
-        k = i
-        while k > 0 and values[order[k - 1]] > values[i]:
-            order[k] = order[k - 1]
-            k -= 1
-        order[k] = i
-    cumulative = 0.0
+def _weighted_middle(values, weights, half, up_to):  # pragma: no cover - compiled
+    """Weighted median of P values, `half` being half of the weights' sum. `up_to` [P] is scratch.
+
+    By comparing all pairs, which runs on vectors: sorting so few takes several times as long.
+    """
+    count, none, middle = values.shape[0], np.float32(0.0), np.float32(np.inf)
     for k in range(count):
-        cumulative += weights[order[k]]
-        if cumulative >= half:
-            return values[order[k]]
-    return values[order[count - 1]]
+        up_to[k] = none
+    for j in range(count):
+        value, weight = values[j], weights[j]
+        for k in range(count):
+            up_to[k] += weight if value <= values[k] else none
+    for k in range(count):
+        if up_to[k] >= half and values[k] < middle:
+            middle = values[k]
+    return middle

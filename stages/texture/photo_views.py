@@ -12,8 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from stages.compiling import njit
-from stages.drawing.rasterizing import depth_map
+from stages.drawing.rasterizing import projected, rasterize
 from stages.geometry.cameras import PinholeCameras
+from stages.texture.observing import STEPS_UNSIGNED
 
 # Two pixels lie on different surfaces where depth departs from a plane by more than this many pixel sizes.
 EDGE_PIXELS = 3.0
@@ -27,21 +28,19 @@ BAND_SIGMA = 8.0
 _BAND_PASSES = 3
 # Photos with more pixels on a texel's side than this are smoothed first, or their finest detail would alias.
 FINER = 1.25
-# What a prepared photo takes.
-BYTES_PER_PIXEL = 26
 
 
 @dataclass(frozen=True)
 class View:
-    """One photo prepared for sampling.
+    """One photo prepared for sampling, cut to the part that shows the mesh: [H, W] below.
 
     Attributes:
-        matrix: [3, 4] pixels (homogeneous) from scene points.
+        matrix: [3, 4] its pixels (homogeneous) from scene points.
         center: [3] projection centre in the scene frame.
         focal: mean focal length in pixels.
         inverse_depth: [H, W] float32 of the mesh, 0 where the photo sees past it.
-        confidence: [H, W] float32 in [0, 1]; 0 outside the mask.
-        low: [H, W, 3] float32, the photo low-passed along surfaces only, 0..255.
+        confidence: [H, W] uint8, 255 for full trust; 0 outside the mask.
+        low: [H, W, 3] uint16, the photo low-passed along surfaces only, in `STEPS_UNSIGNED` a level.
         photo: [H, W, 3] uint8.
         original: the photo before it was smoothed for texels that cannot hold its detail.
     """
@@ -54,6 +53,12 @@ class View:
     low: np.ndarray
     photo: np.ndarray
     original: np.ndarray
+
+    @property
+    def nbytes(self) -> int:
+        """Memory that it takes."""
+        images = (self.inverse_depth, self.confidence, self.low, self.photo)
+        return sum(image.nbytes for image in images) + (self.original is not self.photo) * self.original.nbytes
 
 
 def prepare_view(
@@ -85,32 +90,46 @@ def prepare_view(
         raise ValueError(f"mask of {cameras.names[index]}: expected shape {(height, width)}, got {mask.shape}")
     K = cameras.intrinsics[index]
     focal = float(np.sqrt(K[0, 0] * K[1, 1]))
-    _, inverse_depth = depth_map(cameras, index, vertices, faces)
+    xy, inverse_depths = projected(cameras, index, vertices)
+    left, top, right, bottom = _box(xy[inverse_depths > 0], width, height)
+    _, inverse_depth = rasterize(xy - (left, top), inverse_depths, faces, right - left, bottom - top)
+    photo = np.ascontiguousarray(photo[top:bottom, left:right])
     on_object = inverse_depth > 0
     if mask is not None:
-        on_object &= mask
+        on_object &= mask[top:bottom, left:right]
     linked_left, linked_up = surface_links(np.where(on_object, inverse_depth, 0).astype(np.float32), focal)
-    interior = np.zeros((height, width), dtype=np.uint8)
+    interior = np.zeros(on_object.shape, dtype=np.uint8)
     interior[1:-1, 1:-1] = linked_left[1:-1, 1:-1] & linked_left[1:-1, 2:] & linked_up[1:-1, 1:-1] & linked_up[2:, 1:-1]
     from_edge = cv2.distanceTransform(interior, cv2.DIST_L2, 3)
     confidence = np.clip((from_edge - UNSAFE_PIXELS) / FADE_PIXELS, FAINT, 1.0)
     confidence[~on_object] = 0
-    original = photo = np.ascontiguousarray(photo)
+    original = photo
     pixels_on_texel = texel_side * focal * float(np.median(inverse_depth[on_object])) if on_object.any() else 0.0
     if pixels_on_texel > FINER:
         # A texel's square has the variance r^2 / 12 pixels^2, of which sampling brings 1 / 12.
         smooth = low_pass(photo, linked_left, linked_up, float(np.sqrt((pixels_on_texel**2 - 1) / 12)))
         photo = np.clip(smooth + 0.5, 0, 255).astype(np.uint8)
+    low = low_pass(photo, linked_left, linked_up, BAND_SIGMA)
+    low *= STEPS_UNSIGNED
+    corner_from_photo = np.array([[1.0, 0, -left], [0, 1, -top], [0, 0, 1]])
     return View(
-        matrix=K @ cameras.extrinsics[index],
+        matrix=corner_from_photo @ K @ cameras.extrinsics[index],
         center=cameras.centers[index],
         focal=focal,
         inverse_depth=inverse_depth,
-        confidence=confidence.astype(np.float32),
-        low=low_pass(photo, linked_left, linked_up, BAND_SIGMA),
+        confidence=(255 * confidence + 0.5).astype(np.uint8),
+        low=np.rint(low, out=low).astype(np.uint16),
         photo=photo,
         original=original,
     )
+
+
+def _box(xy: np.ndarray, width: int, height: int) -> tuple[int, int, int, int]:
+    """Left, top, right and bottom of the pixels that points [P, 2] fall on, at least two each way."""
+    low, high = (xy.min(0), xy.max(0)) if len(xy) else (np.zeros(2), np.zeros(2))
+    left, top = (int(np.clip(np.floor(at), 0, side - 2)) for at, side in zip(low, (width, height), strict=True))
+    right, bottom = (int(np.clip(np.ceil(at), 2, side)) for at, side in zip(high, (width, height), strict=True))
+    return left, top, max(right, left + 2), max(bottom, top + 2)
 
 
 @njit(nogil=True, cache=True)

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from stages.artifacts import AtlasMesh
-from stages.drawing.rasterizing import Texels, surface_points
-from stages.surface.triangle_mesh import MAX_RAYS, median_edge, raycaster, vertex_normals
+from stages.drawing.rasterizing import Texels, rasterize_atlas, surface_points
+from stages.surface.triangle_mesh import MAX_RAYS, face_areas, median_edge, raycaster, vertex_normals
 from stages.texture.padding import pad_charts
 from stages.texture.tangents import to_tangent_space, vertex_tangents
 
@@ -21,12 +21,33 @@ BACK = 0.02
 MIN_COSINE = 0.1
 # An occlusion ray starts this far off the face, in median edge lengths, or the face itself would hide the sky.
 LIFT = 0.01
-# Occlusion changes slowly: one sample stands for this many texels in each direction.
-COARSENESS = 4
+# A map needs no more texels than this on an edge of the mesh that it shows, for between vertices nothing new happens.
+TEXELS_ON_EDGE = 2
+# Smaller textures are not halved for it: their charts would touch.
+LARGE = 2048
+# Occlusion changes slowly: one sample stands for this many texels in each direction at least, and at most.
+COARSENESS, COARSEST = 4, 8
 # Texels that take their occlusion from the samples at a time.
 SPREAD = 1 << 21
 FLAT = (128, 128, 255)
 Listener = Callable[[float, float], None]
+
+
+def relief_texels(atlas: AtlasMesh, texels: Texels, edge: float) -> Texels:
+    """The atlas rasterised for maps of a full mesh: at half the texture's side where that mesh has no more to show.
+
+    Args:
+        texels: the atlas rasterised for its texture.
+        edge: median length of the full mesh's edges, scene units.
+    """
+    if texels.size < LARGE or edge < 2 * TEXELS_ON_EDGE * _texel_side(atlas, texels):
+        return texels
+    return rasterize_atlas(atlas.uvs, atlas.faces, texels.size // 2)
+
+
+def _texel_side(atlas: AtlasMesh, texels: Texels) -> float:
+    """Mean side of a texel in scene units."""
+    return float(np.sqrt(face_areas(atlas.vertices, atlas.faces).sum() / max(len(texels), 1)))
 
 
 # ---------------------------------------------------------------- normals
@@ -105,7 +126,7 @@ def bake_occlusion(
 ) -> np.ndarray:
     """How open each texel is to light from all around: 255 to the whole hemisphere, 0 to none of it.
 
-    Cast for one texel in `COARSENESS` squared and carried to those between (`spread_samples`).
+    Cast for one texel in a square of about an edge of the mesh and carried to those between (`spread_samples`).
 
     Args:
         atlas: the mesh, which hides itself.
@@ -117,14 +138,16 @@ def bake_occlusion(
     Returns:
         [size, size] uint8, row 0 at v = 1.
     """
-    chosen, cell_of = _one_a_cell(texels)
+    on_edge = median_edge(atlas.vertices, atlas.faces) / _texel_side(atlas, texels)
+    side = int(np.clip(on_edge, COARSENESS, COARSEST))
+    chosen, cell_of = _one_a_cell(texels, side)
     points, normals = surface_points(atlas, texels.face_ids[chosen], texels.corner[chosen])
     openness = sky_seen(atlas.vertices, atlas.faces, points, normals, rays, reach, listener)
     grey = np.empty((len(texels), 1), dtype=np.uint8)
     for begin in range(0, len(texels), SPREAD):
         part = slice(begin, begin + SPREAD)
         there, _ = surface_points(atlas, texels.face_ids[part], texels.corner[part])
-        spread = spread_samples(openness, points, cell_of, texels.index[part], there, texels.size)
+        spread = spread_samples(openness, points, cell_of, texels.index[part], there, texels.size, side)
         grey[part, 0] = np.clip(255 * spread + 0.5, 0, 255)
     image, inside = texels.paint(np.repeat(grey, 3, axis=1))
     return pad_charts(image, inside)[0][..., 0].copy()
@@ -172,15 +195,15 @@ def sky_seen(
     return free
 
 
-def _one_a_cell(texels: Texels) -> tuple[np.ndarray, np.ndarray]:
-    """Rows [S] of the texels, the middlemost of each square of `COARSENESS` texels that has any; and the number of each
+def _one_a_cell(texels: Texels, side: int) -> tuple[np.ndarray, np.ndarray]:
+    """Rows [S] of the texels, the middlemost of each square of `side` texels that has any; and the number of each
     square's [cells, cells] int32, -1 where it has none."""
     size = texels.size
     y, x = texels.index // size, texels.index % size
-    cells = -(-size // COARSENESS)
-    cell = (y // COARSENESS) * cells + x // COARSENESS
-    middle = (COARSENESS - 1) / 2
-    off_center = (y % COARSENESS - middle) ** 2 + (x % COARSENESS - middle) ** 2
+    cells = -(-size // side)
+    cell = (y // side) * cells + x // side
+    middle = (side - 1) / 2
+    off_center = (y % side - middle) ** 2 + (x % side - middle) ** 2
     order = np.lexsort((off_center, cell))
     occupied, first = np.unique(cell[order], return_index=True)
     number = np.full(cells * cells, -1, dtype=np.int32)
@@ -189,8 +212,9 @@ def _one_a_cell(texels: Texels) -> tuple[np.ndarray, np.ndarray]:
 
 
 def spread_samples(
-    values: np.ndarray, positions: np.ndarray, cell_of: np.ndarray, texels: np.ndarray, points: np.ndarray, size: int
-) -> np.ndarray:
+    values: np.ndarray, positions: np.ndarray, cell_of: np.ndarray, texels: np.ndarray, points: np.ndarray, size: int,
+    side: int = COARSENESS,
+) -> np.ndarray:  # fmt: skip
     """Values [T] at texels from samples on a coarser grid: bilinear weights times closeness on the surface.
 
     Charts that are neighbours on the texture only are far apart in space, so nothing bleeds from one to another (joint
@@ -198,15 +222,16 @@ def spread_samples(
 
     Args:
         values, positions: [S], [S, 3] of the samples.
-        cell_of: [cells, cells] sample of each square of `COARSENESS` texels, or -1.
+        cell_of: [cells, cells] sample of each square of texels, or -1.
         texels: [T] row-major indices.
         points: [T, 3] of the texels.
         size: side of the texture.
+        side: of a square, in texels.
     """
     cells = len(cell_of)
-    y, x = (texels // size + 0.5) / COARSENESS - 0.5, (texels % size + 0.5) / COARSENESS - 0.5
+    y, x = (texels // size + 0.5) / side - 0.5, (texels % size + 0.5) / side - 0.5
     y0, x0 = np.floor(y).astype(np.int64), np.floor(x).astype(np.int64)
-    own = cell_of[(texels // size) // COARSENESS, (texels % size) // COARSENESS]
+    own = cell_of[(texels // size) // side, (texels % size) // side]
     # A square's side on the surface, from the texels' distances to the sample of their own square.
     spacing = 2 * float(np.sqrt(np.mean((points - positions[own]) ** 2) * 3)) + 1e-12
     total, weights = np.zeros(len(texels)), np.zeros(len(texels))

@@ -27,7 +27,7 @@ from stages.evaluation.reading import read_cameras, read_mesh
 from stages.evaluation.surfaces import Surface, measure_points, sample_faces
 from stages.evaluation.thinning import one_a_cube
 from stages.geometry.cameras import PinholeCameras
-from stages.geometry.similarity import align_points
+from stages.geometry.similarity import Similarity, align_points
 from stages.surface.triangle_mesh import raycaster
 
 TRUTH_MESH = "gt_mesh.ply"
@@ -83,6 +83,17 @@ class KnownObject:
     def surface(self) -> Surface:
         return Surface(self.vertices, self.faces)
 
+    def counts(self, points: np.ndarray) -> np.ndarray:
+        """Which of predicted points [P, 3] are judged, [P] bool: near the object's box, above what it stands on."""
+        low, high, margin = self.vertices.min(0), self.vertices.max(0), BOX_MARGIN * self.surface.extent
+        inside: np.ndarray = np.all((points > low - margin) & (points < high + margin), axis=1)
+        return inside & (points[:, 2] > self.ground)
+
+    @property
+    def ground(self) -> float:
+        """Height below which nothing is judged."""
+        return float(self.vertices[:, 2].min() + GROUND_MARGIN * self.surface.extent)
+
 
 def score_surface(vertices: np.ndarray, faces: np.ndarray, known: KnownObject, samples: int = SAMPLES) -> KnownScore:
     """Compare a predicted mesh (vertices [V, 3], faces [F, 3], in the truth's frame) with the known surface.
@@ -92,23 +103,18 @@ def score_surface(vertices: np.ndarray, faces: np.ndarray, known: KnownObject, s
     """
     extent = known.surface.extent
     low, high = known.vertices.min(0), known.vertices.max(0)
-    margin, ground = BOX_MARGIN * extent, low[2] + GROUND_MARGIN * extent
-
-    def crop(points: np.ndarray) -> np.ndarray:
-        inside = np.all((points > low - margin) & (points < high + margin), axis=1)
-        return points[inside & (points[:, 2] > ground)]
-
-    points = crop(sample_faces(vertices, faces, samples)[0])
+    points = sample_faces(vertices, faces, samples)[0]
+    points = points[known.counts(points)]
     if len(points) < samples // 4:
         # The object is a small part of the mesh: sample it as if it stood alone.
         in_box = np.all((vertices > low - FACE_MARGIN * extent) & (vertices < high + FACE_MARGIN * extent), 1)
         near = in_box[faces].all(1)
         if near.any():
-            points = crop(sample_faces(vertices, faces[near], samples)[0])
+            points = sample_faces(vertices, faces[near], samples)[0]
+            points = points[known.counts(points)]
     if len(points) == 0:
         raise ValueError("no surface of the mesh lies inside the known object's box: is it in the same frame?")
-    seen = seen_surface(known)
-    predicted, true = Surface(points), Surface(seen[seen[:, 2] > ground])
+    predicted, true = Surface(points), Surface(seen_surface(known))
     found = measure_points(predicted, true, predicted, known.surface, [part * extent for part in SCORE_THRESHOLDS])
     return KnownScore(
         accuracy=100 * found.accuracy.mean / extent,
@@ -122,7 +128,8 @@ def score_surface(vertices: np.ndarray, faces: np.ndarray, known: KnownObject, s
 
 
 def seen_surface(known: KnownObject) -> np.ndarray:
-    """Points [P, 3] of the known surface that at least one camera's pixel centre sees, evenly thinned."""
+    """Points [P, 3] of the known surface that are asked for: seen by at least one camera's pixel centre, above the
+    ground; evenly thinned."""
     scene = raycaster(known.vertices, known.faces)
     points = []
     for i in range(len(known.cameras)):
@@ -131,7 +138,8 @@ def seen_surface(known: KnownObject) -> np.ndarray:
         hit = np.isfinite(distance)
         chosen = rays.numpy()[hit]
         points.append(chosen[:, :3] + distance[hit][:, None] * chosen[:, 3:])
-    return one_a_cube(np.concatenate(points), SEEN_SPACING * known.surface.extent)
+    seen = one_a_cube(np.concatenate(points), SEEN_SPACING * known.surface.extent)
+    return seen[seen[:, 2] > known.ground]
 
 
 def pinhole_rays(cameras: PinholeCameras, index: int) -> Any:
@@ -181,7 +189,25 @@ def score_mesh(
     Raises:
         InputError: a file cannot be read, or nothing is left to measure.
     """
-    known, cameras = load_known_object(truth), read_cameras(model).pinhole
+    known = load_known_object(truth)
+    world_from_model = truth_from_model(known, model, truth, known_stem)
+    vertices, faces = read_mesh(mesh_path)
+    try:
+        score = score_surface(world_from_model.apply(vertices), faces, known)
+    except ValueError as error:
+        raise InputError(f"{mesh_path} cannot be scored: {error}.", f"Look at it, and at {truth}.") from error
+    return score.as_dict()
+
+
+def truth_from_model(
+    known: KnownObject, model: Path, truth: Path, known_stem: Callable[[str], str] = file_stem
+) -> Similarity:
+    """The similarity by which the camera centres of a COLMAP model meet the known ones; see `score_mesh`.
+
+    Raises:
+        InputError: the model cannot be read, or fewer than three of its cameras are known.
+    """
+    cameras = read_cameras(model).pinhole
     true_centers = dict(zip(map(file_stem, known.cameras.names), known.cameras.centers, strict=True))
     centers = dict(zip(cameras.names, cameras.centers, strict=True))
     shared = [name for name in sorted(centers) if known_stem(name) in true_centers]
@@ -190,12 +216,6 @@ def score_mesh(
             f"Only {len(shared)} of {len(centers)} cameras of {model} have a known pose (need 3).",
             f"Check that {truth} belongs to these photos.",
         )
-    world_from_model = align_points(
+    return align_points(
         np.array([centers[name] for name in shared]), np.array([true_centers[known_stem(name)] for name in shared])
     )
-    vertices, faces = read_mesh(mesh_path)
-    try:
-        score = score_surface(world_from_model.apply(vertices), faces, known)
-    except ValueError as error:
-        raise InputError(f"{mesh_path} cannot be scored: {error}.", f"Look at it, and at {truth}.") from error
-    return score.as_dict()

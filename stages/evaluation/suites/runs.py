@@ -40,7 +40,8 @@ log = logging.getLogger(__name__)
 
 # Raised whenever the same results would get other scores: what was scored before is scored anew.
 SCORING = 1
-POSED = ("ingest", "sfm", "place", "undistort")  # stages that no seed changes
+POSED = ("ingest", "sfm", "place", "undistort")  # what peers are given, too
+SHARED = (*POSED, "densify")  # stages that no seed changes
 OURS = "hineus"
 
 
@@ -146,13 +147,13 @@ def _ask(request: BenchRequest, scene: SuiteScene, place: Path, seed: int) -> Re
 
 
 def _share_poses(first: Path, place: Path) -> None:
-    """Start another seed from the poses of the first: only the training is to differ."""
+    """Start another seed from the poses and dense points of the first: only the training is to differ."""
     if place.exists() or not is_workspace(first):
         return
     partial = place.with_name(f"{place.name}.partial")
     with storage_errors(place, "copying the poses"):
         shutil.rmtree(partial, ignore_errors=True)
-        for name in POSED:
+        for name in SHARED:
             if (first / name).is_dir():
                 shutil.copytree(first / name, partial / name)
         for name in (WORKSPACE_RECORD, "config.yaml"):

@@ -1,0 +1,78 @@
+"""Depth maps to one point cloud."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from stages.geometry.point_cloud import PointCloud
+from stages.stereo.rectification import View
+from stages.stereo.trust import normals_at, places
+
+if TYPE_CHECKING:
+    from jaxtyping import Float, Float32, Int, UInt8, UInt64
+
+# No more depths than this become points, evenly chosen of all: memory.
+MAX_DEPTHS = 4_000_000
+# Bits of a cell's place along an axis; with those of its size they fill 64. A cell is about a pixel wide, so that
+# places which share their last 19 bits are hundreds of photos apart.
+_BITS = 19
+
+
+def fused(
+    views: Sequence[View],
+    depths: Sequence[Float32[np.ndarray, "h w"]],
+    trusts: Sequence[Float32[np.ndarray, "h w"]],
+    colors: Sequence[UInt8[np.ndarray, "h w 3"]],
+) -> PointCloud:
+    """The depths with some trust as points: means, weighed by trust, of those that lie in one cell about a pixel wide.
+
+    Cells double where pixels do, so that a close-up keeps its detail beside a photo from afar.
+    """
+    total = sum(int((trust > 0).sum()) for trust in trusts)
+    if not total:
+        return PointCloud.empty()
+    stride = max(1, int(np.ceil(np.sqrt(total / MAX_DEPTHS))))
+    rows, photos, cells = [], [], []
+    for k, (view, depth, trust) in enumerate(zip(views, depths, trusts, strict=True)):
+        v, u = (stride * each for each in np.nonzero(trust[::stride, ::stride] > 0))
+        at, weights = places(view, depth, v, u), trust[v, u][:, None]
+        row = np.empty((len(v), 10), np.float32)
+        row[:, :3], row[:, 3:6], row[:, 6:9], row[:, 9] = at, normals_at(view, depth, v, u), colors[k][v, u], 1
+        rows.append(row * weights)
+        photos.append(np.full(len(v), k, np.int32))
+        cells.append(_cells(at, depth[v, u] * stride / view.focal))
+    return _means(np.concatenate(rows), np.concatenate(photos), np.concatenate(cells))
+
+
+def _cells(points: Float[np.ndarray, "n 3"], widths: Float[np.ndarray, " n"]) -> UInt64[np.ndarray, " n"]:
+    """A number for the cell of each point: of its size as a power of two, and where it is on a grid of that size."""
+    octave = np.round(np.log2(widths)).astype(np.int64)
+    key = octave.astype(np.uint64)
+    for column in np.floor(points / 2.0 ** octave[:, None]).astype(np.int64).T:
+        key = key << np.uint64(_BITS) | column.astype(np.uint64) & np.uint64(2**_BITS - 1)
+    return key
+
+
+def _means(
+    rows: Float32[np.ndarray, "n 10"], photos: Int[np.ndarray, " n"], key: UInt64[np.ndarray, " n"]
+) -> PointCloud:
+    """One point for each cell; rows are place, normal, colour and 1, times trust."""
+    order = np.lexsort((photos, key))
+    key, photos = key[order], photos[order]
+    first = np.flatnonzero(np.concatenate([[True], key[1:] != key[:-1]]))
+    sums = np.add.reduceat(rows[order], first, axis=0)
+    seen_first = np.concatenate([[True], (key[1:] != key[:-1]) | (photos[1:] != photos[:-1])])
+    starts = np.concatenate([np.cumsum(seen_first)[first] - 1, [seen_first.sum()]])
+    trust = sums[:, 9] / np.diff(np.append(first, len(key)))
+    normals = sums[:, 3:6] / np.maximum(np.linalg.norm(sums[:, 3:6], axis=1, keepdims=True), 1e-12)
+    return PointCloud(
+        points=sums[:, :3] / sums[:, 9:],
+        normals=normals,
+        colors=np.round(sums[:, 6:9] / sums[:, 9:]).astype(np.uint8),
+        trust=trust.astype(np.float32),
+        starts=starts.astype(np.int64),
+        photos=photos[seen_first],
+    )

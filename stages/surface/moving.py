@@ -1,0 +1,104 @@
+"""What moves vertices shares: who is beside whom, smooth directions, and that no face folds."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from stages.compiling import njit
+from stages.surface.triangle_mesh import face_normals, vertex_normals
+
+if TYPE_CHECKING:
+    from jaxtyping import Float, Int
+
+# Directions are means over this many rings: neighbours move side by side, and hardly a face folds.
+DIRECTION_RINGS = 3
+# Where faces would fold, the vertices around them slide apart this many times; then the move is halved so often.
+SLIDES = 6
+HALVINGS = 12
+
+
+@dataclass(frozen=True)
+class Rings:
+    """The neighbours of vertex v: `others[starts[v] : starts[v + 1]]`."""
+
+    starts: Int[np.ndarray, " v+1"]
+    others: Int[np.ndarray, " e"]
+
+    def mean(self, values: Float[np.ndarray, "v c"], times: int = 1) -> Float[np.ndarray, "v c"]:
+        """Each vertex averaged with its neighbours, so many times over."""
+        for _ in range(times):
+            values = _ring_means(self.starts, self.others, values)
+        return values
+
+
+def rings_of(faces: Int[np.ndarray, "f 3"], num_vertices: int) -> Rings:
+    """The neighbours of each vertex."""
+    from scipy.sparse import coo_matrix
+
+    first, second = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
+    rows, columns = np.concatenate([first, second]), np.concatenate([second, first])
+    graph = coo_matrix((np.ones(len(rows), dtype=np.int8), (rows, columns)), shape=(num_vertices, num_vertices)).tocsr()
+    return Rings(graph.indptr, graph.indices)
+
+
+def directions_of(
+    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], rings: Rings
+) -> Float[np.ndarray, "v 3"]:
+    """Unit normals, averaged over the surroundings."""
+    return unit(rings.mean(vertex_normals(vertices, faces), DIRECTION_RINGS))
+
+
+def unit(vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    """The vectors at length 1; zero stays zero."""
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), np.finfo(np.float32).tiny)
+
+
+def without_folds(
+    vertices: Float[np.ndarray, "v 3"],
+    faces: Int[np.ndarray, "f 3"],
+    directions: Float[np.ndarray, "v 3"],
+    moved: Float[np.ndarray, "v 3"],
+    rings: Rings,
+) -> tuple[Float[np.ndarray, "v 3"], int]:
+    """The moved vertices so that no face turns over that did not before; and how many would have.
+
+    A face is turned over where its normal points against the directions at its corners. Corners of slivers slide
+    apart, within the surface; what still folds then goes back towards where it came from.
+    """
+    towards = directions[faces].sum(1)
+
+    def folded(places: np.ndarray) -> np.ndarray:
+        return np.einsum("fc,fc->f", face_normals(places, faces), towards) <= 0
+
+    before, would = folded(vertices), 0
+    moved = moved.copy()
+    for attempt in range(SLIDES + HALVINGS):
+        new = folded(moved) & ~before
+        would = would or int(np.count_nonzero(new))
+        if not new.any():
+            break
+        touched = np.zeros((len(vertices), 1))
+        touched[faces[new]] = 1
+        rows = np.flatnonzero(rings.mean(touched)[:, 0])
+        if attempt < SLIDES:
+            slide = (rings.mean(moved) - moved)[rows]
+            moved[rows] += slide - np.einsum("nc,nc->n", slide, directions[rows])[:, None] * directions[rows]
+        else:
+            part = 0.5 if attempt < SLIDES + HALVINGS - 1 else 0.0
+            moved[rows] = vertices[rows] + part * (moved[rows] - vertices[rows])
+    return moved, would
+
+
+@njit(cache=True, nogil=True)
+def _ring_means(starts: np.ndarray, others: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """See `Rings.mean`."""
+    means = values.astype(np.float64)
+    for v in range(len(starts) - 1):
+        for c in range(values.shape[1]):
+            for k in range(starts[v], starts[v + 1]):
+                means[v, c] += values[others[k], c]
+            means[v, c] /= 1 + starts[v + 1] - starts[v]
+    return means

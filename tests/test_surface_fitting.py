@@ -1,0 +1,201 @@
+"""Meshes moved to dense points, and rid of noise."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from stages.geometry.point_cloud import PointCloud
+from stages.surface import fitting
+from stages.surface.denoising import denoised
+from stages.surface.fitting import fit_to_points
+from stages.surface.isosurface import extract_isosurface
+from stages.surface.moving import directions_of, rings_of, without_folds
+from stages.surface.triangle_mesh import face_normals
+
+RESOLUTION = 40
+CELL = 2 / RESOLUTION
+RADIUS = 0.6
+
+
+@pytest.fixture(scope="module")
+def sphere():
+    surface = extract_isosurface(lambda p: np.linalg.norm(p, axis=1).astype(np.float32) - RADIUS, RESOLUTION)
+    return surface.vertices, surface.faces
+
+
+def cloud_of(points, normals, photos=12, trust=1.0):
+    """A cloud whose points are each seen by so many photos."""
+    count = len(points)
+    return PointCloud(
+        points.astype(np.float32),
+        normals.astype(np.float32),
+        np.zeros((count, 3), np.uint8),
+        np.full(count, trust, np.float32),
+        np.arange(count + 1) * photos,
+        np.tile(np.arange(photos, dtype=np.int32), count),
+    )
+
+
+def round_cloud(radius, noise=0.0, count=20_000, **kwargs):
+    """Points about a sphere."""
+    rng = np.random.default_rng(0)
+    normals = rng.normal(size=(count, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    return cloud_of(normals * (radius + noise * rng.normal(size=(count, 1))), normals, **kwargs)
+
+
+def radii(vertices):
+    return np.linalg.norm(vertices, axis=1)
+
+
+def folds(vertices, moved, faces):
+    """Faces that turned over."""
+    return np.einsum("fc,fc->f", face_normals(vertices, faces), face_normals(moved, faces)) <= 0
+
+
+@pytest.mark.parametrize("off", [-1.5, 0.4, 2.0])
+def test_the_mesh_goes_to_the_mean_of_noisy_points(sphere, off):
+    fit = fit_to_points(*sphere, round_cloud(RADIUS + off * CELL, noise=0.3 * CELL), CELL)
+    away = radii(fit.vertices) - (RADIUS + off * CELL)
+    assert np.abs(away).mean() < 0.06 * CELL
+    assert fit.vertices.dtype == np.float32
+    assert fit.used > 15_000
+
+
+def test_points_that_disagree_with_their_surroundings_have_no_say(sphere):
+    good = round_cloud(RADIUS + 0.5 * CELL, noise=0.1 * CELL)
+    wild = np.arange(len(good)) % 6 == 0
+    points = np.where(wild[:, None], good.points + 4 * CELL * good.normals, good.points)
+    fit = fit_to_points(*sphere, replace(good, points=points.astype(np.float32)), CELL)
+    assert np.abs(radii(fit.vertices) - RADIUS - 0.5 * CELL).mean() < 0.12 * CELL
+
+
+@pytest.mark.parametrize(
+    "cloud",
+    [
+        PointCloud.empty(),
+        round_cloud(RADIUS + CELL, trust=0.0),
+        round_cloud(RADIUS + 9 * CELL),
+        replace(round_cloud(RADIUS + CELL), normals=-round_cloud(RADIUS + CELL).normals),
+    ],
+    ids=["empty", "distrusted", "far", "turned away"],
+)
+def test_what_is_no_evidence_moves_nothing(sphere, cloud):
+    fit = fit_to_points(*sphere, cloud, CELL)
+    np.testing.assert_array_equal(fit.vertices, sphere[0])
+    assert fit.used == fit.folds == 0
+
+
+def test_few_points_and_points_of_one_photo_move_little(sphere):
+    few = fit_to_points(*sphere, round_cloud(RADIUS + CELL, count=30), CELL)
+    one = fit_to_points(*sphere, round_cloud(RADIUS + CELL, noise=0.5 * CELL, photos=1), CELL)
+    many = fit_to_points(*sphere, round_cloud(RADIUS + CELL, noise=0.5 * CELL), CELL)
+    moved = [np.abs(radii(fit.vertices) - RADIUS).mean() / CELL for fit in (few, one, many)]
+    assert moved[0] < 0.25
+    assert moved[1] < 0.25
+    assert moved[2] > 0.9
+
+
+def test_where_points_end_the_move_fades(sphere):
+    vertices, faces = sphere
+    cloud = round_cloud(RADIUS + CELL)
+    fit = fit_to_points(vertices, faces, cloud.chosen(cloud.points[:, 2] > 0), CELL)
+    moved = (radii(fit.vertices) - RADIUS) / CELL
+    assert moved[vertices[:, 2] > 2 * CELL].min() > 0.8
+    assert np.abs(moved[vertices[:, 2] < -9 * CELL]).max() < 0.02
+    edges = np.stack([moved[faces], moved[np.roll(faces, 1, axis=1)]])
+    assert np.abs(edges[0] - edges[1]).max() < 0.35
+
+
+def test_the_sides_of_a_wall_never_meet():
+    half = np.array([0.5, 0.5, 0.06])
+    box = extract_isosurface(lambda p: (np.abs(p) - half).max(1).astype(np.float32), RESOLUTION)
+    vertices, faces = box.vertices, box.faces
+    rng = np.random.default_rng(1)
+    side = np.where(np.arange(30_000) % 2, 1.0, -1.0)
+    points = np.stack([*rng.uniform(-0.45, 0.45, (2, 30_000)), 0.004 * side], axis=1)
+    normals = np.stack([0 * side, 0 * side, side], axis=1)
+    fit = fit_to_points(vertices, faces, cloud_of(points, normals), CELL)
+    flat = np.abs(vertices[:, :2]).max(1) < 0.4
+    top, bottom = (fit.vertices[flat & (sign * vertices[:, 2] > 0), 2] for sign in (1, -1))
+    assert top.min() > bottom.max()
+    assert np.abs(top).mean() < 0.02  # held at 0.4 of the way, 0.012
+    assert not folds(vertices, fit.vertices, faces).any()
+
+
+def test_displacements_are_the_minimum_that_is_written_down(sphere):
+    vertices, faces = sphere
+    rings = rings_of(faces, len(vertices))
+    rng = np.random.default_rng(2)
+    pull, moves = rng.uniform(0, 2, len(vertices)), np.zeros(len(vertices))
+    aim = pull * rng.normal(size=len(vertices))
+    fitting._relax(moves, pull, aim, rings.starts, rings.others, 0.3, 0.01, 400)
+    matrix = np.diag(pull + 0.01)
+    for v in range(len(vertices)):
+        for other in rings.others[rings.starts[v] : rings.starts[v + 1]]:
+            matrix[v, v] += 0.3
+            matrix[v, other] -= 0.3
+    np.testing.assert_allclose(moves, np.linalg.solve(matrix, aim), atol=1e-6)
+
+
+@pytest.mark.parametrize("size", [0.3, 1.0, 3.0])
+def test_no_face_folds_however_vertices_are_moved(sphere, size):
+    vertices, faces = sphere
+    rings = rings_of(faces, len(vertices))
+    directions = directions_of(vertices, faces, rings)
+    wild = vertices + size * CELL * np.random.default_rng(3).normal(size=vertices.shape)
+    assert folds(vertices, wild, faces).any()
+    moved, would = without_folds(vertices, faces, directions, wild, rings)
+    assert would > 0
+    towards = directions[faces].sum(1)
+    assert (np.einsum("fc,fc->f", face_normals(moved, faces), towards) > 0).all()
+
+
+def test_what_does_not_fold_is_not_held_back(sphere):
+    vertices, faces = sphere
+    rings = rings_of(faces, len(vertices))
+    moved, would = without_folds(vertices, faces, directions_of(vertices, faces, rings), 1.02 * vertices, rings)
+    np.testing.assert_array_equal(moved, 1.02 * vertices)
+    assert would == 0
+
+
+def test_ring_means_by_an_obvious_loop(sphere):
+    vertices, faces = sphere
+    rings = rings_of(faces, len(vertices))
+    means = rings.mean(vertices)
+    for v in (0, 17, len(vertices) - 1):
+        around = {v, *faces[(faces == v).any(1)].ravel().tolist()}
+        np.testing.assert_allclose(means[v], vertices[sorted(around)].mean(0), rtol=1e-6)
+
+
+def test_a_noisy_box_comes_out_flat_with_its_edges():
+    box = extract_isosurface(lambda p: (np.abs(p) - 0.5).max(1).astype(np.float32), RESOLUTION)
+    rng = np.random.default_rng(4)
+    noisy = (box.vertices + 0.08 * CELL * rng.normal(size=box.vertices.shape)).astype(np.float32)
+    smooth = denoised(noisy, box.faces, 5)
+
+    def off(vertices):
+        """How far vertices of the faces' middles are from their planes; and the box's volume near its edges."""
+        middle = np.sort(np.abs(box.vertices), axis=1)[:, 1] < 0.4
+        return np.abs(np.abs(vertices[middle]).max(1) - 0.5).mean()
+
+    assert off(smooth) < 0.6 * off(noisy)
+    # The noise-free mesh, as sharp as its cells let it be, hardly moves.
+    still = denoised(box.vertices, box.faces, 5)
+    assert np.linalg.norm(still - box.vertices, axis=1).max() < 0.25 * CELL
+
+
+def test_a_round_thing_stays_as_large(sphere):
+    vertices, faces = sphere
+    assert np.abs(radii(denoised(vertices, faces, 5)) - RADIUS).max() < 0.06 * CELL
+
+
+def test_no_rounds_change_nothing_and_bad_values_are_refused(sphere):
+    np.testing.assert_array_equal(denoised(*sphere, 0), sphere[0])
+    with pytest.raises(ValueError, match="rounds >= 0, got -1"):
+        denoised(*sphere, -1)
+    with pytest.raises(ValueError, match="positive cell, got 0"):
+        fit_to_points(*sphere, PointCloud.empty(), 0)
