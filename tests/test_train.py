@@ -73,17 +73,6 @@ def test_sightings_end_at_their_points_and_are_free_before(kind):
     assert torch.allclose((drawn.places[200:400] - drawn.places[:200]).norm(dim=1), torch.tensor(0.01), atol=1e-6)
 
 
-def test_dense_sightings_carry_the_points_trust():
-    cloud = sphere_cloud(ring_of_cameras())
-    trust = np.where(cloud.points[:, 2] > 0, cloud.trust, 0).astype(np.float32)
-    trusted = Sightings.from_cloud(replace(cloud, trust=trust), ring_of_cameras().centers, "cpu")
-    assert 0 < len(trusted) < len(cloud.photos)
-    drawn = trusted.draw(100, 0.01, torch.Generator().manual_seed(0))
-    points = drawn.places[:100]
-    assert (points[:, 2] > 0).all()  # what has no trust says nothing
-    torch.testing.assert_close(drawn.weights, torch.where(points[:, 0] < 0, 0.5, 1.0))
-
-
 def test_photos_left_out_have_no_sightings():
     cameras = ring_of_cameras()
     training = np.arange(8) != 3

@@ -11,7 +11,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
@@ -41,8 +40,10 @@ Visitor = Callable[[int, View, np.ndarray], None]
 
 # Texels that take part in comparing photos.
 SAMPLES = 20_000
-# Texels blended at a time: the buffers take 16 bytes a texel and kept view. More texels go over the photos again.
+# Texels blended at a time: the buffers take 16 bytes a texel and kept view. Each band goes over the photos again, so
+# bands are small only where all photos stay in memory.
 BAND_BYTES = 1 << 30
+SMALL_BAND_BYTES = 1 << 28
 # Prepared photos that stay in memory for the next pass; the others are made again.
 KEPT_BYTES = 1 << 30
 # Texels handed to a thread at a time.
@@ -118,13 +119,13 @@ def bake_texture(
     colors = np.zeros((num_texels, 3), dtype=np.uint8)
     seen_by = np.zeros(num_texels, dtype=np.uint16)
     views = min(views, num_views)
-    per_band = max(BAND_BYTES // (16 * (views + 1)), _CHUNK)
-    bands = [slice(start, min(start + per_band, num_texels)) for start in range(0, num_texels, per_band)]
-    total, done = num_views * (1 + len(bands)) + 1, itertools.count(1)
+    done = 0.0
 
-    def tell(note: str) -> None:
+    def tell(note: str, photos: float = 1.0) -> None:
+        nonlocal done
+        done += photos
         if listener is not None:
-            listener(next(done), total, note)
+            listener(done, 2 * num_views + 1, note)
 
     with ThreadPoolExecutor(max_workers=max(1, workers)) as pool:
         texel_side = float(np.sqrt(face_areas(atlas.vertices, atlas.faces).sum() / num_texels))  # mean, scene units
@@ -132,6 +133,7 @@ def bake_texture(
         gains, sharpness = _compare(atlas, texels, _prefetch(pool, prepare, num_views, workers), num_views, tell)
         if not gain:
             gains = np.ones((num_views, 3))
+        bands = _bands(num_texels, views, SMALL_BAND_BYTES if len(prepare.kept) == num_views else BAND_BYTES)
         blend = partial(blend_texels, detail=detail, robust_sigma=robust_sigma, diffuse=diffuse)
         for number, band in enumerate(bands):
             prepared = _prefetch(pool, prepare, num_views, workers)
@@ -139,7 +141,7 @@ def bake_texture(
                 prepared = _visited(prepared, visit, gains)
             _blend(
                 pool, *surface_points(atlas, texels.face_ids[band], texels.corner[band]), gains, sharpness,
-                prepared, views, blend, colors[band], seen_by[band], tell,
+                prepared, views, blend, colors[band], seen_by[band], partial(tell, "blending photos", 1 / len(bands)),
             )  # fmt: skip
         prepare.kept.clear()
 
@@ -167,6 +169,12 @@ def bake_texture(
             "blurred_photos": int((sharpness < BLURRED).sum()),
         },
     )
+
+
+def _bands(num_texels: int, views: int, room: int) -> list[slice]:
+    """Texels that are blended together, within `room` bytes."""
+    length = max(room // (16 * (views + 1)), _CHUNK)
+    return [slice(start, min(start + length, num_texels)) for start in range(0, num_texels, length)]
 
 
 class _Prepare:
@@ -239,7 +247,7 @@ def _blend(
     blend: Callable[..., None],
     colors: np.ndarray,
     seen_by: np.ndarray,
-    tell: Callable[[str], None],
+    tell: Callable[[], None],
 ) -> None:
     """Fill colors [T, 3] uint8 and the number of photos that see each texel [T]."""
     count = len(points)
@@ -258,7 +266,7 @@ def _blend(
 
     for index, view in enumerate(prepared):
         list(pool.map(partial(offer, view, index), chunks))
-        tell("blending photos")
+        tell()
 
     def finish(part: slice) -> None:
         blend(best_weights[part], best_lows[part], best_highs[part], colors=colors[part])
