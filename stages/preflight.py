@@ -227,7 +227,7 @@ def _minutes(looked_at: list[float], compared: float, config: Config, workers: i
     count, train = len(looked_at), config.train
     pairs = count * (count - 1) / 2 if count <= config.sfm.exhaustive_max else 10 * count
     wall_per_cpu = 1 - PARALLEL_SHARE + PARALLEL_SHARE / workers
-    part = 1 + EXPLAINED * (train.steps_if_explained - 1) if compared else 1.0
+    part = 1 + EXPLAINED * (train.steps_if_covered - 1) if compared else 1.0
     ray_samples = part * train.steps * train.sampling.rays * train.sampling.samples
     training_s = ray_samples * TRAIN_CPU_S_PER_RAY_SAMPLE * wall_per_cpu
     if train.minutes is not None:
