@@ -547,7 +547,7 @@ def _last_numbers(metrics: Path) -> dict[str, float]:
 
 TRAIN: Stage[TrainParams] = Stage(
     name="train",
-    version=8,
+    version=9,
     settings=lambda config: config.train,
     run=run,
     reads=(FIRST_SCENE, PINHOLE_PHOTOS, POINT_CLOUD),
