@@ -149,7 +149,7 @@ def _by_patch_match(
     folder = context.scratch / "patch_match"
     shutil.rmtree(folder, ignore_errors=True)
     pictures = context.read(PINHOLE_PHOTOS)
-    for k, depth, _ in patch_match_depths(scene, pictures, folder, context.params.side, context.progress):
+    for k, depth in patch_match_depths(scene, pictures, folder, context.params.side, context.progress):
         depths[k] = depth
     shutil.rmtree(folder)
     return depths
