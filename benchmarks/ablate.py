@@ -95,6 +95,10 @@ VARIANTS: dict[str, dict[str, str]] = {
     "gradients-numerical": {"train.field.gradients": "numerical"},
     "planar-mlp": {"train.terms.planar.form": "stable", "train.terms.planar.features": "mlp"},
     "view-only": {"train.field.radiance_inputs": "view"},
+    # what a step leaves out, put back
+    "rays-even": {"train.sampling.needed_share": "0"},
+    "colors-16": {"train.schedule.deferred_from": "null"},
+    "background-16": {"train.sampling.background_samples": "16"},
     "proposal": {"train.sampling.sampler": "proposal"},
     # the paper's "integrated into" rows: each backbone without and with the terms
     **{
@@ -141,7 +145,7 @@ class Plan:
         """All that is set on top of the preset."""
         # Minutes would overrule a budget of steps, dense points would shorten it; a preview at the end is enough.
         budget = [
-            "train.minutes=null", f"train.steps={self.steps}", "train.steps_if_explained=1", "train.preview_every=1",
+            "train.minutes=null", f"train.steps={self.steps}", "train.steps_if_covered=1", "train.preview_every=1",
         ]  # fmt: skip
         return [*self.settings, *budget, f"train.seed={self.seed}", f"train.hold_out={self.holdout}"]
 

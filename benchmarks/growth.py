@@ -96,7 +96,7 @@ def measure(name: str, data: Path, set_name: str) -> Row:
     # Rows that differ in the mesh alone go on in one workspace.
     workspace = FOLDER / f"{set_name}-{count or 'all'}-x{enlarged}"
     photos, pixels = make_photos(source, count, enlarged, FOLDER / f"{workspace.name}-photos")
-    budget = [f"train.steps={STEPS}", "train.steps_if_explained=1", "train.minutes=null"]
+    budget = [f"train.steps={STEPS}", "train.steps_if_covered=1", "train.minutes=null"]
     settings = [*budget, f"extract.resolution={resolution}"]
     arguments = [word for text in settings for word in ("--set", text)]
     answer = run_hineus(

@@ -47,6 +47,7 @@ PARTS = (
     "ambiguity-paper", "visibility-paper", "visibility-mesh", "reflection-paper", "planar-paper", "eikonal-paper",
     "all-paper",
     "density-neus", "scale-learned", "gradients-numerical", "planar-mlp",
+    "rays-even", "colors-16", "background-16",
 )  # fmt: skip
 PARTS_PROGRESS = 0.5  # all parts at work
 LEARNING_STEPS = 100
@@ -207,6 +208,8 @@ def variant_trainers(names: Sequence[str], device: str = "cpu") -> dict[str, Tra
             torch.nn.init.constant_(trainer.fields.log_scale, math.log(first.moment(PARTS_PROGRESS).width))
     for trainer in trainers.values():
         trainer.cache_step = trainer.step_index
+        if trainer.needed.share:
+            trainer.needed.look(trainer.cache)
         for group in trainer.optimizer.param_groups:
             group["base_lr"] = 0.0
     return trainers

@@ -58,9 +58,6 @@ class SamplingParams(Section):
 
     rays: int = Field(512, ge=1, description="rays per step")
     samples: int = Field(16, ge=2, description="samples per ray inside the region of interest")
-    samples_end: int = Field(
-        8, ge=2, description="samples per ray once the density is sharp, fewer and fewer from 0.3 of the budget on"
-    )
     needed_share: float = Field(
         0.7, ge=0, le=1, description="part of the rays that goes where the surface is, and where colours are met worse"
     )
@@ -183,14 +180,14 @@ class TrainParams(Section):
     """Posed images to a neural signed distance field."""
 
     steps: int = Field(
-        8000, ge=1, description="optimiser steps where stereo explains nothing (ignored where `minutes` is set)"
+        8000, ge=1, description="optimiser steps where stereo covers nothing (ignored where `minutes` is set)"
     )
-    steps_if_explained: float = Field(
+    steps_if_covered: float = Field(
         0.25,
         gt=0,
         le=1,
         description="part of `steps` that is enough where trusted dense points cover all of the surface; in between by "
-        "the share that they cover",
+        "the share that they cover. 1: always `steps`",
     )
     minutes: float | None = Field(None, gt=0, description="wall-clock budget in minutes instead of steps")
     seed: int = Field(0, ge=0, description="random seed")

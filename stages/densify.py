@@ -149,7 +149,7 @@ def _by_patch_match(
     folder = context.scratch / "patch_match"
     shutil.rmtree(folder, ignore_errors=True)
     pictures = context.read(PINHOLE_PHOTOS)
-    for k, depth, _ in patch_match_depths(scene, pictures, folder, context.params.side, context.progress):
+    for k, depth in patch_match_depths(scene, pictures, folder, context.params.side, context.progress):
         depths[k] = depth
     shutil.rmtree(folder)
     return depths
@@ -192,7 +192,7 @@ def _publish(
 
 DENSIFY: Stage[HeldOutDensifyParams] = Stage(
     name="densify",
-    version=2,
+    version=3,
     settings=lambda config: HeldOutDensifyParams(**config.densify.model_dump(), hold_out=config.train.hold_out),
     run=run,
     reads=(FIRST_SCENE, PINHOLE_PHOTOS),

@@ -34,7 +34,7 @@ from stages.artifacts import (
 )
 from stages.engine.manifest import load_manifest
 from stages.engine.stage import Stage, StageContext
-from stages.errors import ConfigError, InputError, ReconstructionError
+from stages.errors import InputError, ReconstructionError
 from stages.geometry.cameras import PinholeCameras, PosedScene
 from stages.geometry.normalisation import regrown
 from stages.geometry.point_cloud import PointCloud
@@ -44,10 +44,11 @@ log = logging.getLogger(__name__)
 
 LOG_EVERY = 50  # steps between metric lines
 CHECKPOINT_EVERY = 60.0  # seconds
-MIN_TRAINING = 3  # photos
 METRIC_GRADIENTS = (0.8, 1.2)  # mean lengths of grad f within which f passes for a distance
 # Part of the budget after which the region is looked at: the shape is there, and little of the time is lost.
 LOOK_AT = 0.2
+# And part of the steps in the settings after which is settled how many there are to be, by that shape.
+SETTLED_AT = 0.05
 SETTLED = 500  # steps between looks at that
 # A training goes on from the last one where no more than this part of its photos came and went.
 MAX_CHANGED = 0.25
@@ -70,6 +71,9 @@ def run(context: StageContext[TrainParams]) -> dict[str, Any]:
 
     _use_threads(context)
     training = _Training.begun(context)
+    if training.steps is None:
+        training.advance(SETTLED_AT)
+        training.settle()
     if not training.looked:
         training.advance(LOOK_AT)
         training = training.where_nothing_is_cut()
@@ -120,7 +124,7 @@ class _Training:
     Attributes:
         region: the scene's, where it has grown. looked: no more to be asked whether it should.
         head_start: part of the budget that counts as spent, since what another training learned was there.
-        steps: the budget, where it is not minutes.
+        steps: the budget, where it is not minutes; None: not settled yet.
         spent: seconds before this process, or this scene.
         started: clock at its start.
     """
@@ -131,7 +135,7 @@ class _Training:
     region: _Region | None = None
     looked: bool = False
     head_start: float = 0.0
-    steps: int = 0
+    steps: int | None = None
     spent: float = 0.0
     started: float = field(default_factory=time.monotonic)
 
@@ -160,22 +164,22 @@ class _Training:
         from stages.neural.trained_field import load_field
 
         before = _last_scene(context, scene)
-        steps = _budget(context, scene)
         if before is None:
-            training = cls(context, scene, _make_trainer(context, scene), looked=not scene.growable, steps=steps)
+            training = cls(context, scene, _make_trainer(context, scene), looked=not scene.growable)
             _start_from_shape(training.trainer, scene.cameras)
             return training
         region = _kept_region(scene, before)
         kept = region.of(scene) if region else scene
         trainer = _make_trainer(context, kept)
         if _same_frame(kept, before) and _take_over(trainer, context, kept.contents, before.contents):
-            training = cls(context, kept, trainer, region, looked=True, head_start=KEPT_NETWORKS, steps=steps)
+            training = cls(context, kept, trainer, region, looked=True, head_start=KEPT_NETWORKS)
         else:
             trainer = _make_trainer(context, scene) if region else trainer
             earlier = load_field(_previous_field(context), context.device)
             error = trainer.start_from(_shape_within(earlier.sdf, scene.poses_from_scene, before.poses_from_scene))
             log.info("the SDF starts from the shape learned before, met to %.4f on average", error)
-            training = cls(context, scene, trainer, looked=not scene.growable, head_start=KEPT_SHAPE, steps=steps)
+            training = cls(context, scene, trainer, looked=not scene.growable, head_start=KEPT_SHAPE)
+        training.settle()
         trainer.step_index = training.first_step
         log.info(
             "training goes on from what was learned before: %.0f %% of the budget is kept", 100 * training.head_start
@@ -193,14 +197,27 @@ class _Training:
             return self
         scene = region.of(self.scene)
         shape = _shape_within(self.trainer.distances, scene.poses_from_scene, self.scene.poses_from_scene)
-        steps, self.trainer = self.trainer.step_index, None  # its photos would be in memory twice
+        progress, self.trainer = self.progress, None  # its photos would be in memory twice
         trainer = _make_trainer(self.context, scene)
         error = trainer.start_from(shape)
         log.info("the SDF starts from the shape learned so far, met to %.4f on average", error)
-        trainer.step_index = steps
-        training = _Training(self.context, scene, trainer, region, True, self.head_start, self.steps, self.seconds)
+        training = _Training(self.context, scene, trainer, region, True, self.head_start, spent=self.seconds)
+        training.settle()
+        trainer.step_index = round(progress * training.budget)
         training.save()
         return training
+
+    def settle(self) -> None:
+        """Settle the steps, fewer the more of the surface learned so far dense points cover."""
+        from stages.surface.covering import covered_share
+
+        params, scene = self.context.params, self.scene
+        covered = 0.0
+        if params.steps_if_covered < 1:
+            vertices, faces = self.trainer.coarse_surface()
+            covered = covered_share(vertices, faces, scene.cameras, scene.ground, _cloud(self.context, scene))
+        self.steps = max(1, round(params.steps * (1 + covered * (params.steps_if_covered - 1))))
+        log.info("dense points cover %.0f %% of the surface: %d steps", 100 * covered, self.steps)
 
     def save(self) -> None:
         """Write the checkpoint beside the old one, then take its place: a kill leaves one of the two whole."""
@@ -227,7 +244,12 @@ class _Training:
     @property
     def first_step(self) -> int:
         """Steps that count as taken before the first one here."""
-        return 0 if self.context.params.minutes else round(self.head_start * self.steps)
+        return 0 if self.context.params.minutes else round(self.head_start * self.budget)
+
+    @property
+    def budget(self) -> int:
+        """Steps in all: those of the settings until they are settled."""
+        return self.context.params.steps if self.steps is None else self.steps
 
     @property
     def steps_done(self) -> int:
@@ -239,7 +261,7 @@ class _Training:
         params = self.context.params
         if params.minutes:
             return self.head_start + self.seconds / (60 * params.minutes)
-        return float(self.trainer.step_index / self.steps)
+        return float(self.trainer.step_index / self.budget)
 
     def advance(self, until: float) -> None:
         """Train to this part of the budget; checkpoints, previews and metric lines on the way."""
@@ -270,7 +292,6 @@ def _make_trainer(context: StageContext[TrainParams], scene: PosedScene) -> Any:
 
     params = context.params
     held_out = left_out(len(scene.cameras), params.hold_out)
-    _check_hold_out(len(held_out), int(held_out.sum()), params.hold_out)
     images = _load_images(context.read(PINHOLE_PHOTOS), scene.cameras.names)
     photos = Photos(scene.cameras, *images, context.device, ~held_out)
     training = (~held_out).numpy()
@@ -415,19 +436,6 @@ def _load_images(
     return images, masks if masked == len(names) else None
 
 
-def _budget(context: StageContext[TrainParams], scene: PosedScene) -> int:
-    """Steps, fewer the more of the surface dense points explain."""
-    from stages.stereo.explaining import explained_share
-
-    params = context.params
-    if params.minutes:
-        return params.steps
-    explained = explained_share(_cloud(context, scene), scene.cameras.centers, scene.ground)
-    steps = max(1, round(params.steps * (1 + explained * (params.steps_if_explained - 1))))
-    log.info("dense points explain %.0f %% of the surface: %d steps", 100 * explained, steps)
-    return steps
-
-
 def _start_from_shape(trainer: Any, cameras: PinholeCameras) -> None:
     """Where training is not to start from a sphere: bring the SDF to a room, or to the visual hull of the masks."""
     from stages.geometry.hull import room_distances
@@ -460,14 +468,6 @@ def _hull(cameras: PinholeCameras, photos: Any) -> np.ndarray:
     if distances is None:
         raise InputError(f"The {len(cameras)} masks have no visual hull within the region of interest.", advice)
     return distances
-
-
-def _check_hold_out(num_photos: int, num_held_out: int, every: int) -> None:
-    """Raises ConfigError where too few photos are left to train on, or none is left out though some should be."""
-    left = num_photos - num_held_out
-    if every and (left < MIN_TRAINING or num_held_out == 0):
-        found = f"leaves {left} of {num_photos} photos to train on (needed: {MIN_TRAINING} to {num_photos - 1})"
-        raise ConfigError(f"`train.hold_out` = {every} {found}.", "Try `--hold-out 8`, or 0 for none.")
 
 
 def _write_metrics(lines: IO[str], trainer: Any, progress: float, numbers: dict[str, float]) -> None:
@@ -537,7 +537,7 @@ def _last_numbers(metrics: Path) -> dict[str, float]:
 
 TRAIN: Stage[TrainParams] = Stage(
     name="train",
-    version=7,
+    version=9,
     settings=lambda config: config.train,
     run=run,
     reads=(FIRST_SCENE, PINHOLE_PHOTOS, POINT_CLOUD),

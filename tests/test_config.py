@@ -239,8 +239,8 @@ def test_a_stage_s_old_settings_compare_equal_to_the_same_ones_of_today():
         "undistort": {"subject"},
         "extract": {"fit", "denoising"},
         "train": {
-            "steps_if_explained", "losses.dense", "losses.dense_tolerance", "losses.dense_step", "losses.dense_batch",
-            "sampling.samples_end", "sampling.needed_share", "schedule.deferred_from",
+            "steps_if_covered", "losses.dense", "losses.dense_tolerance", "losses.dense_step", "losses.dense_batch",
+            "sampling.needed_share", "schedule.deferred_from",
         },
     }  # fmt: skip
     for section in ("train", "undistort", "extract"):

@@ -18,7 +18,7 @@ from stages.request import Request
 
 COARSE = (
     "train.steps=40", "sfm.deterministic=true", "sfm.wanted=0.9", "train.sampling.rays=64", "train.field.log2_rows=10",
-    "train.field.finest=64", "train.field.levels=4", "undistort.max_side=160", "train.steps_if_explained=1",
+    "train.field.finest=64", "train.field.levels=4", "undistort.max_side=160", "train.steps_if_covered=1",
 )  # fmt: skip
 
 

@@ -1,4 +1,4 @@
-"""Dense points: fused of depth maps, moved, chosen, what they explain, and how training is held to them."""
+"""Dense points: fused of depth maps, moved, chosen, what they cover, and how training is held to them."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+import trimesh
 from stereo_scene import RADIUS, camera, cameras, draw, ring
 
 from stages.geometry.plane import Plane
 from stages.geometry.point_cloud import PointCloud
 from stages.geometry.similarity import Similarity
 from stages.neural.sightings import Sightings
-from stages.stereo import depth_kernels
 from stages.stereo.depths import views_of
-from stages.stereo.explaining import explained_share
 from stages.stereo.fusion import _cells, fused
+from stages.surface.covering import covered_share
 
 
 def cloud_of(points: np.ndarray, lists: list[list[int]], trust: np.ndarray | float = 1.0) -> PointCloud:
@@ -111,32 +111,37 @@ def test_points_moved_and_chosen():
     assert len(PointCloud.empty().moved(target)) == 0
 
 
-# ---------------------------------------------------------------- what is explained
-def test_votes_of_one_line_along_an_axis():
-    votes = np.zeros((2, 16, 16, 16), np.float32)
-    point, center = np.array([[0.3, 0.06, 0.06]]), np.array([[-5.0, 0.06, 0.06]])
-    depth_kernels.line_votes(point, np.array([0, 1]), np.array([0]), center, 3, votes)
-    expected = np.zeros((2, 16))
-    cell = 2 / 16
-    for step in range(1, 11):  # the middle of each cell's length before the point, and three behind
-        at = int(np.floor((0.3 - step * cell + 1) / cell))
-        expected[0, at] += 1
-    for step in (1, 2, 3):
-        expected[1, int(np.floor((0.3 + step * cell + 1) / cell))] += 1
-    np.testing.assert_array_equal(votes[:, :, 8, 8], expected)
-    assert votes.sum() == expected.sum()
+# ---------------------------------------------------------------- what points cover
+def ball_mesh() -> tuple[np.ndarray, np.ndarray]:
+    ball = trimesh.creation.icosphere(4, RADIUS)
+    return np.asarray(ball.vertices), np.asarray(ball.faces)
 
 
-def test_share_of_a_ball_that_points_explain():
-    cams = all_around()
-    whole = ball_cloud(cams)
-    assert explained_share(whole, cams.centers, None, 32) > 0.9
+def test_share_of_a_ball_that_points_cover():
+    cams, (vertices, faces) = all_around(), ball_mesh()
+    whole = ball_cloud(cams, 30_000)
+
+    def share(cloud: PointCloud, ground: Plane | None = None) -> float:
+        return covered_share(vertices, faces, cams, ground, cloud)
+
+    assert share(whole) == 1
+    assert share(whole.chosen(whole.points[:, 2] > 0)) == pytest.approx(0.5, abs=0.08)
+    assert share(whole.chosen(whole.points[:, 2] > RADIUS / 2)) == pytest.approx(0.25, abs=0.08)
     doubtful = replace(whole, trust=np.full(len(whole), 0.2))
-    for nothing in (PointCloud.empty(), doubtful):
-        assert explained_share(nothing, cams.centers, None, 32) == 0
-    # what the ground hides from the question is not asked for
+    for nothing in (
+        PointCloud.empty(),
+        doubtful,
+        whole.chosen(np.arange(len(whole)) % 300 == 0),
+    ):  # none, thinly spread
+        assert share(nothing) < 0.01
     ground = Plane(np.array([0.0, 0, 1]), 0.0, 0.01, 1.0)
-    assert explained_share(whole.chosen(np.abs(whole.points[:, 2]) > 0.1), cams.centers, ground, 32) > 0.9
+    assert share(whole.chosen(whole.points[:, 2] > 0), ground) == 1  # what lies under the ground is not asked for
+
+
+def test_nothing_is_covered_where_there_is_no_surface():
+    cams = all_around()
+    nothing = (np.zeros((0, 3)), np.zeros((0, 3), int))
+    assert covered_share(*nothing, cams, None, ball_cloud(cams)) == 0
 
 
 # ---------------------------------------------------------------- training
@@ -146,10 +151,8 @@ def test_sightings_of_a_cloud():
     centers = np.array([[3.0, 0, 0], [0, 3, 0], [0, 0, 3]])
     found = Sightings.from_cloud(cloud, centers, "cpu")
     assert found.points.tolist() == pytest.approx(np.array([[0.5, 0, 0], [0, 0, 0.7]]))  # no trust; outside the sphere
-    assert found.weights.tolist() == pytest.approx([0.25, 0.15])  # times 1/2, of two photos; 3/4, of four
+    assert found.weights.tolist() == pytest.approx([0.5, 0.2])
     assert found.lines.tolist() == [[0, 0], [1, 0], [2, 1], [0, 1], [1, 1], [0, 1]]
-    alone = Sightings.from_cloud(cloud_of(points[:1], [[1]]), centers, "cpu")
-    assert len(alone.lines) == 0
     held_out = Sightings.from_cloud(cloud, centers, "cpu", np.array([True, False, True]))
     assert held_out.lines.tolist() == [[0, 0], [2, 1], [0, 1], [0, 1]]
     drawn = found.draw(3, 0.01, torch.Generator().manual_seed(0))

@@ -75,15 +75,10 @@ class Sightings:
         device: torch.device | str,
         training: Bool[np.ndarray, " i"] | None = None,
     ) -> Sightings:
-        """Of a dense cloud in the scene frame.
-
-        The weight is the trust times 1 - 1 / (how many photos saw the point): what one alone saw counts for nothing.
-        """
-        seen_by = np.diff(cloud.starts)
-        weights = cloud.trust * (1 - 1 / np.maximum(seen_by, 1))
-        point = np.repeat(np.arange(len(cloud)), seen_by)
+        """Of a dense cloud in the scene frame; the trust of its points is their weight."""
+        point = np.repeat(np.arange(len(cloud)), np.diff(cloud.starts))
         observations = np.stack([cloud.photos, point], 1)
-        return _within(cloud.points, weights, centers, observations, device, training)
+        return _within(cloud.points, cloud.trust, centers, observations, device, training)
 
     def draw(self, count: int, step: float, generator: torch.Generator) -> Drawn:
         """Four places along each of S random sightings; S is at most `count`.

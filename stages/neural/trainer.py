@@ -143,7 +143,7 @@ class Trainer:
             self._scale.fill_(moment.scale)
             self._sparse_weight.fill_(sparse_weight)
             current = replace(moment, scale=self._scale)
-            kind = moment.levels, moment.samples, moment.deferred
+            kind = moment.levels, moment.deferred
             numbers = self.replay(lambda: self._update(current, self._sparse_weight), kind)
         self.step_index += 1
         return numbers
@@ -291,6 +291,8 @@ class Trainer:
         """Vertices of the surface in the sampler's grid; its faces that lie within the region, turned outwards."""
         from skimage.measure import marching_cubes
 
+        if self.cache_step < 0:
+            self._refresh_cache(self.moment(0.0))
         grid = self.cache.values[0, 0].cpu().numpy().transpose(2, 1, 0)
         if grid.min() >= 0 or grid.max() <= 0:
             return np.zeros((0, 3)), np.zeros((0, 3), dtype=int)

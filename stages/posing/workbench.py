@@ -175,14 +175,15 @@ class Workbench:
         # Masks that were drawn mean the object; guessed ones may leave out what places photos: of a clock on a wall 38
         # of 44, and 42 without.
         guessed = any(record.made_mask == "salient" for record in records)
-        # Pairs that were not likely seldom match.
+        likely = self.matcher == PREEMPTIVE  # the other pairs of three sets of photos placed no photo more
         all_pairs = self._rung_of("all pairs", self.all_pairs, lambda best: self.matcher != EXHAUSTIVE)
         helped = self._rung_of("affine features of photos left out", self.help_left_out, self.few_are_left_out)
         return [
             self._rung_of(f"{self.matcher} matching", self.first),
-            *((helped, all_pairs) if self.matcher == PREEMPTIVE else (all_pairs, helped)),
+            *((helped,) if likely else (all_pairs, helped)),
             self._rung_of("no focal priors", self.no_focal_priors, self.priors_are_doubtful),
             *((affine, inside) if guessed else (inside, affine)),
+            *((all_pairs,) if likely else ()),
             # A plain plaster part before black: 38 of 47 photos, 1 % off in the median. Affine features place none, and
             # relaxed thresholds 29, 5.6 % off.
             self._rung_of(LEARNED, self.learned_corners, lambda best: learned_available() and self._at_once == 1),

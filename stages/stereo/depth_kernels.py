@@ -196,31 +196,3 @@ def votes(
             elif found >= z - margin:
                 agree += 1
         counts[k, 0], counts[k, 1], counts[k, 2] = asked, agree, through
-
-
-@njit(nogil=True, cache=True)
-def line_votes(points, starts, photos, centers, behind, votes):  # pragma: no cover - compiled
-    """Count lines of sight in the cells of a grid over [-1, 1]^3.
-
-    Args:
-        points, starts, photos: [p, 3] and which photos see them, as of a `PointCloud`.
-        behind: cells behind a point that are solid.
-        votes: [2, g, g, g], added to: lines that pass a cell before their point, and those whose point is before it.
-    """
-    cells = votes.shape[1]
-    cell = 2.0 / cells
-    at = np.empty(3, np.int64)
-    for p in range(len(points)):
-        for k in range(starts[p], starts[p + 1]):
-            o = centers[photos[k]]
-            dx, dy, dz = points[p, 0] - o[0], points[p, 1] - o[1], points[p, 2] - o[2]
-            length = np.sqrt(dx * dx + dy * dy + dz * dz)
-            for step in range(-2 * cells, behind + 1):
-                t = (length + step * cell) / length
-                if t <= 0 or step == 0:
-                    continue
-                at[0] = int(np.floor((o[0] + t * dx + 1) / cell))
-                at[1] = int(np.floor((o[1] + t * dy + 1) / cell))
-                at[2] = int(np.floor((o[2] + t * dz + 1) / cell))
-                if at.min() >= 0 and at.max() < cells:
-                    votes[1 if step > 0 else 0, at[0], at[1], at[2]] += 1

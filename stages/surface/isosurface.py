@@ -204,7 +204,7 @@ class _BlockMesh:
 
     Attributes:
         edge_ids: [V] int64 global grid edges, sorted, and `positions` [V, 3] of their vertices.
-        triangles: [T, 3] int64 global grid edges.
+        triangles: [T, 3] int32 rows of these.
         wanted: neighbouring block -> [K] its cells through which the surface goes on, as flat indices.
         border: [L] flat indices of the cells along the block's border that were looked at.
     """
@@ -255,7 +255,7 @@ class _Grid:
     def _coarse_values(self) -> np.ndarray:
         axis = self.axis[:: self.step]
         values = np.full((len(axis),) * 3, np.nan, dtype=np.float32)
-        inside = np.argwhere(self._in_ball([axis**2] * 3))
+        inside = _where(self._in_ball([axis**2] * 3))
         values[tuple(inside.T)] = self.evaluate(inside * self.step)
         return values
 
@@ -265,7 +265,7 @@ class _Grid:
         maybe = self._may_cross(self.coarse, self.step, [axis] * 3)
         per = self.block // self.step
         blocks = maybe.reshape(self.blocks, per, self.blocks, per, self.blocks, per).any((1, 3, 5))
-        return [(int(i), int(j), int(k)) for i, j, k in np.argwhere(blocks)]
+        return [(int(i), int(j), int(k)) for i, j, k in _where(np.asarray(blocks))]
 
     def _may_cross(self, values: np.ndarray, step: int, axes: list[np.ndarray]) -> np.ndarray:
         """Cells of a lattice of this step that the surface may cross. NaN stands for corners outside the ball."""
@@ -317,7 +317,7 @@ class _Grid:
         for corner in _corner_views(needed):
             corner |= active
         needed &= np.isnan(view) & ball[::step, ::step, ::step]
-        index = np.argwhere(needed)
+        index = _where(needed)
         if len(index):
             view[tuple(index.T)] = self.evaluate(index * step + origin)
 
@@ -333,7 +333,7 @@ class _Grid:
         """Activate, in place, cells the surface enters from active ones; return those of other blocks."""
         tables = cube_tables()
         wanted: dict[tuple[int, int, int], list[np.ndarray]] = {}
-        cells = np.argwhere(active)
+        cells = _where(active)
         while len(cells):
             pattern = _patterns(values, cells)
             new = []
@@ -401,7 +401,7 @@ class _Grid:
         wanted: dict[tuple[int, int, int], np.ndarray],
     ) -> _BlockMesh:
         tables = cube_tables()
-        cells = np.argwhere(active)
+        cells = _where(active)
         pattern = _patterns(values, cells)
         crossed = tables.counts[pattern] > 0
         cells, pattern = cells[crossed], pattern[crossed]
@@ -413,7 +413,9 @@ class _Grid:
             return ((start[:, 0] * size + start[:, 1]) * size + start[:, 2]) * 3 + edge // 4
 
         cell_of, edge = np.nonzero(tables.edges[pattern])
-        ids, first = np.unique(edge_id(cells[cell_of], edge), return_index=True)
+        ids, first, vertex = np.unique(edge_id(cells[cell_of], edge), return_index=True, return_inverse=True)
+        vertex_of = np.zeros((len(cells), len(EDGES)), dtype=np.int32)
+        vertex_of[cell_of, edge] = vertex
         cell_of, edge = cell_of[first], edge[first]
         start = cells[cell_of] + CORNERS[EDGE_STARTS[edge]]
         end = start.copy()
@@ -427,7 +429,7 @@ class _Grid:
         turn = np.arange(len(owner)) - np.repeat(np.cumsum(tables.counts[pattern]), tables.counts[pattern])
         turn += tables.counts[pattern][owner]
         corner_edges = tables.triangles[pattern[owner], turn]
-        triangles = np.stack([edge_id(cells[owner], corner_edges[:, i]) for i in range(3)], axis=1)
+        triangles = vertex_of[owner[:, None], corner_edges]
         active[1:-1, 1:-1, 1:-1] = False  # only the border matters to the neighbours
         return _BlockMesh(ids, positions, triangles, wanted, np.flatnonzero(active))
 
@@ -438,11 +440,17 @@ def _corner_views(lattice: np.ndarray) -> list[np.ndarray]:
     return [lattice[tuple(map(slice, corner, corner + cells))] for corner in CORNERS]
 
 
+def _where(mask: np.ndarray) -> np.ndarray:
+    """`np.argwhere`, which is several times slower on a cube of flags with few of them set."""
+    return np.stack(np.unravel_index(np.flatnonzero(mask), mask.shape), axis=1)
+
+
 def _patterns(values: np.ndarray, cells: np.ndarray) -> np.ndarray:
-    """Sign patterns [K] of cells [K, 3]."""
+    """Sign patterns [K] of cells [K, 3] of a lattice [n, n, n]."""
+    inside, first = values.ravel() < 0, np.ravel_multi_index(tuple(cells.T), values.shape)
     pattern = np.zeros(len(cells), dtype=np.int64)
-    for bit, corner in enumerate(_corner_views(values)):
-        pattern |= (corner[tuple(cells.T)] < 0).astype(np.int64) << bit
+    for bit, corner in enumerate(np.ravel_multi_index(tuple(CORNERS.T), values.shape)):
+        pattern |= inside[first + corner].astype(np.int64) << bit
     return pattern
 
 
@@ -454,8 +462,9 @@ def _weld(parts: list[_BlockMesh], evaluated: int) -> Isosurface:
     """One mesh from the blocks' meshes: vertices on the same grid edge become one."""
     if not parts:
         return Isosurface(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32), evaluated)
-    ids, first = np.unique(np.concatenate([p.edge_ids for p in parts]), return_index=True)
+    ids = np.concatenate([p.edge_ids for p in parts])
+    _, first, vertex = np.unique(ids, return_index=True, return_inverse=True)
     positions = np.concatenate([p.positions for p in parts])[first]
-    triangles = np.concatenate([p.triangles for p in parts])
-    faces = np.searchsorted(ids, triangles)
+    starts = np.cumsum([0, *(len(p.edge_ids) for p in parts)])
+    faces = np.concatenate([vertex[start + p.triangles] for start, p in zip(starts, parts, strict=False)])
     return Isosurface(positions.astype(np.float32), faces.astype(np.int32), evaluated)

@@ -28,7 +28,7 @@ _ONE = np.uintp(1)
 def _project(points, normals, matrix, center, u, v, depth, cos):  # pragma: no cover - compiled
     """Fill pixel, depth and cosine to the normal, [_BLOCK] each, of as many points or fewer.
 
-    Apart from `_weight`, into arrays of their own and without a branch, so that it runs on vectors.
+    Apart from `view_weight`, into arrays of their own and without a branch, so that it runs on vectors.
     """
     for k in range(points.shape[0]):
         px, py, pz = points[k, 0], points[k, 1], points[k, 2]
@@ -44,7 +44,7 @@ def _project(points, normals, matrix, center, u, v, depth, cos):  # pragma: no c
 
 
 @njit(nogil=True, cache=True)
-def _weight(u, v, z, cos, focal, inverse_depth, confidence):  # pragma: no cover - compiled
+def view_weight(u, v, z, cos, focal, inverse_depth, confidence):  # pragma: no cover - compiled
     """Weight with which a photo sees a point at depth z on pixel (u, v); 0: it does not.
 
     weight = confidence · (focal cos θ / depth)² cos θ: pixels on a unit of surface, times a further fall-off
@@ -92,7 +92,7 @@ def sample_points(
             block = slice(i, i + _BLOCK)
             _project(points[block], normals[block], matrix, center, us, vs, depths, cosines)
         u, v = us[k], vs[k]
-        weights[i] = _weight(u, v, depths[k], cosines[k], focal, inverse_depth, confidence)
+        weights[i] = view_weight(u, v, depths[k], cosines[k], focal, inverse_depth, confidence)
         if weights[i] > 0:
             colors[i, 0], colors[i, 1], colors[i, 2] = _bilinear(image, u, v)
 
@@ -124,7 +124,7 @@ def gather_texels(
             block = slice(i, i + _BLOCK)
             _project(points[block], normals[block], matrix, center, us, vs, depths, cosines)
         u, v = us[k], vs[k]
-        weight = sharpness * _weight(u, v, depths[k], cosines[k], focal, inverse_depth, confidence)
+        weight = sharpness * view_weight(u, v, depths[k], cosines[k], focal, inverse_depth, confidence)
         if weight <= 0:
             continue
         slot = seen_by[i]
