@@ -7,16 +7,18 @@ from dataclasses import replace
 from pathlib import Path
 
 import cv2
+import numba
 import numpy as np
 import pytest
 from stereo_scene import POSES_FROM_SCENE, RADIUS, Drawn, around, camera, cameras, draw, plain, ring
 
 from configs.params import Config
 from stages import artifacts
-from stages.densify import DENSIFY
+from stages.densify import DENSIFY, _explained
 from stages.engine.stage import StageContext
 from stages.errors import ConfigError
 from stages.geometry.point_cloud import PointCloud
+from stages.stereo import fusion
 
 
 def densify(
@@ -87,6 +89,30 @@ def test_workers_change_no_byte(sound, drawn):
     densify(drawn, root, workers=2, name="two")
     for path in (root / "out").rglob("*.*"):
         assert path.read_bytes() == (root / "two" / path.relative_to(root / "out")).read_bytes(), path
+
+
+def test_threads_are_as_many_as_workers_until_the_points_are_made(drawn, tmp_path, monkeypatch):
+    before, seen = (cv2.getNumThreads(), numba.get_num_threads()), []
+
+    def fused(*args):
+        seen.append((cv2.getNumThreads(), numba.get_num_threads()))
+        return original(*args)
+
+    original = fusion.fused
+    monkeypatch.setattr(fusion, "fused", fused)
+    densify(drawn, tmp_path, workers=1)
+    assert seen == [(1, 1)]
+    assert (cv2.getNumThreads(), numba.get_num_threads()) == before
+
+
+def test_what_is_explained_is_a_share_of_the_mask():
+    trust = np.zeros((4, 6), np.float32)
+    trust[:2, :3], trust[2, 0] = 0.5, 0.49
+    within = np.zeros((4, 6), bool)
+    within[:2] = True
+    assert _explained(trust, None) == 0.25
+    assert _explained(trust, within) == 0.5
+    assert _explained(0 * trust, np.zeros((4, 6), bool)) == 0
 
 
 def test_off(drawn, tmp_path):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -25,22 +25,23 @@ def fused(
     views: Sequence[View],
     depths: Sequence[Float32[np.ndarray, "h w"]],
     trusts: Sequence[Float32[np.ndarray, "h w"]],
-    colors: Sequence[UInt8[np.ndarray, "h w 3"]],
+    colors: Iterable[UInt8[np.ndarray, "h w 3"]],
 ) -> PointCloud:
     """The depths with some trust as points: means, weighed by trust, of those that lie in one cell about a pixel wide.
 
-    Cells double where pixels do, so that a close-up keeps its detail beside a photo from afar.
+    Cells double where pixels do, so that a close-up keeps its detail beside a photo from afar. Colours are taken one
+    photo at a time, so that they need not all be held.
     """
     total = sum(int((trust > 0).sum()) for trust in trusts)
     if not total:
         return PointCloud.empty()
     stride = max(1, int(np.ceil(np.sqrt(total / MAX_DEPTHS))))
     rows, photos, cells = [], [], []
-    for k, (view, depth, trust) in enumerate(zip(views, depths, trusts, strict=True)):
+    for k, (view, depth, trust, color) in enumerate(zip(views, depths, trusts, colors, strict=True)):
         v, u = (stride * each for each in np.nonzero(trust[::stride, ::stride] > 0))
         at, weights = places(view, depth, v, u), trust[v, u][:, None]
         row = np.empty((len(v), 10), np.float32)
-        row[:, :3], row[:, 3:6], row[:, 6:9], row[:, 9] = at, normals_at(view, depth, v, u), colors[k][v, u], 1
+        row[:, :3], row[:, 3:6], row[:, 6:9], row[:, 9] = at, normals_at(view, depth, v, u), color[v, u], 1
         rows.append(row * weights)
         photos.append(np.full(len(v), k, np.int32))
         cells.append(_cells(at, depth[v, u] * stride / view.focal))
