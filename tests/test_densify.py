@@ -185,9 +185,13 @@ def test_a_patch_that_moves_between_photos_leaves_nothing(drawn, tmp_path, sound
     assert wrong(cloud) < 0.07
 
 
-def test_steps_of_45_degrees_give_little_and_nothing_wrong(tmp_path):
-    _, cloud = densify(draw(ring(8, step_deg=45)), tmp_path)
-    assert len(cloud) == 0 or wrong(cloud) < 0.1
+def test_large_steps_give_little_and_nothing_wrong(tmp_path, sound, caplog):
+    _, cloud = densify(draw(ring(10, step_deg=36)), tmp_path / "36")
+    assert 500 < len(cloud) < 0.1 * len(sound[1])
+    assert wrong(cloud) < 0.03
+    numbers, none = densify(draw(ring(8, step_deg=45)), tmp_path / "45")
+    assert numbers["pairs"] == len(none) == 0
+    assert "no two of the 8 photos share enough points" in caplog.text
 
 
 def test_what_is_plain_gives_nothing(tmp_path, caplog):
@@ -197,7 +201,7 @@ def test_what_is_plain_gives_nothing(tmp_path, caplog):
     assert trusted(cloud) < 600  # 50 000, of what is printed
 
 
-@pytest.mark.parametrize(("pixels", "kept"), [(1, 0.5), (3, 0.0)])
+@pytest.mark.parametrize(("pixels", "kept"), [(1, 0.5), (3, 0.05)])
 def test_poses_that_are_wrong_by_pixels(drawn, tmp_path, sound, pixels, kept):
     rng = np.random.default_rng(0)
     extrinsics = drawn.scene.cameras.extrinsics.copy()
@@ -207,7 +211,7 @@ def test_poses_that_are_wrong_by_pixels(drawn, tmp_path, sound, pixels, kept):
     cams = replace(drawn.scene.cameras, extrinsics=extrinsics)
     _, cloud = densify(replace(drawn, scene=replace(drawn.scene, cameras=cams)), tmp_path)
     assert len(cloud) >= kept * len(sound[1])
-    assert len(cloud) == 0 or np.average(off(cloud) > 0.06, weights=cloud.trust) < 0.1
+    assert np.average(off(cloud) > 0.06, weights=cloud.trust) < 0.03
 
 
 def test_a_background_that_stays_while_the_object_turns(drawn, tmp_path):
