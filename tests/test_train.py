@@ -332,6 +332,62 @@ def test_gradients_far_from_one_are_warned_of_now_and_then(caplog):
     assert "mean length of 0.40" in caplog.text
 
 
+# ---------------------------------------------------------------- the budget
+def begun(tmp_path: Path, points: int, **sets: object) -> train._Training:
+    """A training of 400 steps whose surface is a ball still, with so many dense points on that."""
+    radius = TINY.field.sphere_radius
+    run_context = context(tmp_path, "out", changed(TINY, {"steps": 400, "steps_if_covered": 0.25, **sets}))
+    normals = np.random.default_rng(0).normal(size=(points, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    cloud = PointCloud(
+        np.float32(radius * normals), np.float32(normals), np.zeros((points, 3), np.uint8),
+        np.ones(points, np.float32), np.arange(points + 1), np.zeros(points, np.int32),
+    )  # fmt: skip
+    write_densified(tmp_path / "densify", cloud.moved(sphere_scene(ring_of_cameras()).poses_from_scene))
+    return train._Training.begun(run_context)
+
+
+@pytest.mark.parametrize(
+    ("points", "part", "steps"),
+    [(100_000, 0.25, 100), (0, 0.25, 400), (100_000, 1.0, 400), (100_000, 0.001, 1)],
+    ids=["all covered", "none", "as many steps", "hardly any"],
+)
+def test_steps_are_fewer_where_dense_points_cover_the_surface(tmp_path, points, part, steps):
+    training = begun(tmp_path, points, steps_if_covered=part)
+    assert (training.steps, training.budget) == (None, 400)
+    training.settle()
+    assert training.steps == training.budget == pytest.approx(steps, abs=4)
+
+
+def test_a_half_that_dense_points_cover_saves_half_as_much(tmp_path):
+    training = begun(tmp_path, 100_000)
+    cloud = training.context.read(artifacts.POINT_CLOUD)
+    left = training.scene.poses_from_scene.inverse().apply(cloud.points)[:, 0] < 0
+    write_densified(tmp_path / "densify", replace(cloud, trust=np.where(left, 0.4, 1.0).astype(np.float32)))
+    training.settle()
+    assert training.steps == pytest.approx(250, abs=20)
+
+
+def test_a_training_that_is_resumed_keeps_its_budget(tmp_path):
+    training = begun(tmp_path, 0)
+    training.save()
+    assert train._Training.begun(training.context).steps is None
+    training.steps = 123
+    training.save()
+    assert train._Training.begun(training.context).budget == 123
+
+
+def test_in_a_region_that_grows_as_much_of_the_budget_is_spent(tmp_path, monkeypatch):
+    training = begun(tmp_path, 100_000)
+    training.settle()
+    training.trainer.step_index = round(0.2 * training.budget)
+    monkeypatch.setattr(train, "_grown", lambda _: train._Region((0.0, 0.0, 0.0), 1.2))
+    grown = training.where_nothing_is_cut()
+    assert grown.region is not None
+    assert grown.budget < 150  # the points cover the surface there, too
+    assert grown.progress == pytest.approx(0.2, abs=0.5 / grown.budget)
+
+
 # ---------------------------------------------------------------- a region that grows
 CUT = BorderCut(np.array([[0.0, 0, 0.97], [0, 0.1, 0.95]]), photos=5)
 LARGER = region_without_cut(CUT)

@@ -9,21 +9,31 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from stages.errors import ConfigError
 from stages.neural.training_photos import Photos, RayBatch
 
 if TYPE_CHECKING:
     from jaxtyping import Bool
 
+MIN_TRAINING = 3  # photos
 PIXELS = 20_000  # of a photo at most; its PSNR barely moves with more
 _RAYS = 4096  # rendered at a time
 _SMALLEST_ERROR = 1e-10  # a photo met exactly has 100 dB
 
 
 def left_out(num_photos: int, every: int) -> Bool[Tensor, " {num_photos}"]:
-    """Which photos are left out: i % every == every // 2, none where `every` is 0."""
+    """Which photos are left out: i % every == every // 2, none where `every` is 0.
+
+    Raises ConfigError where too few photos are left to train on, or none is left out though some should be.
+    """
     if every == 0:
         return torch.zeros(num_photos, dtype=torch.bool)
-    return torch.arange(num_photos) % every == every // 2
+    out = torch.arange(num_photos) % every == every // 2
+    left = num_photos - int(out.sum())
+    if not MIN_TRAINING <= left < num_photos:
+        found = f"leaves {left} of {num_photos} photos to train on (needed: {MIN_TRAINING} to {num_photos - 1})"
+        raise ConfigError(f"`train.hold_out` = {every} {found}.", "Try `--hold-out 8`, or 0 for none.")
+    return out
 
 
 @torch.no_grad()

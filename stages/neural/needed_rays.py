@@ -19,7 +19,7 @@ from stages.neural.training_photos import Photos, RayBatch
 from stages.neural.visibility import smallest_sdf_on_paths
 
 if TYPE_CHECKING:
-    from jaxtyping import Float, Int
+    from jaxtyping import Bool, Float, Int
 
 # Pixels along a cell's side, doubled until there are no more cells than this: 16 for 47 photos of 640 x 480.
 _SIDE, _MOST_CELLS = 4, 1 << 16
@@ -35,7 +35,8 @@ class NeededRays:
     Attributes:
         share: part of the rays that goes where it is needed; the others keep what is free, and the background, as they
             are.
-        errors: running mean of the colour error [C].
+        errors, known: running mean of the colour error [C] that starts at zero, and how much of it is of rays that were
+            drawn, from 0 to 1.
         weights: of the cells in the draw, [C]; zero: only the even share goes there.
     """
 
@@ -53,8 +54,7 @@ class NeededRays:
         boxes = photos.boxes[self.images]
         self.low = boxes[:, :2] + self.side * torch.stack([place % columns, place // columns], 1)
         self.size = torch.minimum(boxes[:, 2:] - self.low, torch.full_like(self.low, self.side))
-        self.errors = torch.ones(len(self.images), device=photos.device)
-        self.weights = torch.zeros(len(self.images), device=photos.device)
+        self.errors, self.known, self.weights = torch.zeros(3, len(self.images), device=photos.device).unbind()
         self._upto = torch.zeros(len(self.images), dtype=torch.float64, device=photos.device)
 
     def draw(self, num_rays: int, generator: torch.Generator) -> tuple[RayBatch, Int[Tensor, " r"]]:
@@ -81,14 +81,16 @@ class NeededRays:
         sums, counts = torch.zeros_like(self.errors), torch.zeros_like(self.errors)
         sums.index_add_(0, cells, errors.detach())
         counts.index_add_(0, cells, torch.ones_like(errors))
-        mean = sums / counts.clamp(min=1)
-        self.errors.copy_(torch.where(counts > 0, torch.lerp(self.errors, mean, _RENEWAL), self.errors))
+        renewal = _RENEWAL * (counts > 0)
+        self.errors.lerp_(sums / counts.clamp(min=1), renewal)
+        self.known.lerp_(torch.ones_like(self.known), renewal)
 
     @torch.no_grad()
     def look(self, cache: SdfCache) -> None:
         """Find the cells that show the surface of the cached SDF, and weigh them by their errors.
 
-        A cell's weight is its area times its error and the mean error: none of the surface is left out.
+        A cell's weight is its area times its error and the mean error: none of the surface is left out. As far as a
+        cell's error is not known yet, the mean stands for it, too: to be drawn seldom is no error.
         """
         directions = self.photos.directions(self.images, (self.low + 0.5 * self.size).floor())
         corners = self.photos.directions(self.images, self.low)
@@ -99,8 +101,8 @@ class NeededRays:
         # from the middle ray to the cell's corner, half way through the sphere
         reach = 0.5 * (entry + leave) * torch.linalg.vector_norm(corners - directions, dim=1)
         shown = crosses & (smallest < reach + cache.cell)
-        mean = (self.errors * shown).sum() / shown.sum().clamp(min=1)
-        self._weigh(shown * self.size.prod(1) * (self.errors + mean))
+        mean = _mean(self.errors, self.known, shown)
+        self._weigh(shown * self.size.prod(1) * (self.errors + (1 - self.known) * mean + mean))
 
     def _weigh(self, weights: Float[Tensor, " c"]) -> None:
         self.weights.copy_(weights)
@@ -108,11 +110,18 @@ class NeededRays:
 
     def state(self) -> dict[str, Any]:
         """Everything that the next draw depends on."""
-        return {"errors": self.errors, "weights": self.weights}
+        return {"errors": self.errors, "known": self.known, "weights": self.weights}
 
     def load_state(self, state: dict[str, Any]) -> None:
         self.errors.copy_(state["errors"])
+        self.known.copy_(state["known"])
         self._weigh(state["weights"])
+
+
+def _mean(errors: Float[Tensor, " c"], known: Float[Tensor, " c"], shown: Bool[Tensor, " c"]) -> Float[Tensor, ""]:
+    """Mean colour error of the cells that show the surface; 1 while no ray was drawn there."""
+    seen = (known * shown).sum()
+    return torch.where(seen > 0, (errors * shown).sum() / seen.clamp(min=1e-12), 1.0)
 
 
 def _counts(photos: Photos, side: int) -> Int[Tensor, "i 2"]:

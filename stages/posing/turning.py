@@ -68,6 +68,11 @@ class Depth:
     zoomed: Mapping[Names, float] = field(default_factory=dict)
     is_flat: bool = False
 
+    @property
+    def from_one_place(self) -> bool:
+        """Whether turning alone, or turning and zooming, explains the matches."""
+        return any(map(_shows_none, (self.parallaxes, self.zoomed)))
+
 
 def judge_depth(database: Path) -> Depth:
     """Look at pairs of photos, taken evenly of all that matched."""
@@ -99,7 +104,7 @@ def refuse_one_place(depth: Depth) -> None:
         ReconstructionError: turning alone, or turning and zooming, explains their matches.
     """
     for found, did in ((depth.parallaxes, "turns"), (depth.zoomed, "turns and zooms")):
-        if not found or _most(found) >= MIN_PARALLAX:
+        if not _shows_none(found):
             continue
         names = sorted(set().union(*found))
         flat = " (or something flat was photographed from straight ahead, nearer and nearer)" if "zooms" in did else ""
@@ -110,6 +115,10 @@ def refuse_one_place(depth: Depth) -> None:
             "Walk around the subject, a step to the side for each photo, add these photos to the folder, and try "
             "`hineus run PHOTOS --until sfm`.",
         )
+
+
+def _shows_none(found: Mapping[Names, float]) -> bool:
+    return bool(found) and _most(found) < MIN_PARALLAX
 
 
 def _most(found: Mapping[Names, float]) -> float:

@@ -227,6 +227,8 @@ class Workbench:
         """The chosen matcher and mapper."""
         self._features_and_matches(self._first, best)
         self.depth = judge_depth(self.database())
+        if self.depth.from_one_place and self._match_all(self._first):
+            self.depth = judge_depth(self.database())
         refuse_one_place(self.depth)
         return self._solve(self._first, self.params.mapper)
 
@@ -342,16 +344,30 @@ class Workbench:
         self._extract(base)
         self._tell(PART_FEATURES, "matches")
         self._match(base)
-        if not self._stationary and has_still_background(self.database(base)):
+        if not self._stationary and self._has_still_background(base):
             log.info("the background stands still while the object turns: its matches are left out")
             self._stationary = True
-            if self.matcher == PREEMPTIVE:  # which went by the background
-                self.matcher = EXHAUSTIVE
-                self._match(base)
             self._verify_again(base)
         if best is not None and self.matcher != EXHAUSTIVE:
             self._match_pairs(base, self._pairs_to_try(base, best))
         self._tell(PART_MATCHES, "poses")
+
+    def _has_still_background(self, base: Base) -> bool:
+        """Of all pairs, too: of likely ones, which are near each other, little moves that is far away or on an axis."""
+        path = self.database(base)
+        return has_still_background(path) and (not self._match_all(base) or has_still_background(path))
+
+    def _match_all(self, base: Base) -> bool:
+        """Match all pairs, from now on, where only likely ones were matched; else False.
+
+        No verdict on a capture goes by likely pairs alone.
+        """
+        if self.matcher != PREEMPTIVE:
+            return False
+        log.info("all pairs are matched, to be sure of what the likely ones tell")
+        self.matcher = EXHAUSTIVE
+        self._match(base)
+        return True
 
     def _matched_by_poses(self, base: Base, model: Any, descriptors: Any) -> tuple[Solution | None, int]:
         """Match again where the poses found allow it, and go on from them; how many photos then match nothing.

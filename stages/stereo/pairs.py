@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from stages.stereo.rectification import View, comparable
+from stages.stereo.rectification import View, comparable, rectify
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Integer
@@ -27,16 +27,24 @@ def pairs_of(
 ) -> list[tuple[int, int]]:
     """Pairs of photos to compare (i < j), in order: each photo with its `neighbors` best, and those it is one of.
 
+    All can be rectified: a photo that cannot, beside another, leaves its place to the next.
+
     Args:
         points, observations: known points, and rows (photo, point): which photo sees which.
     """
     suited = scores(views, points, observations)
     centers = np.stack([view.center for view in views])
+    seen = [points[observations[observations[:, 0] == i, 1]] for i in range(len(views))]
     found: set[tuple[int, int]] = set()
     for i, row in enumerate(suited):
-        seen = points[observations[observations[:, 0] == i, 1]]
-        if len(seen):
-            found |= {(min(i, j), max(i, j)) for j in _best(row, _unit(centers - np.median(seen, axis=0)), neighbors)}
+
+        def usable(j: int, i: int = i) -> bool:
+            left, right = sorted((i, j))
+            return rectify(views[left], views[right], np.concatenate([seen[left], seen[right]])) is not None
+
+        if len(seen[i]):
+            directions = _unit(centers - np.median(seen[i], axis=0))
+            found |= {(min(i, j), max(i, j)) for j in _best(row, directions, neighbors, usable)}
     return sorted(found)
 
 
@@ -46,7 +54,7 @@ def scores(
     """How well each two photos suit each other.
 
     The points that both see, each weighed by the angle between the lines of sight, and by how alike the sizes are at
-    which they show it (Goesele et al. 2007); 0 where they share fewer than `MIN_SHARED`, or cannot be rectified.
+    which they show it (Goesele et al. 2007); 0 where they share fewer than `MIN_SHARED`, or are not `comparable`.
     """
     from scipy.sparse import csr_array
 
@@ -78,8 +86,10 @@ def _by_angle(degrees: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
     return weights
 
 
-def _best(scores: Float[np.ndarray, " n"], directions: Float[np.ndarray, "n 3"], count: int) -> list[int]:
-    """The best `count` photos, each chosen for what those before it have not said already.
+def _best(
+    scores: Float[np.ndarray, " n"], directions: Float[np.ndarray, "n 3"], count: int, usable: Callable[[int], bool]
+) -> list[int]:
+    """The best `count` usable photos, each chosen for what those before it have not said already.
 
     Args:
         directions: unit, towards the photos from what they look at.
@@ -87,6 +97,9 @@ def _best(scores: Float[np.ndarray, " n"], directions: Float[np.ndarray, "n 3"],
     left, chosen = scores.copy(), list[int]()
     while len(chosen) < count and (left > 0).any():
         best = int(left.argmax())
+        if not usable(best):
+            left[best] = 0
+            continue
         chosen.append(best)
         degrees = np.degrees(np.arccos(np.clip(directions @ directions[best], -1, 1)))
         left *= np.minimum(degrees / APART, 1)

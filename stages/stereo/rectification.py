@@ -163,7 +163,7 @@ def _window(
         width, height = view.size
         corners = np.array([[0, 0, 1], [width, 0, 1], [0, height, 1], [width, height, 1]], float)
         rays = corners @ np.linalg.inv(view.matrix).T @ view.rotation @ turn.T
-        if (rays[:, 2] < MIN_CORNER * np.linalg.norm(rays, axis=1)).any():
+        if not (rays[:, 2] >= MIN_CORNER * np.linalg.norm(rays, axis=1)).all():  # nor where axes leave no plane: NaN
             return None
         places = rays[:, :2] / rays[:, 2:]
         boxes.append((places.min(0), places.max(0)))

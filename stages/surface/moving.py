@@ -15,6 +15,8 @@ if TYPE_CHECKING:
 
 # Directions are means over this many rings: neighbours move side by side, and hardly a face folds.
 DIRECTION_RINGS = 3
+# Faces that lean more than this (cosine) from the directions around them are as good as folded: dark specks.
+FOLD_COSINE = 0.3
 # Where faces would fold, the vertices around them slide apart this many times; then the move is halved so often.
 SLIDES = 6
 HALVINGS = 12
@@ -65,13 +67,14 @@ def without_folds(
 ) -> tuple[Float[np.ndarray, "v 3"], int]:
     """The moved vertices so that no face turns over that did not before; and how many would have.
 
-    A face is turned over where its normal points against the directions at its corners. Corners of slivers slide
-    apart, within the surface; what still folds then goes back towards where it came from.
+    A face is turned over where it stands on edge, or worse, beside the directions at its corners. Corners of slivers
+    slide apart, within the surface; what still folds then goes back towards where it came from.
     """
-    towards = directions[faces].sum(1)
+    towards = unit(directions[faces].sum(1))
 
     def folded(places: np.ndarray) -> np.ndarray:
-        return np.einsum("fc,fc->f", face_normals(places, faces), towards) <= 0
+        crosses = face_normals(places, faces)
+        return np.einsum("fc,fc->f", crosses, towards) <= FOLD_COSINE * np.linalg.norm(crosses, axis=1)
 
     before, would = folded(vertices), 0
     moved = moved.copy()
