@@ -12,7 +12,7 @@ from stages.surface import fitting
 from stages.surface.denoising import denoised
 from stages.surface.fitting import fit_to_points
 from stages.surface.isosurface import extract_isosurface
-from stages.surface.moving import directions_of, rings_of, without_folds
+from stages.surface.moving import directions_of, rings_of, within_gaps, without_folds
 from stages.surface.triangle_mesh import face_normals
 
 RESOLUTION = 40
@@ -124,6 +124,30 @@ def test_the_sides_of_a_wall_never_meet():
     assert top.min() > bottom.max()
     assert np.abs(top).mean() < 0.02  # held at 0.4 of the way, 0.012
     assert not folds(vertices, fit.vertices, faces).any()
+
+
+def test_the_sides_of_a_thin_wall_are_not_smoothed_into_each_other():
+    box = extract_isosurface(lambda p: (np.abs(p) - np.array([0.5, 0.5, 0.06])).max(1).astype(np.float32), RESOLUTION)
+    # A corrugated sheet, less than a fifth of a cell thick: its top alone would go straight through its bottom.
+    sheet = box.vertices * np.array([1, 1, 0.08 * CELL / 0.06])
+    sheet[:, 2] += 0.3 * CELL * np.sin(2 * np.pi / (5 * CELL) * sheet[:, 0])
+    top = (np.abs(box.vertices[:, :2]).max(1) < 0.4) & (box.vertices[:, 2] > 0)
+    up = (denoised(sheet, box.faces, 5) - sheet)[top, 2]
+    assert up.max() > 0.12 * CELL  # away from the bottom nothing holds it
+    assert up.min() > -0.41 * 0.16 * CELL
+
+
+def test_what_meets_its_own_side_first_still_finds_the_other():
+    """A ray that grazes a face of its own side goes on beyond it."""
+    steps = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], dtype=float)
+    vertices = np.concatenate([steps + np.array([0, 0, height]) for height in (0.0, 0.4, 1.0)])
+    faces = np.array([[0, 1, 2], [3, 4, 5], [6, 8, 7]])
+    directions = np.repeat([[0.0, 0, 1], [0, 0, 1], [0, 0, -1]], 3, axis=0)
+    moves = np.zeros_like(vertices)
+    vertices[0, :2], moves[0] = 0.1, [0, 0, 3]
+    moved = within_gaps(vertices, faces, directions, moves, 0.5)
+    np.testing.assert_allclose(moved[0], [0, 0, 0.4], atol=1e-5)
+    assert not moved[1:].any()
 
 
 def test_displacements_are_the_minimum_that_is_written_down(sphere):
