@@ -89,7 +89,8 @@ def largest_descriptors(database: Any, image_id: int) -> Float[np.ndarray, "k 12
     areas = np.abs(keypoints[:, 2] * keypoints[:, 5] - keypoints[:, 3] * keypoints[:, 4])
     descriptors = np.asarray(database.read_descriptors(image_id).data)
     order = np.argsort(-areas, kind="stable")
-    return descriptors[order[descriptors.any(axis=1)[order]][:LARGEST]].astype(np.float32)
+    known = np.asarray(descriptors.any(axis=1))
+    return descriptors[order[known[order]][:LARGEST]].astype(np.float32)
 
 
 def common_features(descriptors: list[Float[np.ndarray, "_ 128"]]) -> Int[np.ndarray, "n n"]:
