@@ -166,7 +166,7 @@ class DensifyParams(Section):
     method: Literal["auto", "patch_match", "off"] = Field(
         "auto",
         description="auto: semi-global matching of neighbouring photos; patch_match: COLMAP's, which needs a GPU and a "
-        "pycolmap that was built with CUDA; off: no dense points",
+        "pycolmap that was built with CUDA, and was never tried on one; off: no dense points",
     )
     side: int = Field(1000, ge=64, description="photos are compared at this longest side, pixels")
     neighbors: int = Field(

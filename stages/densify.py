@@ -178,7 +178,7 @@ def _by_patch_match(context: StageContext[HeldOutDensifyParams], photos: _Captur
     folder = context.scratch / "patch_match"
     shutil.rmtree(folder, ignore_errors=True)
     side = context.params.side
-    for k, depth, _ in patch_match_depths(photos.scene, photos.pictures, folder, side, context.progress):
+    for k, depth in patch_match_depths(photos.scene, photos.pictures, folder, side, context.progress):
         depths[k] = depth
     shutil.rmtree(folder)
     return depths

@@ -219,7 +219,7 @@ def _write_points(
         normals=chosen.normals @ place.world_from_poses.rotation.T,
     )
     try:
-        laz = laz_bytes(world, place.offset or (0.0, 0.0, 0.0), place.crs, generator())
+        laz, far = laz_bytes(world, place.offset or (0.0, 0.0, 0.0), place.crs, generator())
     except ImportError as error:
         raise SystemRequirementError(
             f"Dense points are written as LAZ with laspy, lazrs and, on a map, pyproj: {error}.",
@@ -227,7 +227,17 @@ def _write_points(
         ) from error
     files = {"ply": points_ply_bytes(world, asset.note), "laz": laz}
     sizes = {f"points_{kind}": artifacts.points_path(asset.out, kind).write_bytes(files[kind]) for kind in files}
-    return {"points": len(chosen)}, sizes
+    return {"points": len(chosen), **({"warnings": [_too_far(far)]} if far else {})}, sizes
+
+
+def _too_far(count: int) -> dict[str, str]:
+    """For the report and the log: that points.laz lacks so many points."""
+    sentence = (
+        f"points.laz lacks the {count:,} dense points that lie thousands of times as far out as the others: they are "
+        "wrong, and its whole numbers would be coarse for all. points.ply has them."
+    )
+    log.warning("%s", sentence)
+    return {"sentence": sentence}
 
 
 def asked_for(
@@ -338,7 +348,7 @@ def provenance(scene: PosedScene, place: Place, gltf_from_world: np.ndarray, run
 
 EXPORT: Stage[ExportParams] = Stage(
     name="export",
-    version=8,
+    version=9,
     settings=lambda config: config.export,
     run=run,
     reads=(SCENE, WORLD_PLACE, GIVEN_REGION, POINT_CLOUD, ATLAS_MESH, BASE_COLOR, NORMAL_MAP, OCCLUSION),

@@ -67,7 +67,7 @@ def run(context: StageContext[ExtractParams]) -> dict[str, Any]:
 
 EXTRACT: Stage[ExtractParams] = Stage(
     name="extract",
-    version=3,
+    version=4,
     settings=lambda config: config.extract,
     run=run,
     reads=(SCENE, FIELD, POINT_CLOUD),

@@ -45,7 +45,7 @@ SFM_CPU_S_PER_MP = 2.8  # 2.3 to 3.3 CPU seconds a megapixel looked at
 SFM_CPU_S_PER_PAIR = 0.01  # too little in those sets to be told from nothing; larger ones are quadratic
 STEREO_CPU_S_PER_MP_AND_NEIGHBOR = 0.28  # 1.0 to 1.2 CPU seconds a megapixel compared with four neighbours
 STEREO_BASE_GIB, STEREO_GIB_PER_MP = 0.5, 0.021  # 0.55 to 1.2 GiB at 11 to 29 megapixels; maps of all are held
-EXPLAINED = 0.6  # share of the surface that dense points cover: 0.16 of polished metal, 0.6 of plaster, 0.9 of a helmet
+COVERED = 0.6  # share of the surface that dense points cover: 0.16 of polished metal, 0.6 of plaster, 0.9 of a helmet
 TRAIN_CPU_S_PER_RAY_SAMPLE = 4.9e-6  # 317 to 329 CPU seconds for 8000 steps of 512 rays of 16 samples
 OTHER_CPU_S = 50.0  # everything after training: 37 to 47
 # Part of the work that cores share: two made training 1.53 to 1.80 times as fast, poses 1.7 times. What more cores
@@ -227,7 +227,7 @@ def _minutes(looked_at: list[float], compared: float, config: Config, workers: i
     count, train = len(looked_at), config.train
     pairs = count * (count - 1) / 2 if count <= config.sfm.exhaustive_max else 10 * count
     wall_per_cpu = 1 - PARALLEL_SHARE + PARALLEL_SHARE / workers
-    part = 1 + EXPLAINED * (train.steps_if_covered - 1) if compared else 1.0
+    part = 1 + COVERED * (train.steps_if_covered - 1) if compared else 1.0
     ray_samples = part * train.steps * train.sampling.rays * train.sampling.samples
     training_s = ray_samples * TRAIN_CPU_S_PER_RAY_SAMPLE * wall_per_cpu
     if train.minutes is not None:

@@ -624,6 +624,22 @@ def test_a_box_that_was_given_crops_the_points_as_the_mesh(tmp_path):
     assert 0 < EXPORT.run(context)["points"] == ((heights > -0.2) & (heights < 0.5)).sum() < 400
 
 
+def test_points_too_far_for_the_laz_are_told(tmp_path):
+    import laspy
+    import open3d as o3d
+
+    context = workspace(tmp_path, ExportParams(formats=("points",), points_trust=0.0, points_from="everywhere"))
+    points = shell().points.copy()
+    points[:2] *= 1e6
+    artifacts.POINT_CLOUD.save(context.inputs["densify"], replace(shell(), points=points))
+    numbers = EXPORT.run(context)
+    (warning,) = numbers["warnings"]
+    assert "lacks the 2 dense points" in warning["sentence"]
+    assert numbers["points"] == len(o3d.io.read_point_cloud(str(context.out / "points.ply")).points) == 400
+    found = laspy.read(context.out / "points.laz")
+    np.testing.assert_allclose(found.xyz, points[2:], atol=1e-5)
+
+
 def test_without_points_no_file_is_written_and_it_is_said_why(tmp_path):
     from stages.geometry.point_cloud import PointCloud
 

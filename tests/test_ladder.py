@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import product
+from itertools import combinations, product
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +11,10 @@ import pytest
 
 from configs.params import SfmParams
 from stages.artifacts import ImageSet
+from stages.errors import ReconstructionError
 from stages.posing.ladder import Rung, Solution, Step, better, climb, describe, photos_wanted
+from stages.posing.pairs import EXHAUSTIVE, PREEMPTIVE
+from stages.posing.turning import Depth
 from stages.posing.workbench import Base, Workbench, forget_focal_priors, has_still_background
 
 
@@ -151,6 +154,20 @@ def test_a_background_that_stands_still_is_seen_and_one_that_moves_along_is_not(
     assert not has_still_background(database(tmp_path / "d.db", turntable(30), []))
 
 
+@pytest.mark.parametrize(("asked", "taken"), [("auto", EXHAUSTIVE), ("preemptive", PREEMPTIVE)])
+def test_views_of_360_degree_pictures_are_matched_with_all_unless_asked_for_less(
+    tmp_path: Path, monkeypatch, asked: str, taken: str
+):
+    from stages.artifacts import ImageRecord
+
+    views = ImageSet(tuple(ImageRecord(f"{i}.jpg", "", 64, 64, 50.0, "c", 1.0, False, "", frame="a") for i in "12"))
+    monkeypatch.setattr(Workbench, "_import", lambda bench, base: None)
+    bench = Workbench(
+        tmp_path, tmp_path, tmp_path, views, SfmParams(matcher=asked), 1, 1, False, lambda done, total, note: None
+    )  # fmt: skip
+    assert bench.matcher == taken
+
+
 def test_focal_priors_are_forgotten(tmp_path: Path):
     import pycolmap
 
@@ -192,8 +209,8 @@ def test_always_inside_the_masks_needs_masks(tmp_path: Path):
 
 
 # ---------------------------------------------------------------- the workbench
-def workbench(tmp_path: Path, focal: float | None = None, **params: object):
-    """Three photos of noise, the object in the left half of each."""
+def workbench(tmp_path: Path, focal: float | None = None, names=("a b.png", "c.png", "d.png"), **params: object):
+    """Photos of noise, the object in the left half of each."""
     import cv2
 
     from stages import artifacts
@@ -203,7 +220,7 @@ def workbench(tmp_path: Path, focal: float | None = None, **params: object):
     records, noise = [], np.random.default_rng(0)
     mask = np.zeros((120, 160), np.uint8)
     mask[:, :80] = 255
-    for name in ("a b.png", "c.png", "d.png"):
+    for name in names:
         grey = noise.integers(0, 256, (30, 40), dtype=np.uint8)
         artifacts.write_png(artifacts.Pictures(tmp_path).path(name), cv2.resize(grey, (160, 120)))
         artifacts.write_png(artifacts.Pictures(tmp_path).mask_path(name), mask)
@@ -228,6 +245,77 @@ def keypoints(path: Path) -> np.ndarray:
 
     with pycolmap.Database.open(path) as opened:
         return np.concatenate([opened.read_keypoints(image.image_id)[:, :2] for image in opened.read_all_images()])
+
+
+FOUR = tuple(turntable(30))
+
+
+def matching_all(bench: Workbench, places: dict[str, np.ndarray], monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """All features of a bench match, of neighbours or of all pairs, by its matcher; what was matched is remembered."""
+    import pycolmap
+
+    matched = []
+
+    def match(base: Base) -> None:
+        matched.append(bench.matcher)
+        indices = np.stack([np.arange(len(next(iter(places.values()))))] * 2, 1).astype(np.uint32)
+        with pycolmap.Database.open(bench.database(base)) as opened:
+            ids = [opened.read_image_with_name(name).image_id for name in FOUR]
+            for image_id, keypoints in zip(ids, places.values(), strict=True):
+                if not opened.exists_keypoints(image_id):
+                    opened.write_keypoints(image_id, keypoints.astype(np.float32))
+            for i, j in combinations(range(len(ids)), 2):
+                likely = j == i + 1 or bench.matcher == EXHAUSTIVE
+                if likely and not opened.exists_matches(ids[i], ids[j]):
+                    opened.write_matches(ids[i], ids[j], indices)
+
+    monkeypatch.setattr(bench, "_extract", lambda base: None)
+    monkeypatch.setattr(bench, "_match", match)
+    return matched
+
+
+@pytest.mark.parametrize("of_all", [True, False])
+def test_a_background_stands_still_only_if_it_does_between_all_pairs(tmp_path: Path, monkeypatch, of_all: bool):
+    """Neighbours on a dense walk have matches on the axis that hardly move, and photos further apart have none."""
+    places = turntable(30)
+    if not of_all:
+        places = {name: at + 2.5 * i for i, (name, at) in enumerate(places.items())}
+    bench = workbench(tmp_path, names=FOUR)
+    matched = matching_all(bench, places, monkeypatch)
+    bench._features_and_matches(Base(), None)
+    assert matched == [PREEMPTIVE, EXHAUSTIVE]
+    assert bench.matcher == EXHAUSTIVE
+    assert bench.stands_still is of_all
+
+
+def test_a_background_that_moves_along_needs_no_second_match(tmp_path: Path, monkeypatch):
+    bench = workbench(tmp_path, names=FOUR)
+    places = {name: at + 30 * i for i, (name, at) in enumerate(turntable(30).items())}
+    assert matching_all(bench, places, monkeypatch) == []
+    bench._features_and_matches(Base(), None)
+    assert (bench.matcher, bench.stands_still) == (PREEMPTIVE, False)
+
+
+@pytest.mark.parametrize("one_place", [True, False])
+def test_photos_are_of_one_place_only_if_all_pairs_say_so(tmp_path: Path, monkeypatch, one_place: bool):
+    bench = workbench(tmp_path, names=FOUR)
+    matched = matching_all(
+        bench, {name: at + 30 * i for i, (name, at) in enumerate(turntable(30).items())}, monkeypatch
+    )
+
+    def depth(path: Path) -> Depth:
+        far = 0.02 if bench.matcher == EXHAUSTIVE and not one_place else 0.001
+        return Depth({("000.png", "001.png"): 0.001, ("000.png", "003.png"): far})
+
+    monkeypatch.setattr("stages.posing.workbench.judge_depth", depth)
+    monkeypatch.setattr(bench, "_solve", lambda *arguments: solution(4))
+    if one_place:
+        with pytest.raises(ReconstructionError, match="taken from one place"):
+            bench.first(None)
+    else:
+        assert bench.first(None) == solution(4)
+        assert bench.depth.parallaxes["000.png", "003.png"] == 0.02
+    assert matched == [PREEMPTIVE, EXHAUSTIVE]
 
 
 def test_features_are_found_inside_the_masks_where_asked(tmp_path: Path):

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from itertools import combinations
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from stages.posing import pairs
+from stages.posing.features import _pad_descriptors
 from stages.posing.pairs import choose_pairs, common_features, likely_pairs, near_pairs
 
 
@@ -36,7 +38,9 @@ def slow_count(first: np.ndarray, second: np.ndarray) -> int:
     return found
 
 
-def test_counts_are_those_of_a_slow_loop_and_of_features_that_are_there_twice():
+@pytest.mark.parametrize("at_once", [1, 2, 4, 64])
+def test_counts_are_those_of_a_slow_loop_and_of_features_that_are_there_twice(monkeypatch, at_once: int):
+    monkeypatch.setattr(pairs, "AT_ONCE", at_once)
     scene = descriptors(40, 0)
     photos = [
         noisy(scene[:30], 1),
@@ -56,9 +60,51 @@ def test_counts_are_those_of_a_slow_loop_and_of_features_that_are_there_twice():
     assert common_features([]).shape == (0, 0)
 
 
+def few_partners(monkeypatch: pytest.MonkeyPatch, **numbers: int) -> None:
+    """Only so many partners of each kind, and one tree of pairs."""
+    for name, number in {"SPREAD": 0, "APART": 0, "TREES": 1, **numbers}.items():
+        monkeypatch.setattr(pairs, name, number)
+
+
+def seen_from(angles_deg: np.ndarray) -> np.ndarray:
+    """[n, n] as many features as photos of directions so far apart have in common: SIFT forgets within some 20 deg."""
+    common = np.rint(100 * np.exp(-((angles_deg / 20) ** 2))).astype(int)
+    np.fill_diagonal(common, 0)
+    return common
+
+
+@pytest.mark.parametrize(("rings", "least"), [(25, 50), (30, 50), (45, 5)])
+def test_two_rings_of_photos_do_not_hang_on_one_pair(rings: float, least: int):
+    """Two walks around something, the second one so many degrees higher; past 33 of them no pair across is clear."""
+    around = np.arange(75) * 2 * np.pi / 75
+    heights = np.radians(np.repeat([10, 10 + rings], 75))
+    directions = np.stack(
+        [np.cos(heights) * np.cos([*around, *around]), np.cos(heights) * np.sin([*around, *around]), np.sin(heights)], 1
+    )
+    chosen = choose_pairs(seen_from(np.degrees(np.arccos(np.clip(directions @ directions.T, -1, 1)))))
+    assert sum(i < 75 <= j for i, j in chosen) >= least
+    assert len(chosen) < 75 * 74 / 3  # of 75 * 149
+
+
+def test_pairs_of_a_dense_walk_are_far_apart_too():
+    """The best twelve partners are at most six photos away, which is 7 degrees here."""
+    angles = np.abs(np.subtract.outer(np.arange(150), np.arange(150))) * 180 / 149
+    apart = [angles[pair] for pair in choose_pairs(seen_from(angles))]
+    assert np.quantile(apart, 0.8) > 15
+    assert len(apart) < 15 * 150
+
+
+def test_a_photo_gets_further_partners_evenly_and_those_apart_from_all_others(monkeypatch: pytest.MonkeyPatch):
+    few_partners(monkeypatch, MOST=1, LEAST=1, SPREAD=3, APART=1)
+    common = np.zeros((9, 9), int)
+    common[0, 1:9] = [90, 40, 35, 30, 25, 20, 15, 2]
+    common = common + common.T
+    common[1:8, 1:8] = 50 - 40 * (np.arange(1, 8) == 3)[:, None] - 40 * (np.arange(1, 8) == 3)
+    assert pairs._partners(common, 0) == [1, 2, 4, 7, 3]
+
+
 def test_a_photo_gets_its_clear_partners_and_a_few_whatever_they_share(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(pairs, "MOST", 3)
-    monkeypatch.setattr(pairs, "LEAST", 1)
+    few_partners(monkeypatch, MOST=3, LEAST=1)
     common = np.zeros((6, 6), int)
     for (i, j), count in {(0, 1): 9, (0, 2): 8, (0, 3): 7, (0, 4): 6, (1, 2): 5, (3, 5): 2}.items():
         common[i, j] = common[j, i] = count
@@ -68,8 +114,7 @@ def test_a_photo_gets_its_clear_partners_and_a_few_whatever_they_share(monkeypat
 
 
 def test_pairs_connect_all_photos(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(pairs, "MOST", 2)
-    monkeypatch.setattr(pairs, "LEAST", 1)
+    few_partners(monkeypatch, MOST=2, LEAST=1)
     common = np.zeros((8, 8), int)
     for group in (range(4), range(4, 8)):
         for i, j in combinations(group, 2):
@@ -101,6 +146,8 @@ def test_the_largest_features_of_a_database_choose_the_pairs(tmp_path: Path, mon
             keypoints[:, 2] = keypoints[:, 5] = sizes
             opened.write_keypoints(image_id, keypoints)
             opened.write_descriptors(image_id, pycolmap.FeatureDescriptors(pycolmap.FeatureExtractorType.SIFT, own))
+    with pycolmap.Database.open(path) as opened:  # larger ones without a descriptor count for nothing
+        _append_zeros(opened, sizes=30.0, number=25)
     monkeypatch.setattr(pairs, "_connecting", lambda common: [])
     monkeypatch.setattr(pairs, "NEXT", 0)
     assert likely_pairs(path) == [(1, 3)]
@@ -111,3 +158,13 @@ def test_the_largest_features_of_a_database_choose_the_pairs(tmp_path: Path, mon
     assert near_pairs(path, {"4 a.jpg"}) == [(1, 4), (1, 5), (4, 5)]
     assert near_pairs(path, {"0 a.jpg"}) == [(1, 2), (1, 3), (2, 3)]
     assert near_pairs(path, set()) == []
+
+
+def _append_zeros(opened: Any, sizes: float, number: int) -> None:
+    """As `stages.posing.features.append` does, to all images of an open database that have features."""
+    more = np.zeros((number, 6), np.float32)
+    more[:, 2] = more[:, 5] = sizes
+    ids = [image.image_id for image in opened.read_all_images() if opened.exists_keypoints(image.image_id)]
+    for i in ids:
+        opened.update_keypoints(i, np.concatenate([opened.read_keypoints(i), more]))
+    _pad_descriptors(opened, dict.fromkeys(ids, number))

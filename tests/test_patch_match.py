@@ -12,7 +12,7 @@ from rigs import capture, look_at, scene_without_points
 from stages.artifacts import Pictures, write_png
 from stages.geometry.cameras import PinholeCameras, PosedScene
 from stages.stereo import patch_match
-from stages.stereo.patch_match import patch_match_depths, read_agreeing, read_array, reduced_cameras, write_workspace
+from stages.stereo.patch_match import patch_match_depths, read_array, reduced_cameras, write_workspace
 
 NORMAL, HEIGHT = np.array([0.3, 0.1, 1.0]) / np.linalg.norm([0.3, 0.1, 1.0]), 0.2
 
@@ -65,7 +65,7 @@ def padded(array: np.ndarray, size: tuple[int, int]) -> np.ndarray:
 
 
 def write_maps(folder: Path, cameras: PinholeCameras) -> None:
-    """The plane, as COLMAP would have found it, of all photos but the second; three photos agree with each pixel."""
+    """The plane, as COLMAP would have found it, of all photos but the second."""
     import pycolmap
 
     size = tuple(cameras.sizes.max(0).tolist())
@@ -75,10 +75,6 @@ def write_maps(folder: Path, cameras: PinholeCameras) -> None:
         stereo, name = folder / "stereo", f"{index:06d}.png.geometric.bin"
         pycolmap.DepthMap.from_array(depth, 1, 10).write(stereo / "depth_maps" / name)
         pycolmap.NormalMap.from_array(normal).write(stereo / "normal_maps" / name)
-        rows, columns = np.nonzero(depth)
-        agreeing = np.stack([columns, rows, 0 * rows + 3, *3 * [0 * rows]], 1).astype("<i4")
-        header = f"{size[0]}&{size[1]}&1&".encode()
-        (stereo / "consistency_graphs" / name).write_bytes(header + agreeing.tobytes())
 
 
 def test_colmap_fuses_the_maps_to_the_plane(cameras: PinholeCameras, pictures: Pictures, tmp_path: Path) -> None:
@@ -146,11 +142,10 @@ def test_depths_come_back_by_photo(
     monkeypatch.setattr(pycolmap, "patch_match_stereo", match)
     monkeypatch.setattr(patch_match, "POLL_S", 0.001)
     found = list(patch_match_depths(scene, pictures, folder, 120, lambda *done: told.append(done)))
-    assert [index for index, _, _ in found] == [0, 2, 3]
-    for index, depth, trust in found:
+    assert [index for index, _ in found] == [0, 2, 3]
+    for index, depth in found:
         np.testing.assert_allclose(depth, plane_depths(reduced, index), rtol=1e-6)
-        assert (trust == 0.75).all()
-    assert asked[0].write_consistency_graph
+    assert asked[0].allow_missing_files
     assert told[-1] == (3, 8, "matching")
 
 
@@ -160,7 +155,7 @@ def test_without_cuda_colmap_says_so(cameras: PinholeCameras, pictures: Pictures
         list(patch_match_depths(posed(cameras, *on_plane()), pictures, tmp_path / "out", 120, lambda *done: None))
 
 
-def test_the_formats_as_they_are_documented(tmp_path: Path) -> None:
+def test_arrays_as_colmap_documents_them(tmp_path: Path) -> None:
     values = np.array([[1, 2, 3], [4, 5, np.nan]], "<f4")
     (tmp_path / "depth").write_bytes(b"3&2&1&" + values.tobytes())
     np.testing.assert_array_equal(read_array(tmp_path / "depth"), values)
@@ -171,6 +166,3 @@ def test_the_formats_as_they_are_documented(tmp_path: Path) -> None:
     (tmp_path / "short").write_bytes(b"4&2&1&" + values.tobytes())
     with pytest.raises(ValueError, match="expected 4 x 2 numbers, got 6"):
         read_array(tmp_path / "short")
-    graph = np.array([2, 0, 1, 7, 0, 1, 3, 5, 6, 7, 1, 1, 0], "<i4")
-    (tmp_path / "graph").write_bytes(b"3&2&1&" + graph.tobytes())
-    np.testing.assert_array_equal(read_agreeing(tmp_path / "graph"), [[0, 0, 1], [3, 0, 0]])

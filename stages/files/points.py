@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Sequence
+from datetime import date
 
 import numpy as np
 
@@ -12,8 +13,11 @@ from stages.geometry.point_cloud import PointCloud
 # LAZ holds whole numbers: they count this part of the points' median distance from their middle, or less, a power of
 # ten. Stereo is a hundred times as coarse, and finer numbers compress badly.
 STEP = 1e-5
-# The most steps from the middle, just less than 32 bits hold: beyond, steps are larger.
+# The most steps from the middle, just less than 32 bits hold: two thousand to twenty thousand times the points' median
+# distance. What lies beyond is wrong, and steps that reached it would be coarse for all the others.
 MOST_STEPS = 2e9
+# Files say when they were made; the same points give the same bytes on any day.
+MADE = date(2000, 1, 1)
 # LAS has colours of 16 bits: 255 becomes 65535.
 FULL_RANGE = 257
 
@@ -40,7 +44,9 @@ def points_ply_bytes(cloud: PointCloud, comment: str = "") -> bytes:
     return "\n".join([*lines, "end_header", ""]).encode("ascii", "replace") + table.tobytes()
 
 
-def laz_bytes(cloud: PointCloud, offset: Sequence[float] = (0.0, 0.0, 0.0), crs: str = "", program: str = "") -> bytes:
+def laz_bytes(
+    cloud: PointCloud, offset: Sequence[float] = (0.0, 0.0, 0.0), crs: str = "", program: str = ""
+) -> tuple[bytes, int]:
     """LAZ: LAS 1.4, compressed, points of format 7 with normals, trust and number of photos as extra dimensions.
 
     Args:
@@ -48,6 +54,9 @@ def laz_bytes(cloud: PointCloud, offset: Sequence[float] = (0.0, 0.0, 0.0), crs:
         offset: added to its coordinates, in float64, it gives those of the file.
         crs: the coordinate system of these, projected, as "EPSG:32632".
         program: what wrote it.
+
+    Returns:
+        The file, and how many points it lacks: those more than `MOST_STEPS` steps from the points' middle.
 
     Raises:
         ImportError: laspy or lazrs is missing, or pyproj where there is a `crs`.
@@ -61,7 +70,11 @@ def laz_bytes(cloud: PointCloud, offset: Sequence[float] = (0.0, 0.0, 0.0), crs:
     middle = np.round(np.median(points, axis=0))
     header = laspy.LasHeader(version="1.4", point_format=7)
     header.generating_software = program.encode("ascii", "replace").decode()[:32]
-    header.scales = np.full(3, _step(points - middle))
+    header.creation_date = MADE
+    step = _step(points - middle)
+    within = np.abs(points - middle).max(1) <= MOST_STEPS * step
+    points, cloud = points[within], cloud.chosen(within)
+    header.scales = np.full(3, step)
     header.offsets = middle + offset
     # names of PDAL for normals, as CloudCompare knows them
     extra = {f"Normal{axis}": column.astype(np.float32) for axis, column in zip("XYZ", cloud.normals.T, strict=True)}
@@ -77,11 +90,12 @@ def laz_bytes(cloud: PointCloud, offset: Sequence[float] = (0.0, 0.0, 0.0), crs:
     las = laspy.LasData(header)
     las.x, las.y, las.z = (points + offset).T
     las.red, las.green, las.blue = cloud.colors.T.astype(np.uint16) * FULL_RANGE
+    las.return_number[:] = las.number_of_returns[:] = 1
     for name, column in extra.items():
         las[name] = column
     data = io.BytesIO()
     las.write(data, do_compress=True, laz_backend=laspy.LazBackend.Lazrs)
-    return data.getvalue()
+    return data.getvalue(), int((~within).sum())
 
 
 def _counts(cloud: PointCloud) -> np.ndarray:
@@ -91,6 +105,5 @@ def _counts(cloud: PointCloud) -> np.ndarray:
 
 def _step(offsets: np.ndarray) -> float:
     """The length that whole numbers count, for points [n, 3] as seen from their middle: a power of ten."""
-    usual, most = float(np.median(np.linalg.norm(offsets, axis=1))), float(np.abs(offsets).max())
-    finest = STEP * usual if usual > 0 else 1e-3
-    return float(10.0 ** max(np.floor(np.log10(finest)), np.ceil(np.log10(max(most, 1e-300) / MOST_STEPS))))
+    usual = float(np.median(np.linalg.norm(offsets, axis=1)))
+    return float(10.0 ** np.floor(np.log10(STEP * usual if usual > 0 else 1e-3)))

@@ -3,7 +3,8 @@
 The largest features of a photo say which others show the same [Wu, Towards Linear-time Incremental Structure from
 Motion, 3DV 2013: preemptive matching]. Matching all features of a pair takes a hundred times as long, or more. A photo
 is matched with the best of its clear partners, with those next to it in name, and with a few whatever they share; pairs
-that have most in common connect all photos.
+that have most in common connect all photos. The best partners stand next to a photo: they tell little of depth, and of
+two passes around something they are all of the same one. So some of the further clear partners are matched, too.
 """
 
 from __future__ import annotations
@@ -24,9 +25,12 @@ LARGEST = 300  # features of each photo that are looked at
 # Photos that show nothing in common share two of these matches, and up to six; of pairs with 30 verified matches of
 # all features, 99 in 100 share six.
 CLEAR = 6
-MOST, LEAST = 12, 4  # partners of a photo: clear ones, and whatever they share
+MOST, LEAST = 12, 4  # partners of a photo that share most: clear ones, and whatever they share
+SPREAD, APART = 4, 4  # further clear partners: evenly from better to worse, and those that share least with the others
+TREES = 8  # pairs, at least, by which any some photos are connected with the rest
 NEXT = 2  # photos to each side in the order of names are partners, too: most captures are a walk
 BEST = 3  # partners that share most are near a photo, with those next to it
+AT_ONCE = 64  # photos that one is compared with in one product
 # COLMAP's tests of a match, as angles between descriptors: to the nearest one, and to it over that to the second.
 MAX_ANGLE, MAX_RATIO = 0.7, 0.8
 
@@ -75,13 +79,18 @@ def common_in(database: Path) -> tuple[list[int], list[str], Int[np.ndarray, "n 
 
 
 def largest_descriptors(database: Any, image_id: int) -> Float[np.ndarray, "k 128"]:
-    """Descriptors of the largest features of an image of an open COLMAP database, whole numbers."""
-    if not database.exists_descriptors(image_id):
+    """Descriptors of the largest features of an image of an open COLMAP database, whole numbers.
+
+    Features that match nothing (see `stages.posing.features.append`), whose descriptors are zero, are passed over.
+    """
+    if not database.num_descriptors_for_image(image_id):
         return np.zeros((0, 128), np.float32)
     keypoints = database.read_keypoints(image_id)
     areas = np.abs(keypoints[:, 2] * keypoints[:, 5] - keypoints[:, 3] * keypoints[:, 4])
-    order = np.argsort(-areas, kind="stable")[:LARGEST]
-    return np.asarray(database.read_descriptors(image_id).data)[order].astype(np.float32)
+    descriptors = np.asarray(database.read_descriptors(image_id).data)
+    order = np.argsort(-areas, kind="stable")
+    known = np.asarray(descriptors.any(axis=1))
+    return descriptors[order[known[order]][:LARGEST]].astype(np.float32)
 
 
 def common_features(descriptors: list[Float[np.ndarray, "_ 128"]]) -> Int[np.ndarray, "n n"]:
@@ -94,11 +103,16 @@ def common_features(descriptors: list[Float[np.ndarray, "_ 128"]]) -> Int[np.nda
     ends = np.cumsum([len(each) for each in descriptors])
     stacked = np.concatenate(descriptors) if descriptors else np.zeros((0, 128), np.float32)
     lengths = np.maximum(np.linalg.norm(stacked, axis=1), 1)
-    for i, own in enumerate(descriptors[:-1]):
-        # of one photo and all later ones at once: many small products would lose their time between threads
-        cosines = own @ stacked[ends[i] :].T / (lengths[ends[i] - len(own) : ends[i], None] * lengths[ends[i] :])
-        for j, block in enumerate(np.split(cosines, ends[i + 1 : -1] - ends[i], axis=1), i + 1):
-            common[i, j] = common[j, i] = count_matches(block)
+    for i, own in enumerate(descriptors):
+        # of one photo and many later ones at once: many small products would lose their time between threads
+        for start in range(i + 1, number, AT_ONCE):
+            stop = min(start + AT_ONCE, number)
+            others = slice(ends[start - 1], ends[stop - 1])
+            cosines = own @ stacked[others].T
+            cosines /= lengths[ends[i] - len(own) : ends[i], None]
+            cosines /= lengths[others]
+            for j, block in enumerate(np.split(cosines, ends[start : stop - 1] - ends[start - 1], axis=1), start):
+                common[i, j] = common[j, i] = count_matches(block)
     return common
 
 
@@ -121,23 +135,39 @@ def count_matches(cosines: Float[np.ndarray, "k m"]) -> int:
 def choose_pairs(common: Int[np.ndarray, "n n"]) -> list[tuple[int, int]]:
     """Pairs (i < j) to match, given how many features each two photos have in common."""
     chosen = set(_connecting(common))
-    for i, own in enumerate(common):
-        partners = [int(j) for j in np.argsort(-own, kind="stable") if j != i]
-        chosen |= {
-            (min(i, j), max(i, j))
-            for rank, j in enumerate(partners[:MOST])
-            if rank < LEAST or own[j] >= CLEAR
-        }  # fmt: skip
+    for i in range(len(common)):
+        chosen |= {(min(i, j), max(i, j)) for j in _partners(common, i)}
     return sorted(chosen)
 
 
+def _partners(common: Int[np.ndarray, "n n"], i: int) -> list[int]:
+    """The best partners of one photo, and some of its further clear ones."""
+    own = common[i]
+    ranked = [int(j) for j in np.argsort(-own, kind="stable") if j != i]
+    clear = [j for j in ranked if own[j] >= CLEAR]
+    partners, further = ranked[: max(LEAST, min(MOST, len(clear)))], clear[MOST:]
+    if further:
+        partners += [further[k] for k in sorted(set(np.linspace(0, len(further) - 1, SPREAD).astype(int).tolist()))]
+    for _ in range(APART):
+        left = [j for j in further if j not in partners]
+        if not left:
+            break
+        shared = common[np.ix_(left, partners)].max(axis=1, initial=0)
+        partners.append(left[int(shared.argmin())])
+    return partners
+
+
 def _connecting(common: Int[np.ndarray, "n n"]) -> list[tuple[int, int]]:
-    """The spanning tree whose pairs have most in common."""
+    """Spanning trees whose pairs have most in common, one after another, each of pairs that those before left."""
     from scipy.sparse.csgraph import minimum_spanning_tree
 
     costs = np.triu(common.max(initial=0) + 1 - common, 1)  # above zero, which would be no edge
-    first, second = minimum_spanning_tree(costs).nonzero()
-    return [(min(i, j), max(i, j)) for i, j in zip(first.tolist(), second.tolist(), strict=True)]
+    found = []
+    for _ in range(TREES):
+        first, second = minimum_spanning_tree(costs).nonzero()
+        found += [(min(i, j), max(i, j)) for i, j in zip(first.tolist(), second.tolist(), strict=True)]
+        costs[first, second] = 0
+    return found
 
 
 # ---------------------------------------------------------------- matching

@@ -68,6 +68,11 @@ class Depth:
     zoomed: Mapping[Names, float] = field(default_factory=dict)
     is_flat: bool = False
 
+    @property
+    def from_one_place(self) -> bool:
+        """Whether turning alone, or turning and zooming, explains the matches."""
+        return any(map(_shows_none, (self.parallaxes, self.zoomed)))
+
 
 def judge_depth(database: Path) -> Depth:
     """Look at pairs of photos, taken evenly of all that matched."""
@@ -99,7 +104,7 @@ def refuse_one_place(depth: Depth) -> None:
         ReconstructionError: turning alone, or turning and zooming, explains their matches.
     """
     for found, did in ((depth.parallaxes, "turns"), (depth.zoomed, "turns and zooms")):
-        if not found or _most(found) >= MIN_PARALLAX:
+        if not _shows_none(found):
             continue
         names = sorted(set().union(*found))
         flat = " (or something flat was photographed from straight ahead, nearer and nearer)" if "zooms" in did else ""
@@ -110,6 +115,10 @@ def refuse_one_place(depth: Depth) -> None:
             "Walk around the subject, a step to the side for each photo, add these photos to the folder, and try "
             "`hineus run PHOTOS --until sfm`.",
         )
+
+
+def _shows_none(found: Mapping[Names, float]) -> bool:
+    return bool(found) and _most(found) < MIN_PARALLAX
 
 
 def _most(found: Mapping[Names, float]) -> float:
@@ -136,13 +145,30 @@ def _by_zooming(pairs: Mapping[Names, Pair]) -> tuple[float, dict[Names, float]]
 
 
 def from_one_place(found: Mapping[Names, float]) -> list[str]:
-    """The most photos that one of them, which is among them, shows no parallax to; none where all do."""
-    places: dict[str, set[str]] = {}
-    for names, parallax in found.items():
-        if parallax < MIN_PARALLAX:
-            for name in names:
-                places.setdefault(name, set()).update(names)
-    return sorted(max(places.values(), key=len, default=()))
+    """The most photos that one of them, which is among them, shows no parallax to, and those that belong to them.
+
+    Not every pair was matched. A photo belongs to others where at least `MIN_PAIRS` pairs with them were, and nearly
+    all of these show no parallax: on a dense walk pairs of neighbours show none, and others do.
+
+    Returns:
+        Names, sorted; none where all pairs show parallax.
+    """
+    partners: dict[str, dict[str, bool]] = {}  # photo -> partner -> whether they show no parallax
+    for (first, second), parallax in found.items():
+        partners.setdefault(first, {})[second] = parallax < MIN_PARALLAX
+        partners.setdefault(second, {})[first] = parallax < MIN_PARALLAX
+    stars = ({name, *still} for name, of in sorted(partners.items()) if (still := [k for k in of if of[k]]))
+    place = max(stars, key=len, default=set[str]())
+    grown = {""}
+    while grown:
+        seen = {name: [still for k, still in of.items() if k in place] for name, of in partners.items()}
+        grown = {
+            name
+            for name, pairs in seen.items()
+            if name not in place and len(pairs) >= MIN_PAIRS and sum(pairs) >= PAIRS_SHARE * len(pairs)
+        }
+        place |= grown
+    return sorted(place)
 
 
 def two_places(model: Any) -> tuple[list[str], list[str]]:

@@ -147,7 +147,8 @@ class Workbench:
             ]
             self.priors = {camera.camera_id: camera.mean_focal_length() for camera in cameras}
         self.matcher = choose_matcher(params, self.located, len(self.names))
-        if self.matcher == PREEMPTIVE and self._at_once > 1:  # of views of one place the best partners tell least
+        if params.matcher == "auto" and self.matcher == PREEMPTIVE and self._at_once > 1:
+            # of views of one place the best partners tell least
             self.matcher = EXHAUSTIVE
 
     def database(self, base: Base | None = None) -> Path:
@@ -217,6 +218,8 @@ class Workbench:
         if not base.focal_priors:
             forget_focal_priors(self.database(base), self.params.camera_model, self._known)
         self._features_and_matches(base, best)
+        if self.matcher == PREEMPTIVE:  # few of the likely partners of a new photo may be known ones
+            self._match_pairs(base, self._pairs_with(base, self.known.new))
         self.depth = judge_depth(self.database())
         if not self.known.changed:
             return self._solution_of(base, [renamed_model(self.known)])
@@ -227,6 +230,8 @@ class Workbench:
         """The chosen matcher and mapper."""
         self._features_and_matches(self._first, best)
         self.depth = judge_depth(self.database())
+        if self.depth.from_one_place and self._match_all(self._first):
+            self.depth = judge_depth(self.database())
         refuse_one_place(self.depth)
         return self._solve(self._first, self.params.mapper)
 
@@ -342,16 +347,30 @@ class Workbench:
         self._extract(base)
         self._tell(PART_FEATURES, "matches")
         self._match(base)
-        if not self._stationary and has_still_background(self.database(base)):
+        if not self._stationary and self._has_still_background(base):
             log.info("the background stands still while the object turns: its matches are left out")
             self._stationary = True
-            if self.matcher == PREEMPTIVE:  # which went by the background
-                self.matcher = EXHAUSTIVE
-                self._match(base)
             self._verify_again(base)
         if best is not None and self.matcher != EXHAUSTIVE:
             self._match_pairs(base, self._pairs_to_try(base, best))
         self._tell(PART_MATCHES, "poses")
+
+    def _has_still_background(self, base: Base) -> bool:
+        """Of all pairs, too: of likely ones, which are near each other, little moves that is far away or on an axis."""
+        path = self.database(base)
+        return has_still_background(path) and (not self._match_all(base) or has_still_background(path))
+
+    def _match_all(self, base: Base) -> bool:
+        """Match all pairs, from now on, where only likely ones were matched; else False.
+
+        No verdict on a capture goes by likely pairs alone.
+        """
+        if self.matcher != PREEMPTIVE:
+            return False
+        log.info("all pairs are matched, to be sure of what the likely ones tell")
+        self.matcher = EXHAUSTIVE
+        self._match(base)
+        return True
 
     def _matched_by_poses(self, base: Base, model: Any, descriptors: Any) -> tuple[Solution | None, int]:
         """Match again where the poses found allow it, and go on from them; how many photos then match nothing.
@@ -420,15 +439,18 @@ class Workbench:
 
     def _pairs_to_try(self, base: Base, best: Solution | None) -> list[tuple[int, int]]:
         """Image ids of all pairs with a photo that has no pose; of all pairs where no photo has one."""
+        return self._pairs_with(base, self.names - (frozenset() if best is None else best.registered))
+
+    def _pairs_with(self, base: Base, names: Collection[str]) -> list[tuple[int, int]]:
+        """Image ids of all pairs with one of these photos."""
         import pycolmap
 
-        registered = frozenset[str]() if best is None else best.registered
         with pycolmap.Database.open(self.database(base)) as database:
             images = sorted((image.image_id, image.name) for image in database.read_all_images())
         return [
             (first, second)
             for (first, name), (second, other) in combinations(images, 2)
-            if name not in registered or other not in registered
+            if name in names or other in names
         ]
 
     def _import(self, base: Base) -> None:

@@ -36,16 +36,17 @@ def fused(
     if not total:
         return PointCloud.empty()
     stride = max(1, int(np.ceil(np.sqrt(total / MAX_DEPTHS))))
-    rows, photos, cells = [], [], []
+    counts = [int((trust[::stride, ::stride] > 0).sum()) for trust in trusts]
+    ends = np.cumsum(counts)
+    rows, cells = np.empty((ends[-1], 10), np.float32), np.empty(ends[-1], np.uint64)
     for k, (view, depth, trust, color) in enumerate(zip(views, depths, trusts, colors, strict=True)):
         v, u = (stride * each for each in np.nonzero(trust[::stride, ::stride] > 0))
-        at, weights = places(view, depth, v, u), trust[v, u][:, None]
-        row = np.empty((len(v), 10), np.float32)
+        at, of_photo = places(view, depth, v, u), slice(ends[k] - counts[k], ends[k])
+        row = rows[of_photo]
         row[:, :3], row[:, 3:6], row[:, 6:9], row[:, 9] = at, normals_at(view, depth, v, u), color[v, u], 1
-        rows.append(row * weights)
-        photos.append(np.full(len(v), k, np.int32))
-        cells.append(_cells(at, depth[v, u] * stride / view.focal))
-    return _means(np.concatenate(rows), np.concatenate(photos), np.concatenate(cells))
+        row *= trust[v, u][:, None]
+        cells[of_photo] = _cells(at, depth[v, u] * stride / view.focal)
+    return _means(rows, np.repeat(np.arange(len(views), dtype=np.int32), counts), cells)
 
 
 def _cells(points: Float[np.ndarray, "n 3"], widths: Float[np.ndarray, " n"]) -> UInt64[np.ndarray, " n"]:
@@ -64,7 +65,9 @@ def _means(
     order = np.lexsort((photos, key))
     key, photos = key[order], photos[order]
     first = np.flatnonzero(np.concatenate([[True], key[1:] != key[:-1]]))
-    sums = np.add.reduceat(rows[order], first, axis=0)
+    sums = np.empty((len(first), 10), np.float32)
+    for column in range(10):  # one at a time: memory
+        sums[:, column] = np.add.reduceat(rows[order, column], first)
     seen_first = np.concatenate([[True], (key[1:] != key[:-1]) | (photos[1:] != photos[:-1])])
     starts = np.concatenate([np.cumsum(seen_first)[first] - 1, [seen_first.sum()]])
     trust = sums[:, 9] / np.diff(np.append(first, len(key)))

@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from stages.artifacts.pictures import IMAGES, Pictures, write_png
-from stages.compiling import njit
 from stages.geometry.cameras import PinholeCameras, PosedScene
 from stages.posing.colmap_model import pinhole_model
 from stages.stereo.depths import views_of
@@ -26,8 +25,6 @@ if TYPE_CHECKING:
 
 # Each photo is compared with so many at most: those that share the most sparse points with it. COLMAP's own choice.
 SOURCES = 20
-# A depth that so many of them agree with is trusted fully, one that a quarter of these agree with by a quarter.
-ENOUGH = 4
 # Gigabytes of photos and maps that COLMAP keeps in memory.
 CACHE_GB = 4.0
 POLL_S = 1.0
@@ -41,7 +38,7 @@ def patch_match_depths(
     folder: Path,
     max_side: int,
     progress: Callable[[float, float, str], None],
-) -> Iterator[tuple[int, Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]]:
+) -> Iterator[tuple[int, Float32[np.ndarray, "h w"]]]:
     """Match all photos with their neighbours, then give them back one by one. Needs a GPU.
 
     Args:
@@ -51,8 +48,8 @@ def patch_match_depths(
         progress: told how many of how many maps are there; each photo has two.
 
     Returns:
-        Number of the photo, its depths along the optical axis in units of the scene, 0 where unknown, and their trust
-        in [0, 1]. Photos that overlap with no other are left out.
+        Number of the photo, and its depths along the optical axis in units of the scene, 0 where unknown. Photos that
+        overlap with no other are left out.
 
     Raises:
         ValueError: pycolmap's, where there is no GPU.
@@ -61,7 +58,7 @@ def patch_match_depths(
     _match(folder, len(reduced), progress)
     for index in range(len(reduced)):
         if depth_path(folder, index).exists():
-            yield index, *read_depths(folder, index, reduced.sizes[index])
+            yield index, read_depths(folder, index, reduced.sizes[index])
 
 
 def write_workspace(scene: PosedScene, pictures: Pictures, folder: Path, max_side: int) -> PinholeCameras:
@@ -87,7 +84,7 @@ def write_workspace(scene: PosedScene, pictures: Pictures, folder: Path, max_sid
     )
     (folder / "sparse").mkdir(parents=True)
     sparse_model(colmap, scene.points, scene.observations).write_binary(str(folder / "sparse"))
-    for kind in ("depth_maps", "normal_maps", "consistency_graphs"):
+    for kind in ("depth_maps", "normal_maps"):
         (folder / "stereo" / kind).mkdir(parents=True)
     seen = np.bincount(scene.observations[:, 0], minlength=len(cameras))
     names = [_name(index) for index in np.flatnonzero(seen >= MIN_POINTS).tolist()]
@@ -129,16 +126,11 @@ def depth_path(folder: Path, index: int) -> Path:
     return folder / "stereo" / "depth_maps" / f"{_name(index)}.geometric.bin"
 
 
-def read_depths(
-    folder: Path, index: int, size: Integer[np.ndarray, " 2"]
-) -> tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
-    """Depths of a photo of that size (without its margin), 0 where unknown, and their trust: how many photos agree."""
+def read_depths(folder: Path, index: int, size: Integer[np.ndarray, " 2"]) -> Float32[np.ndarray, "h w"]:
+    """Depths of a photo of that size (without its margin), 0 where unknown."""
     width, height = size.tolist()
     depth = read_array(depth_path(folder, index))[:height, :width]
-    agreeing = read_agreeing(folder / "stereo" / "consistency_graphs" / f"{_name(index)}.geometric.bin")
-    known = np.isfinite(depth) & (depth > 0)
-    trust = np.minimum(agreeing[:height, :width] / ENOUGH, 1)
-    return np.where(known, depth, 0).astype(np.float32), np.where(known, trust, 0).astype(np.float32)
+    return np.where(np.isfinite(depth) & (depth > 0), depth, 0).astype(np.float32)
 
 
 def read_array(path: Path) -> Float32[np.ndarray, "h w"]:
@@ -147,39 +139,17 @@ def read_array(path: Path) -> Float32[np.ndarray, "h w"]:
     Raises:
         ValueError: it holds another number of them.
     """
-    (width, height), numbers = _parts(path, "<f4")
-    if len(numbers) != width * height:
-        raise ValueError(f"{path}: expected {width} x {height} numbers, got {len(numbers)}")
-    return numbers.reshape(height, width)
-
-
-def read_agreeing(path: Path) -> Integer[np.ndarray, "h w"]:
-    """How many photos agree with the depth of each pixel, from COLMAP's consistency graph: column, row, n, n photos."""
-    (width, height), numbers = _parts(path, "<i4")
-    counts = np.zeros((height, width), np.int32)
-    _count(numbers, counts)
-    return counts
-
-
-@njit(cache=True)
-def _count(numbers, counts):  # type: ignore[no-untyped-def]
-    at = 0
-    while at + 2 < len(numbers):
-        counts[numbers[at + 1], numbers[at]] = numbers[at + 2]
-        at += 3 + numbers[at + 2]
-
-
-def _parts(path: Path, kind: str) -> tuple[tuple[int, int], np.ndarray]:
-    """Width and height in the header of a file of COLMAP's, and what follows."""
     width, height, _, data = path.read_bytes().split(b"&", 3)
-    return (int(width), int(height)), np.frombuffer(data, kind)
+    numbers, shape = np.frombuffer(data, "<f4"), (int(height), int(width))
+    if len(numbers) != shape[0] * shape[1]:
+        raise ValueError(f"{path}: expected {shape[1]} x {shape[0]} numbers, got {len(numbers)}")
+    return numbers.reshape(shape)
 
 
 def _match(folder: Path, photos: int, progress: Callable[[float, float, str], None]) -> None:
     import pycolmap
 
     options = pycolmap.PatchMatchOptions()
-    options.write_consistency_graph = True
     options.allow_missing_files = True  # of photos that are compared with, but not matched themselves
     options.cache_size = CACHE_GB
     with ThreadPoolExecutor(1) as pool:

@@ -8,8 +8,9 @@ the mesh, and between the points d should change slowly, and go back to nothing 
 with q_i the place on the mesh next to point i and r_i its signed distance from there, in cells. The middle term has no
 unit of length, so the same number of points outweighs it on a fine mesh and on a coarse one. Points that disagree with
 their surroundings lose their weight w_i (iteratively reweighted least squares, Geman and McClure 1987), and so do
-surroundings where points scatter, or where few photos say the same: what a point is off by falls from 0.5 % of a
-helmet's extent, where one photo says it, to 0.1 %, where 13 do.
+surroundings where points scatter. Where they scatter much, where they are few, or where few photos say the same, the
+displacement is not believed: what a point is off by falls from 0.5 % of a helmet's extent, where one photo says it, to
+0.1 %, where 13 do.
 """
 
 from __future__ import annotations
@@ -21,8 +22,8 @@ import numpy as np
 
 from stages.compiling import njit
 from stages.geometry.point_cloud import PointCloud
-from stages.surface.moving import Rings, directions_of, rings_of, unit, without_folds
-from stages.surface.triangle_mesh import MAX_RAYS, raycaster
+from stages.surface.moving import Rings, directions_of, rings_of, unit, within_gaps, without_folds
+from stages.surface.triangle_mesh import raycaster
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
@@ -41,17 +42,13 @@ SWEEPS = 12
 OUTLIER = 2.0
 # Scatter, in cells, that is never undercut: what SGBM rounds to, and poses are off by.
 LEAST_SCATTER = 0.3
-# So many photos that say the same are believed in full.
-ENOUGH_PHOTOS = 10.0
 # Where fewer points than this are to a vertex, or photos to a point, most of the displacement is not believed.
 FEW_POINTS = 0.1
-FEW_PHOTOS = 2.0
+FEW_PHOTOS = 3.0
+# Nor where they scatter by more cells than this, outliers aside: on plain walls they are off together.
+WIDE_SCATTER = 0.3
 # Rings over which scatter, photos and the displacements themselves are averaged.
 SMOOTHING_RINGS = 3
-# A vertex moves by no more than this part of the way to the next surface, so two sides of a wall never meet.
-GAP_PART = 0.4
-# Rays start so many cells off: on the surface they would meet it at once.
-RAY_START = 0.3
 _TINY = 1e-12
 
 
@@ -118,9 +115,8 @@ def fit_to_points(
     evidence = _beside(vertices, faces, directions, cloud.chosen(cloud.trust > 0), cell)
     if not len(evidence.weights):
         return same
-    moves = cell * _displacements(evidence, rings)
-    limit = GAP_PART * _gaps(vertices, faces, directions, moves, cell)
-    moved = vertices + np.clip(moves, -limit, limit)[:, None] * directions
+    moves = cell * _displacements(evidence, rings)[:, None] * directions
+    moved = vertices + within_gaps(vertices, faces, directions, moves, cell)
     moved, folds = without_folds(vertices, faces, directions, moved, rings)
     return Fit(moved.astype(np.float32), len(evidence.weights), folds)
 
@@ -153,7 +149,6 @@ def _displacements(evidence: _Evidence, rings: Rings) -> np.ndarray:
     """Displacement [V] in cells that the points ask for, see the top of this file."""
     moves = np.zeros(len(rings.starts) - 1)
     _, photos = _around(evidence, evidence.photos, evidence.weights, rings)
-    agreed = np.minimum(photos / ENOUGH_PHOTOS, 1) ** 3
     weights, inliers = evidence.weights, np.ones(len(evidence.weights))
     for _ in range(ROUNDS):
         pull, aim = _gathered(evidence.corners, evidence.shares, evidence.distances, weights, len(moves))
@@ -161,11 +156,12 @@ def _displacements(evidence: _Evidence, rings: Rings) -> np.ndarray:
         off = (evidence.distances - evidence.at_points(moves)) ** 2
         _, variance = _around(evidence, off, inliers * evidence.weights, rings)
         inliers = 1 / (1 + off / (OUTLIER**2 * (LEAST_SCATTER**2 + evidence.at_points(variance)))) ** 2
-        # What is off for a reason, and not by chance, does not average out: so cubes and squares.
-        local = agreed / (LEAST_SCATTER**2 + variance) ** 2
+        # What is off for a reason, and not by chance, does not average out: so the variance squared.
+        local = 1 / (LEAST_SCATTER**2 + variance) ** 2
         weights = inliers * evidence.weights * evidence.at_points(local)
     density, _ = _around(evidence, evidence.photos, np.ones(len(weights)), rings)
     support = density**2 / (density**2 + FEW_POINTS**2) * photos**4 / (photos**4 + FEW_PHOTOS**4)
+    support /= 1 + (variance / WIDE_SCATTER**2) ** 4
     return rings.mean((support * moves)[:, None], SMOOTHING_RINGS)[:, 0]
 
 
@@ -176,28 +172,6 @@ def _around(
     sums = _gathered(evidence.corners, evidence.shares, values, weights, len(rings.starts) - 1)
     weight, total = rings.mean(np.stack(sums, axis=1), SMOOTHING_RINGS).T
     return weight, total / np.maximum(weight, _TINY)
-
-
-def _gaps(
-    vertices: np.ndarray, faces: np.ndarray, directions: np.ndarray, moves: np.ndarray, cell: float
-) -> np.ndarray:
-    """How far [V] each vertex may move before it meets a surface that is turned the other way."""
-    import open3d as o3d
-
-    scene = raycaster(vertices, faces)
-    gaps = np.full(len(vertices), np.inf)
-    moving = np.flatnonzero(moves)
-    for first in range(0, len(moving), MAX_RAYS):
-        part = moving[first : first + MAX_RAYS]
-        ways = directions[part] * np.sign(moves[part])[:, None]
-        rays = np.concatenate([vertices[part] + RAY_START * cell * ways, ways], axis=1)
-        answers = scene.cast_rays(o3d.core.Tensor(rays.astype(np.float32)))
-        lengths = answers["t_hit"].numpy() + RAY_START * cell
-        met = np.isfinite(lengths)
-        there = directions[faces[answers["primitive_ids"].numpy()[met]]].sum(1)
-        other = np.einsum("nc,nc->n", there, directions[part[met]]) < 0
-        gaps[part[met][other]] = lengths[met][other]
-    return gaps
 
 
 @njit(cache=True, nogil=True)
