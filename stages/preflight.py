@@ -178,7 +178,7 @@ def preflight(
     if needs.memory_gib > memory:
         shortages.append(
             f"It may take {needs.memory_gib:.1f} GiB of memory, {memory:.1f} are free: close other programs, or try "
-            "`--set undistort.max_side=800`, `--workers 1`."
+            "`--set undistort.max_side=800`, `--set densify.side=600`, `--workers 1`."
         )
     if not os.access(folder, os.W_OK):
         shortages.append(f"{folder} cannot be written: try `--workspace DIR`.")

@@ -12,7 +12,7 @@ from stages.surface import fitting
 from stages.surface.denoising import denoised
 from stages.surface.fitting import fit_to_points
 from stages.surface.isosurface import extract_isosurface
-from stages.surface.moving import directions_of, rings_of, without_folds
+from stages.surface.moving import directions_of, rings_of, within_gaps, without_folds
 from stages.surface.triangle_mesh import face_normals
 
 RESOLUTION = 40
@@ -126,6 +126,30 @@ def test_the_sides_of_a_wall_never_meet():
     assert not folds(vertices, fit.vertices, faces).any()
 
 
+def test_the_sides_of_a_thin_wall_are_not_smoothed_into_each_other():
+    box = extract_isosurface(lambda p: (np.abs(p) - np.array([0.5, 0.5, 0.06])).max(1).astype(np.float32), RESOLUTION)
+    # A corrugated sheet, less than a fifth of a cell thick: its top alone would go straight through its bottom.
+    sheet = box.vertices * np.array([1, 1, 0.08 * CELL / 0.06])
+    sheet[:, 2] += 0.3 * CELL * np.sin(2 * np.pi / (5 * CELL) * sheet[:, 0])
+    top = (np.abs(box.vertices[:, :2]).max(1) < 0.4) & (box.vertices[:, 2] > 0)
+    up = (denoised(sheet, box.faces, 5) - sheet)[top, 2]
+    assert up.max() > 0.12 * CELL  # away from the bottom nothing holds it
+    assert up.min() > -0.41 * 0.16 * CELL
+
+
+def test_what_meets_its_own_side_first_still_finds_the_other():
+    """A ray that grazes a face of its own side goes on beyond it."""
+    steps = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], dtype=float)
+    vertices = np.concatenate([steps + np.array([0, 0, height]) for height in (0.0, 0.4, 1.0)])
+    faces = np.array([[0, 1, 2], [3, 4, 5], [6, 8, 7]])
+    directions = np.repeat([[0.0, 0, 1], [0, 0, 1], [0, 0, -1]], 3, axis=0)
+    moves = np.zeros_like(vertices)
+    vertices[0, :2], moves[0] = 0.1, [0, 0, 3]
+    moved = within_gaps(vertices, faces, directions, moves, 0.5)
+    np.testing.assert_allclose(moved[0], [0, 0, 0.4], atol=1e-5)
+    assert not moved[1:].any()
+
+
 def test_displacements_are_the_minimum_that_is_written_down(sphere):
     vertices, faces = sphere
     rings = rings_of(faces, len(vertices))
@@ -177,12 +201,20 @@ def test_a_noisy_box_comes_out_flat_with_its_edges():
     noisy = (box.vertices + 0.08 * CELL * rng.normal(size=box.vertices.shape)).astype(np.float32)
     smooth = denoised(noisy, box.faces, 5)
 
-    def off(vertices):
-        """How far vertices of the faces' middles are from their planes; and the box's volume near its edges."""
-        middle = np.sort(np.abs(box.vertices), axis=1)[:, 1] < 0.4
-        return np.abs(np.abs(vertices[middle]).max(1) - 0.5).mean()
+    places = np.sort(np.abs(box.vertices), axis=1)
+    middles, beside_edges = places[:, 1] < 0.4, places[:, 1] > 0.5 - 1.01 * CELL
 
-    assert off(smooth) < 0.6 * off(noisy)
+    def off(vertices, rows):
+        """How far vertices are from the box's surface."""
+        beyond = np.abs(vertices[rows]) - 0.5
+        outside, inside = np.linalg.norm(np.maximum(beyond, 0), axis=1), np.minimum(beyond.max(1), 0)
+        return np.abs(outside + inside).mean()
+
+    assert off(smooth, middles) < 0.6 * off(noisy, middles)
+    assert off(smooth, beside_edges) < 0.7 * off(noisy, beside_edges)
+    # A filter that rounds the edges off makes them worse.
+    rounded = rings_of(box.faces, len(noisy)).mean(noisy)
+    assert off(rounded, beside_edges) > 2 * off(noisy, beside_edges)
     # The noise-free mesh, as sharp as its cells let it be, hardly moves.
     still = denoised(box.vertices, box.faces, 5)
     assert np.linalg.norm(still - box.vertices, axis=1).max() < 0.25 * CELL

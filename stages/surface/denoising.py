@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from stages.compiling import njit
-from stages.surface.moving import directions_of, rings_of, without_folds
+from stages.surface.moving import directions_of, rings_of, within_gaps, without_folds
 from stages.surface.triangle_mesh import face_normals
 
 if TYPE_CHECKING:
@@ -27,7 +27,9 @@ FOLLOWING = 2
 def denoised(
     vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], rounds: int
 ) -> Float[np.ndarray, "v 3"]:
-    """Vertices moved so that the faces' normals vary less, but across edges; no face folds that did not before.
+    """Vertices moved so that the faces' normals vary less, but across edges.
+
+    No face folds that did not before, and the two sides of a wall stay apart.
 
     Args:
         rounds: of the filter, each over the faces around a face; 0 changes nothing.
@@ -54,7 +56,9 @@ def denoised(
         normals = _filtered(normals, places[faces].mean(1), areas, faces, starts, around, reach, NORMAL_SPREAD)
     _follow(places, faces, normals, areas, starts, around, FOLLOWING * rounds)
     rings = rings_of(faces, len(vertices))
-    places, _ = without_folds(vertices, faces, directions_of(vertices, faces, rings), places, rings)
+    directions = directions_of(vertices, faces, rings)
+    places = vertices + within_gaps(vertices, faces, directions, places - vertices, reach)
+    places, _ = without_folds(vertices, faces, directions, places, rings)
     return places.astype(np.float32)
 
 

@@ -22,8 +22,8 @@ import numpy as np
 
 from stages.compiling import njit
 from stages.geometry.point_cloud import PointCloud
-from stages.surface.moving import Rings, directions_of, rings_of, unit, without_folds
-from stages.surface.triangle_mesh import MAX_RAYS, raycaster
+from stages.surface.moving import Rings, directions_of, rings_of, unit, within_gaps, without_folds
+from stages.surface.triangle_mesh import raycaster
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
@@ -49,10 +49,6 @@ FEW_PHOTOS = 3.0
 WIDE_SCATTER = 0.3
 # Rings over which scatter, photos and the displacements themselves are averaged.
 SMOOTHING_RINGS = 3
-# A vertex moves by no more than this part of the way to the next surface, so two sides of a wall never meet.
-GAP_PART = 0.4
-# Rays start so many cells off: on the surface they would meet it at once.
-RAY_START = 0.3
 _TINY = 1e-12
 
 
@@ -119,9 +115,8 @@ def fit_to_points(
     evidence = _beside(vertices, faces, directions, cloud.chosen(cloud.trust > 0), cell)
     if not len(evidence.weights):
         return same
-    moves = cell * _displacements(evidence, rings)
-    limit = GAP_PART * _gaps(vertices, faces, directions, moves, cell)
-    moved = vertices + np.clip(moves, -limit, limit)[:, None] * directions
+    moves = cell * _displacements(evidence, rings)[:, None] * directions
+    moved = vertices + within_gaps(vertices, faces, directions, moves, cell)
     moved, folds = without_folds(vertices, faces, directions, moved, rings)
     return Fit(moved.astype(np.float32), len(evidence.weights), folds)
 
@@ -177,28 +172,6 @@ def _around(
     sums = _gathered(evidence.corners, evidence.shares, values, weights, len(rings.starts) - 1)
     weight, total = rings.mean(np.stack(sums, axis=1), SMOOTHING_RINGS).T
     return weight, total / np.maximum(weight, _TINY)
-
-
-def _gaps(
-    vertices: np.ndarray, faces: np.ndarray, directions: np.ndarray, moves: np.ndarray, cell: float
-) -> np.ndarray:
-    """How far [V] each vertex may move before it meets a surface that is turned the other way."""
-    import open3d as o3d
-
-    scene = raycaster(vertices, faces)
-    gaps = np.full(len(vertices), np.inf)
-    moving = np.flatnonzero(moves)
-    for first in range(0, len(moving), MAX_RAYS):
-        part = moving[first : first + MAX_RAYS]
-        ways = directions[part] * np.sign(moves[part])[:, None]
-        rays = np.concatenate([vertices[part] + RAY_START * cell * ways, ways], axis=1)
-        answers = scene.cast_rays(o3d.core.Tensor(rays.astype(np.float32)))
-        lengths = answers["t_hit"].numpy() + RAY_START * cell
-        met = np.isfinite(lengths)
-        there = directions[faces[answers["primitive_ids"].numpy()[met]]].sum(1)
-        other = np.einsum("nc,nc->n", there, directions[part[met]]) < 0
-        gaps[part[met][other]] = lengths[met][other]
-    return gaps
 
 
 @njit(cache=True, nogil=True)

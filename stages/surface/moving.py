@@ -1,14 +1,14 @@
-"""What moves vertices shares: who is beside whom, smooth directions, and that no face folds."""
+"""What moves vertices shares: who is beside whom, smooth directions, that no face folds and no wall's sides meet."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from stages.compiling import njit
-from stages.surface.triangle_mesh import face_normals, vertex_normals
+from stages.surface.triangle_mesh import MAX_RAYS, face_normals, raycaster, vertex_normals
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
@@ -20,6 +20,12 @@ FOLD_COSINE = 0.3
 # Where faces would fold, the vertices around them slide apart this many times; then the move is halved so often.
 SLIDES = 6
 HALVINGS = 12
+# A vertex moves by no more than this part of the way to the next surface, so two sides of a wall never meet.
+GAP_PART = 0.4
+# Rays start so many cells off: on the surface they would meet it at once.
+RAY_START = 0.03
+# So often they are cast, to go on beyond what is turned the same way.
+PASSES = 4
 
 
 @dataclass(frozen=True)
@@ -56,6 +62,49 @@ def directions_of(
 def unit(vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
     """The vectors at length 1; zero stays zero."""
     return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), np.finfo(np.float32).tiny)
+
+
+def within_gaps(
+    vertices: Float[np.ndarray, "v 3"],
+    faces: Int[np.ndarray, "f 3"],
+    directions: Float[np.ndarray, "v 3"],
+    moves: Float[np.ndarray, "v 3"],
+    cell: float,
+) -> Float[np.ndarray, "v 3"]:
+    """The moves, shortened to `GAP_PART` of the way to the next surface that is turned the other way."""
+    scene, moves = raycaster(vertices, faces), moves.copy()
+    moving = np.flatnonzero(moves.any(1))
+    for first in range(0, len(moving), MAX_RAYS):
+        part = moving[first : first + MAX_RAYS]
+        gaps = _gaps(scene, vertices, faces, directions, moves, part, RAY_START * cell)
+        moves[part] *= np.minimum(1, GAP_PART * gaps / np.linalg.norm(moves[part], axis=1))[:, None]
+    return moves
+
+
+def _gaps(
+    scene: Any, vertices: np.ndarray, faces: np.ndarray, directions: np.ndarray, moves: np.ndarray,
+    rows: np.ndarray, start: float,
+) -> np.ndarray:  # fmt: skip
+    """How far [n] vertices may move before they meet a surface that is turned the other way."""
+    import open3d as o3d
+
+    gaps, starts, left = np.full(len(rows), np.inf), np.full(len(rows), start), np.arange(len(rows))
+    ways = directions[rows] * np.sign(np.einsum("nc,nc->n", moves[rows], directions[rows]))[:, None]
+    for _ in range(PASSES):
+        rays = np.concatenate([vertices[rows[left]] + starts[left, None] * ways[left], ways[left]], axis=1)
+        answers = scene.cast_rays(o3d.core.Tensor(rays.astype(np.float32)))
+        lengths = answers["t_hit"].numpy()
+        met = np.isfinite(lengths)
+        left = left[met]
+        starts[left] += lengths[met]
+        there = directions[faces[answers["primitive_ids"].numpy()[met]]].sum(1)
+        other = np.einsum("nc,nc->n", there, directions[rows[left]]) < 0
+        gaps[left[other]] = starts[left[other]]
+        left = left[~other]
+        starts[left] += start
+        if not len(left):
+            break
+    return gaps
 
 
 def without_folds(
