@@ -56,10 +56,12 @@ class SfmParams(Section):
 
     matcher: Literal["auto", "preemptive", "exhaustive", "sequential", "spatial"] = Field(
         "auto",
-        description="which image pairs are matched; preemptive: those of which large features match; auto: so up to "
-        "`exhaustive_max` photos",
+        description="which image pairs are matched; preemptive: only pairs whose largest features match; auto: "
+        "preemptive up to `preemptive_max` photos, then spatial or sequential",
     )
-    exhaustive_max: int = Field(150, ge=2, description="auto looks at all pairs up to this many photos")
+    preemptive_max: int = Field(
+        150, ge=2, description="with more photos than this, auto matches neighbours only, in space (GPS) or in name"
+    )
     mapper: Literal["incremental", "global"] = Field("incremental", description="how poses are solved")
     wanted: float = Field(
         0.95,

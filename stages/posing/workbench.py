@@ -418,7 +418,7 @@ class Workbench:
 
         with torch_threads(self.threads):
             descriptors = write_corners(self.database(base), self.images_folder, masks, network, features)
-            pairs = likely_pairs(descriptors, self.params.exhaustive_max)
+            pairs = likely_pairs(descriptors, self.params.preemptive_max)
             write_matches(self.database(base), descriptors, pairs, matches)
         self._verify_again(base)
         self._tell(PART_MATCHES, "poses")
@@ -704,7 +704,7 @@ def choose_matcher(params: Any, located: int, num_images: int) -> str:
         )
     if params.matcher != "auto":
         return params.matcher
-    if num_images <= params.exhaustive_max:
+    if num_images <= params.preemptive_max:
         return PREEMPTIVE
     return "spatial" if located > 0.9 * num_images else "sequential"
 
