@@ -56,10 +56,12 @@ class SfmParams(Section):
 
     matcher: Literal["auto", "preemptive", "exhaustive", "sequential", "spatial"] = Field(
         "auto",
-        description="which image pairs are matched; preemptive: those of which large features match; auto: so up to "
-        "`exhaustive_max` photos",
+        description="which image pairs are matched; preemptive: only pairs whose largest features match; auto: "
+        "preemptive up to `preemptive_max` photos, then spatial or sequential",
     )
-    exhaustive_max: int = Field(150, ge=2, description="auto looks at all pairs up to this many photos")
+    preemptive_max: int = Field(
+        150, ge=2, description="with more photos than this, auto matches neighbours only, in space (GPS) or in name"
+    )
     mapper: Literal["incremental", "global"] = Field("incremental", description="how poses are solved")
     wanted: float = Field(
         0.95,
@@ -169,13 +171,15 @@ class DensifyParams(Section):
         "pycolmap that was built with CUDA, and was never tried on one; off: no dense points",
     )
     side: int = Field(1000, ge=64, description="photos are compared at this longest side, pixels")
-    neighbors: int = Field(4, ge=1, le=20, description="photos that each photo is compared with")
+    neighbors: int = Field(
+        4, ge=2, le=20, description="photos that each photo is compared with: two must agree on a depth"
+    )
 
 
 class HeldOutDensifyParams(DensifyParams):
     """With `train.hold_out`, as it reaches the stage: photos held out from training make no dense points either."""
 
-    hold_out: int = 0
+    hold_out: int = Field(0, ge=0, description="every n-th photo is left out, as in `train.hold_out`; 0: none")
 
 
 class ExtractParams(Section):

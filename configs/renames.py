@@ -27,6 +27,7 @@ _PLACE = "region up gps marker_size marker_dictionary known_distance"
 RENAMED = {
     **{f"train.{name}": f"{group}.{name}" for group, names in _GROUPS.items() for name in names.split()},
     **{f"undistort.{name}": f"place.{name}" for name in _PLACE.split()},
+    "sfm.exhaustive_max": "sfm.preemptive_max",
     "train.holdout": "train.hold_out",
     "train.density": "train.density.form",
     "train.weight_eikonal": "train.losses.eikonal",

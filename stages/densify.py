@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import logging
 import shutil
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -28,11 +29,61 @@ log = logging.getLogger(__name__)
 EXPLAINED = 0.5
 
 
+@dataclass(frozen=True)
+class _Capture:
+    """The photos that are compared, and the size at which they are.
+
+    Attributes:
+        used: index of each among all photos of the capture.
+        pairs: two photos each, see `pairs_of`.
+    """
+
+    scene: PosedScene
+    used: np.ndarray
+    views: Sequence[View]
+    pairs: Sequence[tuple[int, int]]
+    pictures: Pictures
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return self.scene.cameras.names
+
+    def color(self, photo: int) -> np.ndarray:
+        """RGB [h, w, 3] of a photo; read anew each time, since those of all photos would fill the memory."""
+        import cv2
+
+        picture, size = self.pictures.image(self.names[photo]), self.views[photo].size
+        return picture if picture.shape[1::-1] == size else cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
+
+    def grey(self, photo: int) -> np.ndarray:
+        """[h, w] uint8."""
+        import cv2
+
+        return cv2.cvtColor(self.color(photo), cv2.COLOR_RGB2GRAY)
+
+    def within(self, photo: int) -> np.ndarray | None:
+        """Whether each pixel [h, w] lies on the photo's mask, where it has one."""
+        import cv2
+
+        mask = self.pictures.mask(self.names[photo])
+        return None if mask is None else cv2.resize(mask, self.views[photo].size, interpolation=cv2.INTER_NEAREST) > 127
+
+
 def run(context: StageContext[HeldOutDensifyParams]) -> dict[str, Any]:
     """Compare neighbouring photos, judge what they say, fuse it."""
     if context.params.method == "off":
         context.write(POINT_CLOUD, PointCloud.empty())
         return {"points": 0, "depth_maps": 0, "explained": {}}
+    photos = _capture(context)
+    with _threads(context.workers):
+        depths = _depths(context, photos)
+        numbers = _publish(context, photos, depths)
+    if not numbers["points"]:
+        _say_why(len(photos.views), len(photos.pairs), numbers["depth_maps"])
+    return {"pairs": len(photos.pairs), **numbers}
+
+
+def _capture(context: StageContext[HeldOutDensifyParams]) -> _Capture:
     from stages.stereo.depths import views_of
     from stages.stereo.pairs import pairs_of
 
@@ -41,13 +92,7 @@ def run(context: StageContext[HeldOutDensifyParams]) -> dict[str, Any]:
     scene = _of_photos(whole, used)
     views = views_of(scene.cameras, context.params.side)
     pairs = pairs_of(views, scene.points, scene.observations, context.params.neighbors)
-    pictures = context.read(PINHOLE_PHOTOS)
-    colors = [_at_size(pictures, name, view) for name, view in zip(scene.cameras.names, views, strict=True)]
-    depths, trusts = _judged(context, scene, views, pairs, colors)
-    numbers = _publish(context, scene, used, views, depths, trusts, colors)
-    if not numbers["points"]:
-        _say_why(len(views), len(pairs), numbers["depth_maps"])
-    return {"pairs": len(pairs), **numbers}
+    return _Capture(scene, used, views, pairs, context.read(PINHOLE_PHOTOS))
 
 
 def _used(count: int, hold_out: int) -> np.ndarray:
@@ -78,63 +123,47 @@ def _say_why(photos: int, pairs: int, depth_maps: int) -> None:
     log.warning("%s: training goes on without dense points", why)
 
 
-def _at_size(pictures: Pictures, name: str, view: View) -> np.ndarray:
-    """A photo [h, w, 3] at the size at which it is compared."""
-    import cv2
-
-    photo = pictures.image(name)
-    same = photo.shape[1::-1] == view.size
-    return photo if same else cv2.resize(photo, view.size, interpolation=cv2.INTER_AREA)
-
-
-def _judged(
-    context: StageContext[HeldOutDensifyParams],
-    scene: PosedScene,
-    views: Sequence[View],
-    pairs: Sequence[tuple[int, int]],
-    colors: Sequence[np.ndarray],
-) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Depths [h, w] of each photo in units of the scene, and their trust [h, w]."""
+@contextmanager
+def _threads(workers: int) -> Iterator[None]:
+    """So many threads for the compiled loops, and one for each of OpenCV's calls: a pool makes these in parallel."""
     import cv2
     import numba
 
-    from stages.stereo.trust import trust_of
-
-    threads, compiled_threads = cv2.getNumThreads(), numba.get_num_threads()
-    cv2.setNumThreads(1)  # the pool is the parallelism
-    numba.set_num_threads(min(context.workers, numba.config.NUMBA_NUM_THREADS))
+    before = cv2.getNumThreads(), numba.get_num_threads()
+    cv2.setNumThreads(1)
+    numba.set_num_threads(min(workers, numba.config.NUMBA_NUM_THREADS))
     try:
-        if context.params.method == "patch_match":
-            depths = _by_patch_match(context, scene, views)
-        else:
-            depths = _by_semi_global_matching(context, scene, views, pairs, colors)
-        for name, depth in zip(scene.cameras.names, depths, strict=True):
-            _cut(depth, context.read(PINHOLE_PHOTOS).mask(name))
-        return depths, trust_of(views, depths)
+        yield
     finally:
-        cv2.setNumThreads(threads)
-        numba.set_num_threads(compiled_threads)
+        cv2.setNumThreads(before[0])
+        numba.set_num_threads(before[1])
 
 
-def _by_semi_global_matching(
-    context: StageContext[HeldOutDensifyParams],
-    scene: PosedScene,
-    views: Sequence[View],
-    pairs: Sequence[tuple[int, int]],
-    colors: Sequence[np.ndarray],
-) -> list[np.ndarray]:
-    import cv2
+def _depths(context: StageContext[HeldOutDensifyParams], photos: _Capture) -> list[np.ndarray]:
+    """Depths [h, w] of each photo in units of the scene; none off its mask: what is there may have moved."""
+    if context.params.method == "patch_match":
+        depths = _by_patch_match(context, photos)
+    else:
+        depths = _by_semi_global_matching(context, photos)
+    for k, depth in enumerate(depths):
+        within = photos.within(k)
+        if within is not None:
+            depth[~within] = 0
+    return depths
 
+
+def _by_semi_global_matching(context: StageContext[HeldOutDensifyParams], photos: _Capture) -> list[np.ndarray]:
     from stages.stereo.depths import depth_maps
 
-    seen = [scene.points[scene.observations[scene.observations[:, 0] == k, 1]] for k in range(len(views))]
-    greys = [cv2.cvtColor(photo, cv2.COLOR_RGB2GRAY) for photo in colors]
-    return depth_maps(views, greys, pairs, seen, context.workers, lambda k: context.progress(k, len(views) + 1))
+    scene, count = photos.scene, len(photos.views)
+    seen = [scene.points[scene.observations[scene.observations[:, 0] == k, 1]] for k in range(count)]
+    greys = [photos.grey(k) for k in range(count)]
+    return depth_maps(
+        photos.views, greys, photos.pairs, seen, context.workers, lambda k: context.progress(k, count + 1)
+    )
 
 
-def _by_patch_match(
-    context: StageContext[HeldOutDensifyParams], scene: PosedScene, views: Sequence[View]
-) -> list[np.ndarray]:
+def _by_patch_match(context: StageContext[HeldOutDensifyParams], photos: _Capture) -> list[np.ndarray]:
     """Raises SystemRequirementError where pycolmap was built without CUDA."""
     import pycolmap
 
@@ -145,42 +174,30 @@ def _by_patch_match(
             "`densify.method` = patch_match needs a pycolmap that was built with CUDA; this one was not.",
             "Try `--set densify.method=auto`, or `pip install pycolmap-cuda12`.",
         )
-    depths = [np.zeros(view.size[::-1], np.float32) for view in views]
+    depths = [np.zeros(view.size[::-1], np.float32) for view in photos.views]
     folder = context.scratch / "patch_match"
     shutil.rmtree(folder, ignore_errors=True)
-    pictures = context.read(PINHOLE_PHOTOS)
-    for k, depth in patch_match_depths(scene, pictures, folder, context.params.side, context.progress):
+    side = context.params.side
+    for k, depth in patch_match_depths(photos.scene, photos.pictures, folder, side, context.progress):
         depths[k] = depth
     shutil.rmtree(folder)
     return depths
 
 
-def _cut(depth: np.ndarray, mask: np.ndarray | None) -> None:
-    """Forget the depths [h, w] outside the photo's mask [H, W]: what is there may have moved."""
-    import cv2
-
-    if mask is not None:
-        depth[cv2.resize(mask, depth.shape[::-1], interpolation=cv2.INTER_NEAREST) < 128] = 0
-
-
-def _publish(
-    context: StageContext[HeldOutDensifyParams],
-    scene: PosedScene,
-    used: np.ndarray,
-    views: Sequence[View],
-    depths: Sequence[np.ndarray],
-    trusts: Sequence[np.ndarray],
-    colors: Sequence[np.ndarray],
-) -> dict[str, Any]:
+def _publish(context: StageContext[HeldOutDensifyParams], photos: _Capture, depths: list[np.ndarray]) -> dict[str, Any]:
+    """Judge the depths, fuse them, write both."""
     from stages.stereo.fusion import fused
+    from stages.stereo.trust import trust_of
 
-    cloud = fused(views, depths, trusts, colors).moved(scene.poses_from_scene)
-    context.write(POINT_CLOUD, replace(cloud, photos=used[cloud.photos].astype(np.int32)))
+    trusts = trust_of(photos.views, depths)
+    pose_frame = photos.scene.poses_from_scene
+    cloud = fused(photos.views, depths, trusts, map(photos.color, range(len(depths)))).moved(pose_frame)
+    context.write(POINT_CLOUD, replace(cloud, photos=photos.used[cloud.photos].astype(np.int32)))
     maps, known, explained = context.to_write(DEPTH_MAPS), 0, {}
-    for name, depth, trust in zip(scene.cameras.names, depths, trusts, strict=True):
-        explained[name] = round(float((trust >= EXPLAINED).mean()), 4)
+    for k, (name, depth, trust) in enumerate(zip(photos.names, depths, trusts, strict=True)):
+        explained[name] = round(_explained(trust, photos.within(k)), 4)
         if (depth > 0).any():
-            maps.save(name, depth * np.float32(scene.poses_from_scene.scale), trust)
+            maps.save(name, depth * np.float32(pose_frame.scale), trust)
             known += 1
     return {
         "points": len(cloud),
@@ -188,6 +205,12 @@ def _publish(
         "trust": round(float(cloud.trust.mean()), 3) if len(cloud) else 0.0,
         "explained": explained,
     }
+
+
+def _explained(trust: np.ndarray, within: np.ndarray | None) -> float:
+    """Share of a photo's pixels [h, w], of those on its mask where it has one, whose depth is trusted."""
+    asked = trust.size if within is None else int(within.sum())
+    return float((trust >= EXPLAINED).sum()) / max(asked, 1)
 
 
 DENSIFY: Stage[HeldOutDensifyParams] = Stage(

@@ -42,7 +42,8 @@ MEMORY_OF_PHOTOS = 2.0  # training holds the photos' bytes twice while it puts t
 SFM_BASE_GIB, SFM_GIB_PER_THREAD_MP = 0.25, 0.25  # finding features: 0.32 GiB at 0.3 megapixels, 1.0 at 1.5
 MEMORY_MARGIN = 1.3  # an estimate this near to what is there gets a warning
 SFM_CPU_S_PER_MP = 2.8  # 2.3 to 3.3 CPU seconds a megapixel looked at
-SFM_CPU_S_PER_PAIR = 0.01  # too little in those sets to be told from nothing; larger ones are quadratic
+SFM_CPU_S_PER_PAIR = 0.01  # too little in those sets to be told from nothing; larger ones have more pairs
+PAIRS_PER_PHOTO = 10  # 3.7 of 16 photos, 8 of 47 around something, 14 of 150 on half a walk; of neighbours 10
 STEREO_CPU_S_PER_MP_AND_NEIGHBOR = 0.28  # 1.0 to 1.2 CPU seconds a megapixel compared with four neighbours
 STEREO_BASE_GIB, STEREO_GIB_PER_MP = 0.5, 0.021  # 0.55 to 1.2 GiB at 11 to 29 megapixels; maps of all are held
 COVERED = 0.6  # share of the surface that dense points cover: 0.16 of polished metal, 0.6 of plaster, 0.9 of a helmet
@@ -178,7 +179,7 @@ def preflight(
     if needs.memory_gib > memory:
         shortages.append(
             f"It may take {needs.memory_gib:.1f} GiB of memory, {memory:.1f} are free: close other programs, or try "
-            "`--set undistort.max_side=800`, `--workers 1`."
+            "`--set undistort.max_side=800`, `--set densify.side=600`, `--workers 1`."
         )
     if not os.access(folder, os.W_OK):
         shortages.append(f"{folder} cannot be written: try `--workspace DIR`.")
@@ -225,7 +226,9 @@ def estimate(seen: Inspection, config: Config, device: str, workers: int) -> Nee
 
 def _minutes(looked_at: list[float], compared: float, config: Config, workers: int) -> float:
     count, train = len(looked_at), config.train
-    pairs = count * (count - 1) / 2 if count <= config.sfm.exhaustive_max else 10 * count
+    pairs = count * (count - 1) / 2
+    if config.sfm.matcher != "exhaustive":
+        pairs = min(pairs, PAIRS_PER_PHOTO * count)
     wall_per_cpu = 1 - PARALLEL_SHARE + PARALLEL_SHARE / workers
     part = 1 + COVERED * (train.steps_if_covered - 1) if compared else 1.0
     ray_samples = part * train.steps * train.sampling.rays * train.sampling.samples

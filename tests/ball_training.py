@@ -9,9 +9,10 @@ from train_settings import changed, small
 
 from configs.training import TrainParams
 from stages.geometry.cameras import PinholeCameras
+from stages.neural.needed_rays import NeededRays
 from stages.neural.sightings import Sightings
 from stages.neural.trainer import Trainer
-from stages.neural.training_photos import Photos
+from stages.neural.training_photos import Photos, RayBatch
 
 SMALL = {
     "steps": 60, "sampling.rays": 128, "sampling.samples": 12, "field.levels": 4, "field.log2_rows": 10,
@@ -28,6 +29,11 @@ def make_trainer(params: TrainParams = TINY, masks: bool = False, device: str = 
     views = [render(cameras, i) for i in range(len(cameras))]
     photos = Photos(cameras, [v[0] for v in views], [v[1] for v in views] if masks else None, device)
     return Trainer(photos, *ball_sightings(cameras, device), params, device)
+
+
+def even_rays(photos: Photos, count: int) -> RayBatch:
+    """Drawn evenly from the photos that are trained on."""
+    return NeededRays(photos, share=0.0).draw(count, torch.Generator().manual_seed(0))[0]
 
 
 def ball_sightings(cameras: PinholeCameras, device: str = "cpu") -> tuple[Sightings, Sightings]:

@@ -127,6 +127,14 @@ def test_new_photos_are_placed_beside_known_ones_that_stay(eight: Path, tmp_path
 
 
 @pytest.mark.slow
+def test_new_photos_are_matched_with_all_known_ones(eight: Path, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr("stages.posing.workbench.likely_pairs", lambda database: [])
+    numbers, folder = run(tmp_path, named(*range(9)), eight)
+    assert (numbers["registered"], numbers["kept"]) == (9, ADDED)
+    assert artifacts.REGISTRATION.load(folder).matcher == "preemptive"
+
+
+@pytest.mark.slow
 def test_the_same_photos_keep_their_model_bit_for_bit_and_others_names_only(eight: Path, tmp_path: Path) -> None:
     def files(folder: Path) -> dict[str, bytes]:
         return {path.name: path.read_bytes() for path in artifacts.MODEL.load(folder).iterdir()}

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import os
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,7 +22,7 @@ from stages.drawing.rasterizing import (
 )
 from stages.drawing.rendering import look_at, render_textured, turntable
 from stages.geometry.cameras import PinholeCameras
-from stages.texture.baking import Baked, Provenance, bake_texture
+from stages.texture.baking import Baked, Provenance, _prefetch, _Prepare, bake_texture
 from stages.texture.filling import face_neighbors, harmonic_offsets
 from stages.texture.gains import solve_gains
 from stages.texture.padding import pad_charts
@@ -237,6 +240,37 @@ def test_a_photo_is_cut_to_what_shows_the_mesh(capture):
         np.testing.assert_allclose(shift, np.broadcast_to((left, top), shift.shape), atol=1e-6)
         height, width = view.photo.shape[:2]
         np.testing.assert_array_equal(view.original, photo[top : top + height, left : left + width])
+
+
+def test_a_cut_keeps_nothing_of_the_rest_of_the_photo_in_memory(capture):
+    atlas, cameras, photos = capture
+    beyond = atlas.vertices.astype(np.float64) @ cameras.extrinsics[0, :, :3].T
+    beyond *= 5, 1, 1  # over both sides of the photo, not over its upper and lower border
+    beyond = (beyond @ cameras.extrinsics[0, :, :3]).astype(np.float32)
+    view = prepare_view(cameras, 0, photos[0], None, beyond, atlas.faces)
+    assert view.photo.shape[1] == photos[0].shape[1]
+    assert view.photo.shape[0] < photos[0].shape[0]
+    assert not np.shares_memory(view.photo, photos[0])
+
+
+def test_the_first_photos_are_kept_whichever_are_ready_first(monkeypatch):
+    first_two = threading.Event()
+
+    def prepare_view(cameras, index, *_):
+        if index == 0:
+            assert first_two.wait(10)
+        if index == 2:
+            first_two.set()
+        return SimpleNamespace(nbytes=60 if index == 1 else 50, index=index)
+
+    monkeypatch.setattr("stages.texture.baking.prepare_view", prepare_view)
+    monkeypatch.setattr("stages.texture.baking.KEPT_BYTES", 100)
+    prepare = _Prepare(SimpleNamespace(vertices=None, faces=None), None, lambda index: (None, None), 0.0)
+    with ThreadPoolExecutor(3) as pool:
+        for _ in range(2):
+            assert [view.index for view in _prefetch(pool, prepare, 4, 3)] == [0, 1, 2, 3]
+            assert sorted(prepare.kept) == [0, 2]
+            assert prepare.room == 0
 
 
 def test_a_photo_that_shows_nothing_of_the_mesh_is_no_error(capture):

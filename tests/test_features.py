@@ -83,6 +83,31 @@ def test_where_the_first_photos_are_plain_the_others_are_not_tried(tmp_path: Pat
     assert searched == [["plain0.png", "plain8.png"], names]
 
 
+@pytest.mark.parametrize("why", ["a rich one has features already", "masks"])
+def test_photos_that_are_hardly_rich_are_searched_once(tmp_path: Path, monkeypatch, why: str):
+    """Among photos added later, which are plain, those known before tell nothing; inside masks no photo is rich."""
+    import pycolmap
+
+    masked = why == "masks"
+    names = [f"{'rich' if masked else 'plain'}{i}.png" for i in range(9)] + ["rich.png"]
+    photos(tmp_path / "photos", names)
+    params = SfmParams(max_features=MOST)
+    found = database(tmp_path / "found.db", tmp_path / "photos", names)
+    with pycolmap.Database.open(found) as opened:
+        known = opened.read_image_with_name("rich.png").image_id
+    extract(found, tmp_path / "photos", params, 1, False, among=[known])
+    assert len(features(found)["rich.png"]) >= MOST
+    masks = tmp_path / "masks" if masked else None
+    if masks is not None:
+        masks.mkdir()
+        for name in names:
+            cv2.imwrite(str(masks / f"{name}.png"), np.full((HEIGHT, WIDTH), 255, np.uint8))
+    searched = []
+    monkeypatch.setattr(pycolmap, "extract_features", lambda *_, **options: searched.append(options["image_names"]))
+    extract(found, tmp_path / "photos", params, 1, False, masks_folder=masks)
+    assert searched == ([names[:9]] if masked else [["plain0.png", "plain8.png"], names[:9]])
+
+
 def test_features_and_matches_are_appended(tmp_path: Path):
     import pycolmap
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from ball_training import ball_sightings
+from ball_training import ball_sightings, even_rays
 from sphere_scene import render, ring_of_cameras, write_densified, write_undistorted
 from train_settings import changed, small
 
@@ -15,6 +15,7 @@ from stages import artifacts, train
 from stages.engine.stage import StageContext
 from stages.errors import ConfigError
 from stages.neural.held_out_psnr import held_out_psnr, left_out, photo_psnr
+from stages.neural.needed_rays import NeededRays
 from stages.neural.training_photos import Photos
 
 TINY = small({
@@ -48,7 +49,7 @@ def test_every_nth_photo_is_left_out_from_the_middle_of_the_first_n():
 
 def test_rays_are_drawn_from_all_photos_but_those_left_out():
     photos = make_photos()
-    batch = photos.draw(2000, torch.Generator().manual_seed(0))
+    batch = even_rays(photos, 2000)
     counts = torch.bincount(batch.images, minlength=8)
     assert counts[[2, 6]].tolist() == [0, 0]
     assert (counts[[0, 1, 3, 4, 5, 7]] > 200).all()
@@ -58,7 +59,7 @@ def test_leaving_none_out_draws_what_was_always_drawn():
     with_argument, without = make_photos(every=0), Photos(
         ring_of_cameras(), [render(ring_of_cameras(), i)[0] for i in range(8)], None, "cpu"
     )  # fmt: skip
-    a, b = (photos.draw(100, torch.Generator().manual_seed(0)) for photos in (with_argument, without))
+    a, b = (even_rays(photos, 100) for photos in (with_argument, without))
     assert torch.equal(a.images, b.images)
     assert torch.equal(a.directions, b.directions)
 
@@ -114,14 +115,14 @@ def test_large_photos_are_judged_on_a_grid_of_pixels(monkeypatch):
 @pytest.mark.slow
 def test_the_stage_reports_the_photos_left_out_and_trains_on_the_others(tmp_path, monkeypatch):
     drawn = set()
-    original = Photos.draw
+    original = NeededRays.draw
 
     def draw(self, num_rays, generator):
-        batch = original(self, num_rays, generator)
+        batch, cells = original(self, num_rays, generator)
         drawn.update(batch.images.tolist())
-        return batch
+        return batch, cells
 
-    monkeypatch.setattr(Photos, "draw", draw)
+    monkeypatch.setattr(NeededRays, "draw", draw)
     numbers = run_train(tmp_path, hold_out=4)
     assert drawn == {0, 1, 3, 4, 5, 7}
     assert (numbers["held_out"], numbers["photos"]) == (2, 8)

@@ -154,6 +154,20 @@ def test_a_background_that_stands_still_is_seen_and_one_that_moves_along_is_not(
     assert not has_still_background(database(tmp_path / "d.db", turntable(30), []))
 
 
+@pytest.mark.parametrize(("asked", "taken"), [("auto", EXHAUSTIVE), ("preemptive", PREEMPTIVE)])
+def test_views_of_360_degree_pictures_are_matched_with_all_unless_asked_for_less(
+    tmp_path: Path, monkeypatch, asked: str, taken: str
+):
+    from stages.artifacts import ImageRecord
+
+    views = ImageSet(tuple(ImageRecord(f"{i}.jpg", "", 64, 64, 50.0, "c", 1.0, False, "", frame="a") for i in "12"))
+    monkeypatch.setattr(Workbench, "_import", lambda bench, base: None)
+    bench = Workbench(
+        tmp_path, tmp_path, tmp_path, views, SfmParams(matcher=asked), 1, 1, False, lambda done, total, note: None
+    )  # fmt: skip
+    assert bench.matcher == taken
+
+
 def test_focal_priors_are_forgotten(tmp_path: Path):
     import pycolmap
 

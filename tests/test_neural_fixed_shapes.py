@@ -6,7 +6,7 @@ from collections import Counter
 
 import pytest
 import torch
-from ball_training import TINY, assert_finds_the_ball, make_trainer
+from ball_training import TINY, assert_finds_the_ball, even_rays, make_trainer
 from torch.utils._python_dispatch import TorchDispatchMode
 from train_settings import changed
 
@@ -117,7 +117,7 @@ def test_rays_look_the_same_in_both_forms(like_cuda, masks, progress):
         switch()
         trainer = make_trainer(masks=masks)
         trainer._refresh_cache(trainer.moment(progress))
-        batch = trainer.photos.draw(TINY.sampling.rays, torch.Generator().manual_seed(0))
+        batch = even_rays(trainer.photos, TINY.sampling.rays)
         rendered = trainer.render(batch, progress, torch.zeros(3, 3) + 0.2)
         (rendered.colors - batch.colors).square().mean().backward()
         forms.append((batch, rendered, trainer.fields))
@@ -148,7 +148,7 @@ def test_as_many_rays_as_asked_for_where_few_meet_the_sphere(like_cuda):
     like_cuda()
     photos = make_trainer().photos
     photos.boxes[:] = torch.tensor([0.0, 0, 48, 2])  # the top of the photos, where hardly a ray meets it
-    batch = photos.draw(64, torch.Generator().manual_seed(0))
+    batch = even_rays(photos, 64)
     distinct = batch.drawn.unique()
     assert len(batch.drawn) == 64
     assert 0 < len(distinct) < 64

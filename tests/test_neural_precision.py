@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from ball_training import TINY, assert_finds_the_ball, make_trainer
+from ball_training import TINY, assert_finds_the_ball, even_rays, make_trainer
 from train_settings import changed
 
 from stages.neural.acceleration import is_mixed, short_products
@@ -61,7 +61,7 @@ def test_colours_alone_are_mixed():
     for params in (TINY, mixed()):
         trainer = make_trainer(params)
         trainer._refresh_cache(trainer.moment(0.3))
-        batch = trainer.photos.draw(64, torch.Generator().manual_seed(0))
+        batch = even_rays(trainer.photos, 64)
         rendered.append(trainer.render(batch, 0.3, torch.rand(5, 3, generator=trainer.generator)))
     exact, short = rendered
     for name in ("weights", "gradients", "opacity", "extra_sdf", "extra_gradients", "features"):

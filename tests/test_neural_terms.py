@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from ball_training import SMALL, TINY, make_trainer
+from ball_training import SMALL, TINY, even_rays, make_trainer
 from sphere_scene import RADIUS, ring_of_cameras
 from train_settings import changed
 
@@ -101,7 +101,7 @@ def test_the_ambiguity_weight_trusts_a_painted_ball_and_doubts_a_shifting_one(vi
     settings = {"terms.ambiguity.form": "stable", "terms.ambiguity.visibility": visibility, **SHARP_BALL}
     trainer = make_trainer(changed(TINY, settings))
     trainer._refresh_cache(trainer.moment(0.5))
-    batch = trainer.photos.draw(400, torch.Generator().manual_seed(0))
+    batch = even_rays(trainer.photos, 400)
     with torch.no_grad():
         rendered = trainer.render(batch, 0.5)
     on_ball = rendered.opacity > 0.5
@@ -132,7 +132,7 @@ def test_the_ambiguity_weight_is_that_of_a_loop_over_rays_and_photos():
     trainer.fields.log_gains.data.copy_(0.1 * torch.randn(8, 3, generator=torch.Generator().manual_seed(0)))
     gains, precision = trainer.fields.log_gains.exp().detach(), ambiguity_of(trainer).color_precision
     trainer._refresh_cache(moment)
-    batch = photos.draw(60, torch.Generator().manual_seed(0))
+    batch = even_rays(photos, 60)
     with torch.no_grad():
         rendered = trainer.render(batch, 0.5)
     surface, normals = rendered.surface
@@ -167,7 +167,7 @@ def test_the_ambiguity_weight_is_that_of_a_loop_over_rays_and_photos():
 def test_masks_take_rays_out_of_the_ambiguity_weight():
     trainer = make_trainer(changed(TINY, {"terms.ambiguity.form": "stable", "density.scale_start": 0.01}), masks=True)
     trainer._refresh_cache(trainer.moment(0.5))
-    batch = trainer.photos.draw(400, torch.Generator().manual_seed(0))
+    batch = even_rays(trainer.photos, 400)
     with torch.no_grad():
         rendered = trainer.render(batch, 0.5)
     weights = trainer.terms.color_weight(rendered, rendered.colors, trainer.moment(0.5))
@@ -182,7 +182,7 @@ def test_the_papers_weight_carries_a_gradient_and_the_stable_one_none():
         settings = {"terms.ambiguity.form": form, **SHARP_BALL}
         trainer = make_trainer(changed(TINY, settings))
         trainer._refresh_cache(trainer.moment(0.5))
-        batch = trainer.photos.draw(200, torch.Generator().manual_seed(0))
+        batch = even_rays(trainer.photos, 200)
         rendered = trainer.render(batch, 0.5)
         weights = trainer.terms.color_weight(rendered, rendered.colors, trainer.moment(0.5))
         assert weights.requires_grad is carries
@@ -202,7 +202,7 @@ def test_a_learned_scale_learns_and_a_scheduled_one_ends_at_its_end():
 def test_reflection_waits_for_its_start_and_colours_only_rays_that_meet_something():
     trainer = rough_trainer({"terms.reflection.form": "stable", **FLOOR})
     put_on_a_floor(trainer)
-    batch = trainer.photos.draw(400, torch.Generator().manual_seed(0))
+    batch = even_rays(trainer.photos, 400)
     with torch.no_grad():
         early, late = (trainer.render(batch, progress) for progress in (0.2, 0.5))
         trainer.fields.reflection = None

@@ -38,7 +38,9 @@ def slow_count(first: np.ndarray, second: np.ndarray) -> int:
     return found
 
 
-def test_counts_are_those_of_a_slow_loop_and_of_features_that_are_there_twice():
+@pytest.mark.parametrize("at_once", [1, 2, 4, 64])
+def test_counts_are_those_of_a_slow_loop_and_of_features_that_are_there_twice(monkeypatch, at_once: int):
+    monkeypatch.setattr(pairs, "AT_ONCE", at_once)
     scene = descriptors(40, 0)
     photos = [
         noisy(scene[:30], 1),

@@ -49,7 +49,7 @@ def test_depths_of_one_place_become_one_point_seen_by_their_photos():
     true = draw(cams).depths[0].astype(np.float32)
     trusts = [np.float32(t) * (true > 0) for t in (0.9, 0.3, 0.6)]
     colors = [np.full((*true.shape, 3), c, np.uint8) for c in (100, 200, 0)]
-    cloud = fused([view] * 3, [true] * 3, trusts, colors)
+    cloud = fused([view] * 3, [true] * 3, trusts, iter(colors))
     np.testing.assert_array_equal(np.diff(cloud.starts), 3)
     np.testing.assert_array_equal(cloud.photos, np.tile([0, 1, 2], len(cloud)))
     np.testing.assert_allclose(cloud.trust, 0.6, atol=1e-6)

@@ -211,6 +211,18 @@ def test_needs_grow_with_photos_as_measured():
     for side in (1200, 4000):
         assert of(200, side).memory_gib == pytest.approx(0.5 + 200 * 0.021, abs=0.01)
     assert of(47, 1600, workers=16).memory_gib > of(47, 1600).memory_gib  # each thread looks for features
+    # pairs to match grow with the photos, and with their square only where all are asked for
+    fixed = {"train.minutes": 1, "densify.method": "off"}
+    (six, twelve), (all_six, all_twelve) = (
+        [
+            of(count, 300, **fixed, **{"sfm.matcher": matcher}).minutes - of(1, 300, **fixed).minutes
+            for count in (60, 120)
+        ]
+        for matcher in ("auto", "exhaustive")
+    )
+    assert twelve == pytest.approx(2 * six, rel=0.05)
+    assert all_twelve - twelve > 3 * (all_six - six) > 0
+    assert of(8, 300, **fixed).minutes == of(8, 300, **fixed, **{"sfm.matcher": "exhaustive"}).minutes
     assert of(47, 554, **{"train.minutes": 20}).minutes == pytest.approx(21.0, abs=0.5)
 
 

@@ -16,6 +16,7 @@ from stages import artifacts
 from stages.artifacts import Unregistered
 from stages.engine.stage import StageContext
 from stages.errors import InputError, ReconstructionError
+from stages.posing import pairs
 from stages.posing.evidence import Evidence
 from stages.posing.ladder import Step
 from stages.posing.workbench import Workbench, camera_params, choose_matcher, count_located
@@ -74,6 +75,27 @@ def orbit(count: int, step_deg: float) -> list[np.ndarray]:
 
 
 @pytest.mark.slow
+def test_two_walks_are_one_model_though_few_pairs_are_matched(tmp_path: Path, monkeypatch):
+    """Six photos from below and six from above: the best three partners of each are of its own walk."""
+    import pycolmap
+
+    for name, number in {"MOST": 3, "LEAST": 1, "SPREAD": 1, "APART": 1, "TREES": 3, "NEXT": 0}.items():
+        monkeypatch.setattr(pairs, name, number)
+    angles = np.radians(np.tile(8.0 * np.arange(6), 2))
+    heights = np.repeat([0.9, 1.9], 6)
+    centers = np.stack([2.6 * np.cos(angles), 2.6 * np.sin(angles), heights], 1)
+    photos = [render(look_at(center, np.array([0, 0, 0.35])), i) for i, center in enumerate(centers)]
+    numbers, out = run_sfm(ingested(tmp_path / "ingest", photos, FOCAL), tmp_path)
+    assert (numbers["registered"], numbers["attempts"], numbers["matcher"]) == (12, 1, "preemptive")
+    with pycolmap.Database.open(next(artifacts.FEATURES.load(out).iterdir())) as opened:
+        pair_ids, _ = opened.read_two_view_geometry_num_inliers()
+        names = {image.image_id: int(image.name[:3]) for image in opened.read_all_images()}
+    matched = [sorted(names[i] for i in pycolmap.pair_id_to_image_pair(pair_id)) for pair_id in pair_ids]
+    assert len(matched) < 12 * 11 / 2 - 10
+    assert sum(first < 6 <= second for first, second in matched) >= 3
+
+
+@pytest.mark.slow
 def test_a_background_that_stands_still_behind_a_turntable_does_not_matter(tmp_path: Path, monkeypatch):
     poses = orbit(8, 10)
     background = cv2.resize(texture(7), (WIDTH, HEIGHT)).astype(np.uint8)
@@ -89,6 +111,7 @@ def test_a_background_that_stands_still_behind_a_turntable_does_not_matter(tmp_p
     assert numbers["registered"] == len(poses)
     assert abs(numbers["focal_px"][0] / FOCAL - 1) < 0.1
     assert "--moving-object" in numbers["warnings"][-1]["sentence"]
+    assert numbers["matcher"] == "exhaustive"  # likely pairs went by the background
 
 
 @pytest.mark.slow

@@ -10,7 +10,7 @@ from stereo_scene import around, camera, cameras, draw, first_hit, ring
 
 from stages.geometry.cameras import PinholeCameras
 from stages.stereo import depth_kernels
-from stages.stereo.depths import depth_maps, views_of
+from stages.stereo.depths import _along, depth_maps, views_of
 from stages.stereo.matching import evened
 from stages.stereo.pairs import pairs_of, scores
 from stages.stereo.rectification import View, comparable, rectify, tolerance_of
@@ -281,6 +281,33 @@ def test_workers_change_nothing(measured):
     drawn, views, depths = measured
     for one, two in zip(depths, _depths(drawn, views, workers=2), strict=True):
         np.testing.assert_array_equal(one, two)
+
+
+def test_few_pairs_are_held_at_a_time_whatever_the_photos_are_called():
+    rng = np.random.default_rng(0)
+    named = rng.permutation(60)  # around the object, each compared with two to either side
+    pairs = [tuple(sorted(named[[k, (k + step) % 60]].tolist())) for k in range(60) for step in (1, 2)]
+
+    def most(order: np.ndarray) -> int:
+        turn = np.argsort(order)
+        starts, ends = np.sort(turn[np.array(pairs)], 1).T
+        return max(int(((starts <= now) & (now <= ends)).sum()) for now in range(60))
+
+    order = _along(pairs, 60)
+    assert sorted(order) == list(range(60))
+    assert most(np.arange(60)) > 50
+    assert most(order) <= 20
+    assert sorted(_along([], 3)) == [0, 1, 2]
+
+
+def test_depths_are_held_once_and_trusted_as_before(measured):
+    _, views, depths = measured
+    own = [depth.copy() for depth in depths]
+    trust = trust_of(views, own)
+    assert all(each.base is own[0].base for each in own)
+    for mine, before in zip(own, depths, strict=True):
+        np.testing.assert_array_equal(mine, before)
+    assert [t.shape for t in trust] == [d.shape for d in depths]
 
 
 def test_a_surface_on_which_all_agree_is_trusted_and_one_that_moves_with_the_view_is_not():

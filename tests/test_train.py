@@ -35,6 +35,7 @@ from stages.geometry.similarity import Similarity
 from stages.neural import acceleration, encodings
 from stages.neural import fields as fields_module
 from stages.neural.fields import contract
+from stages.neural.needed_rays import NeededRays
 from stages.neural.sightings import Sightings, sighting_loss
 from stages.neural.trained_field import load_field
 from stages.neural.trainer import Trainer
@@ -44,18 +45,24 @@ from stages.surface.border import BorderCut, region_without_cut
 from stages.surface.triangle_mesh import vertex_normals
 
 
-def test_rays_see_the_pixels_they_were_drawn_from():
-    cameras = ring_of_cameras()
-    photos = make_trainer().photos
-    batch = photos.draw(200, torch.Generator().manual_seed(0))
+@pytest.mark.parametrize("share", [0.0, 1.0], ids=["evenly", "by need"])
+def test_rays_see_the_pixels_they_were_drawn_from(share):
+    cameras, trainer = ring_of_cameras(), make_trainer(masks=True)
+    needed = NeededRays(trainer.photos, share)
+    trainer.cache.refresh(lambda p: p.norm(dim=1) - RADIUS)
+    needed.look(trainer.cache)
+    batch, _ = needed.draw(200, torch.Generator().manual_seed(0))
     assert len(batch.leave) == 200
-    for row in range(0, 200, 20):
+    assert batch.masks is not None
+    assert set(batch.masks.tolist()) == {0.0, 1.0}
+    for row in range(0, 200, 10):
         image = int(batch.images[row])
         pixel, _ = cameras.project(image, (batch.origins + batch.directions)[row].double().numpy()[None])
         x, y = np.floor(pixel[0]).astype(int)
         assert np.allclose(pixel[0] % 1, 0.5, atol=1e-3)
-        expected = render(cameras, image)[0][y, x] / 255
-        assert np.allclose(batch.colors[row].numpy(), expected, atol=1e-6)
+        color, mask = (seen[y, x] / 255 for seen in render(cameras, image))
+        assert np.allclose(batch.colors[row].numpy(), color, atol=1e-6)
+        assert float(batch.masks[row]) == mask
 
 
 @pytest.mark.parametrize("kind", [0, 1], ids=["sparse", "dense"])

@@ -49,15 +49,15 @@ def run_sfm(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("exhaustive_max", [150, 2])
-def test_poses_stay_and_points_are_found(tmp_path: Path, exhaustive_max: int):
+@pytest.mark.parametrize("preemptive_max", [150, 2])
+def test_poses_stay_and_points_are_found(tmp_path: Path, preemptive_max: int):
     import pycolmap
 
     ingest = ingested(tmp_path / "ingest", [render(pose, i) for i, pose in enumerate(POSES)])
     poses = write_poses(tmp_path, [f"images/{i:03d}" for i in range(len(POSES))])
-    numbers, out = run_sfm(ingest, poses, tmp_path, exhaustive_max=exhaustive_max)
+    numbers, out = run_sfm(ingest, poses, tmp_path, preemptive_max=preemptive_max)
     assert numbers["registered"] == len(POSES)
-    assert numbers["matcher"] == ("preemptive" if exhaustive_max > len(POSES) else "spatial")
+    assert numbers["matcher"] == ("preemptive" if preemptive_max > len(POSES) else "spatial")
     assert numbers["poses_from"] == "transforms.json"
     assert numbers["mean_reprojection_error_px"] < 0.5
     model = pycolmap.Reconstruction(str(artifacts.MODEL.load(out)))

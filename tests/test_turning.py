@@ -125,6 +125,31 @@ def test_a_few_photos_from_elsewhere_let_it_go_on_with_a_warning(tmp_path: Path,
     assert _place_warnings(still[:5], 11, row(*range(11))) == []
 
 
+def along_the_names(steps: np.ndarray, reach: int, far: tuple[int, ...] = ()) -> dict[tuple[str, str], float]:
+    """Parallax that grows with the steps between photos, of pairs up to `reach` apart and of some further ones."""
+    places = np.cumsum(steps)
+    return {
+        (f"{i:03d}.png", f"{i + k:03d}.png"): float(places[i + k] - places[i])
+        for i in range(len(steps))
+        for k in (*range(1, reach + 1), *far)
+        if i + k < len(steps)
+    }
+
+
+def test_most_photos_from_one_place_are_found_by_pairs_of_neighbours():
+    """70 of 100: none is matched with more than 20 of the others."""
+    steps = np.where(np.arange(100) < 70, 1e-5, 0.01)
+    still = from_one_place(along_the_names(steps, reach=6, far=(9, 14, 20)))
+    assert still == [f"{i:03d}.png" for i in range(70)]
+
+
+@pytest.mark.parametrize("far", [(), (9, 14, 20)])
+def test_a_dense_walk_is_not_one_place(far: tuple[int, ...]):
+    """Neighbours show no parallax, photos four steps apart do."""
+    still = from_one_place(along_the_names(np.full(100, 0.0013), reach=6, far=far))
+    assert len(still) < 12
+
+
 def test_too_few_pairs_tell_nothing(tmp_path: Path):
     path = matched(tmp_path / "a.db", capture(turned(2)), all_around())
     depth = judge_depth(path)

@@ -58,7 +58,10 @@ class NeededRays:
         self._upto = torch.zeros(len(self.images), dtype=torch.float64, device=photos.device)
 
     def draw(self, num_rays: int, generator: torch.Generator) -> tuple[RayBatch, Int[Tensor, " r"]]:
-        """As `Photos.draw`, by need where anything is known of it; and the cell of each ray."""
+        """At most num_rays random rays through the unit sphere, and the cell of each.
+
+        By need where anything is known of it; the others from all photos for training, equally likely.
+        """
         images, pixels = self.photos.draw_pixels(num_rays, generator)
         chance = torch.rand(len(images), 4, generator=generator, device=images.device)
         total = self._upto[-1]

@@ -86,13 +86,6 @@ class Photos:
         first = int(self.first[index])
         return self.masks[first : first + width * height].view(height, width).cpu().numpy()
 
-    def draw(self, num_rays: int, generator: torch.Generator) -> RayBatch:
-        """At most num_rays random rays through the unit sphere, photos for training equally likely.
-
-        On CUDA exactly as many: where fewer of those drawn cross the sphere, the first are taken again.
-        """
-        return self.rays(*self.draw_pixels(num_rays, generator), limit=num_rays)
-
     def draw_pixels(
         self, num_rays: int, generator: torch.Generator
     ) -> tuple[Int[Tensor, " more"], Float[Tensor, "more 2"]]:
@@ -128,7 +121,7 @@ class Photos:
     def rays(self, images: Int[Tensor, " r"], pixels: Float[Tensor, "r 2"], limit: int | None = None) -> RayBatch:
         """Rays through the centres of integer pixels (x, y) of photos; those that miss are dropped.
 
-        With a limit the first that hit, as `draw` wants them.
+        With a limit the first that hit; on CUDA exactly as many: where fewer do, the first are taken again.
         """
         directions, origins = self.directions(images, pixels), self.centers[images]
         entry, leave, hit = intersect_unit_sphere(origins, directions)

@@ -2,7 +2,7 @@
 
 COLMAP looks for features in the photo at twice its size first, and keeps the largest of all it finds. A photo that is
 rich in larger ones keeps none of that first octave, which takes two thirds of the time: there the search begins at the
-photo's own size, and finds the same features.
+photo's own size, and finds the same features. Inside masks few photos are rich, so that nobody looks whether they are.
 """
 
 from __future__ import annotations
@@ -49,12 +49,12 @@ def extract(
     if masks_folder is not None:
         reader.mask_path = str(masks_folder)
     options = feature_options(params, workers, cuda, affine)
-    if not options["extraction_options"].use_gpu:
-        _extract_rich(database, images_folder, reader, names, feature_options(params, workers, cuda, affine))
+    if masks_folder is None and not options["extraction_options"].use_gpu:
+        _extract_rich(database, images_folder, names, feature_options(params, workers, cuda, affine))
     pycolmap.extract_features(database, images_folder, image_names=names, reader_options=reader, **options)
 
 
-def _extract_rich(database: Path, images_folder: Path, reader: Any, names: list[str], options: dict[str, Any]) -> None:
+def _extract_rich(database: Path, images_folder: Path, names: list[str], options: dict[str, Any]) -> None:
     """Write the features of those of the photos that have as many as are kept without the first octave."""
     import pycolmap
 
@@ -64,10 +64,10 @@ def _extract_rich(database: Path, images_folder: Path, reader: Any, names: list[
     shutil.copyfile(database, scratch)
     first = names[::TRIED_FIRST]
     others = [name for name in names if name not in set(first)]
-    pycolmap.extract_features(scratch, images_folder, image_names=first, reader_options=reader, **options)
-    if others and _rich(scratch, extraction.sift.max_num_features):
-        pycolmap.extract_features(scratch, images_folder, image_names=others, reader_options=reader, **options)
-    rich = _rich(scratch, extraction.sift.max_num_features)
+    pycolmap.extract_features(scratch, images_folder, image_names=first, **options)
+    if others and _rich(scratch, extraction.sift.max_num_features, first):
+        pycolmap.extract_features(scratch, images_folder, image_names=others, **options)
+    rich = _rich(scratch, extraction.sift.max_num_features, names)
     with (
         pycolmap.Database.open(scratch) as old,
         pycolmap.Database.open(database) as new,
@@ -86,12 +86,12 @@ def _without_features(database: Path, among: Collection[int] | None) -> list[str
         return [images[i] for i in ids if not opened.exists_keypoints(i)]
 
 
-def _rich(database: Path, least: int) -> list[int]:
-    """Ids of the images that have at least so many features."""
+def _rich(database: Path, least: int, names: Collection[str]) -> list[int]:
+    """Ids of those of these images that have at least so many features."""
     import pycolmap
 
     with pycolmap.Database.open(database) as opened:
-        ids = sorted(image.image_id for image in opened.read_all_images())
+        ids = sorted(image.image_id for image in opened.read_all_images() if image.name in names)
         return [i for i in ids if opened.num_keypoints_for_image(i) >= least]
 
 

@@ -30,6 +30,7 @@ SPREAD, APART = 4, 4  # further clear partners: evenly from better to worse, and
 TREES = 8  # pairs, at least, by which any some photos are connected with the rest
 NEXT = 2  # photos to each side in the order of names are partners, too: most captures are a walk
 BEST = 3  # partners that share most are near a photo, with those next to it
+AT_ONCE = 64  # photos that one is compared with in one product
 # COLMAP's tests of a match, as angles between descriptors: to the nearest one, and to it over that to the second.
 MAX_ANGLE, MAX_RATIO = 0.7, 0.8
 
@@ -88,7 +89,8 @@ def largest_descriptors(database: Any, image_id: int) -> Float[np.ndarray, "k 12
     areas = np.abs(keypoints[:, 2] * keypoints[:, 5] - keypoints[:, 3] * keypoints[:, 4])
     descriptors = np.asarray(database.read_descriptors(image_id).data)
     order = np.argsort(-areas, kind="stable")
-    return descriptors[order[descriptors.any(axis=1)[order]][:LARGEST]].astype(np.float32)
+    known = np.asarray(descriptors.any(axis=1))
+    return descriptors[order[known[order]][:LARGEST]].astype(np.float32)
 
 
 def common_features(descriptors: list[Float[np.ndarray, "_ 128"]]) -> Int[np.ndarray, "n n"]:
@@ -101,11 +103,16 @@ def common_features(descriptors: list[Float[np.ndarray, "_ 128"]]) -> Int[np.nda
     ends = np.cumsum([len(each) for each in descriptors])
     stacked = np.concatenate(descriptors) if descriptors else np.zeros((0, 128), np.float32)
     lengths = np.maximum(np.linalg.norm(stacked, axis=1), 1)
-    for i, own in enumerate(descriptors[:-1]):
-        # of one photo and all later ones at once: many small products would lose their time between threads
-        cosines = own @ stacked[ends[i] :].T / (lengths[ends[i] - len(own) : ends[i], None] * lengths[ends[i] :])
-        for j, block in enumerate(np.split(cosines, ends[i + 1 : -1] - ends[i], axis=1), i + 1):
-            common[i, j] = common[j, i] = count_matches(block)
+    for i, own in enumerate(descriptors):
+        # of one photo and many later ones at once: many small products would lose their time between threads
+        for start in range(i + 1, number, AT_ONCE):
+            stop = min(start + AT_ONCE, number)
+            others = slice(ends[start - 1], ends[stop - 1])
+            cosines = own @ stacked[others].T
+            cosines /= lengths[ends[i] - len(own) : ends[i], None]
+            cosines /= lengths[others]
+            for j, block in enumerate(np.split(cosines, ends[start : stop - 1] - ends[start - 1], axis=1), start):
+                common[i, j] = common[j, i] = count_matches(block)
     return common
 
 

@@ -130,7 +130,7 @@ def _match(database_path: Path, model: Any, params: Any, threads: int, cuda: boo
     options = match_options(params, threads, cuda)
     matcher = params.matcher
     if matcher == "auto":
-        matcher = PREEMPTIVE if model.num_reg_images() <= params.exhaustive_max else "spatial"
+        matcher = PREEMPTIVE if model.num_reg_images() <= params.preemptive_max else "spatial"
     if matcher == PREEMPTIVE:
         match_pairs(database_path, likely_pairs(database_path), options)
         return matcher

@@ -145,13 +145,30 @@ def _by_zooming(pairs: Mapping[Names, Pair]) -> tuple[float, dict[Names, float]]
 
 
 def from_one_place(found: Mapping[Names, float]) -> list[str]:
-    """The most photos that one of them, which is among them, shows no parallax to; none where all do."""
-    places: dict[str, set[str]] = {}
-    for names, parallax in found.items():
-        if parallax < MIN_PARALLAX:
-            for name in names:
-                places.setdefault(name, set()).update(names)
-    return sorted(max(places.values(), key=len, default=()))
+    """The most photos that one of them, which is among them, shows no parallax to, and those that belong to them.
+
+    Not every pair was matched. A photo belongs to others where at least `MIN_PAIRS` pairs with them were, and nearly
+    all of these show no parallax: on a dense walk pairs of neighbours show none, and others do.
+
+    Returns:
+        Names, sorted; none where all pairs show parallax.
+    """
+    partners: dict[str, dict[str, bool]] = {}  # photo -> partner -> whether they show no parallax
+    for (first, second), parallax in found.items():
+        partners.setdefault(first, {})[second] = parallax < MIN_PARALLAX
+        partners.setdefault(second, {})[first] = parallax < MIN_PARALLAX
+    stars = ({name, *still} for name, of in sorted(partners.items()) if (still := [k for k in of if of[k]]))
+    place = max(stars, key=len, default=set[str]())
+    grown = {""}
+    while grown:
+        seen = {name: [still for k, still in of.items() if k in place] for name, of in partners.items()}
+        grown = {
+            name
+            for name, pairs in seen.items()
+            if name not in place and len(pairs) >= MIN_PAIRS and sum(pairs) >= PAIRS_SHARE * len(pairs)
+        }
+        place |= grown
+    return sorted(place)
 
 
 def two_places(model: Any) -> tuple[list[str], list[str]]:

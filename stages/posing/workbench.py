@@ -147,7 +147,8 @@ class Workbench:
             ]
             self.priors = {camera.camera_id: camera.mean_focal_length() for camera in cameras}
         self.matcher = choose_matcher(params, self.located, len(self.names))
-        if self.matcher == PREEMPTIVE and self._at_once > 1:  # of views of one place the best partners tell least
+        if params.matcher == "auto" and self.matcher == PREEMPTIVE and self._at_once > 1:
+            # of views of one place the best partners tell least
             self.matcher = EXHAUSTIVE
 
     def database(self, base: Base | None = None) -> Path:
@@ -217,6 +218,8 @@ class Workbench:
         if not base.focal_priors:
             forget_focal_priors(self.database(base), self.params.camera_model, self._known)
         self._features_and_matches(base, best)
+        if self.matcher == PREEMPTIVE:  # few of the likely partners of a new photo may be known ones
+            self._match_pairs(base, self._pairs_with(base, self.known.new))
         self.depth = judge_depth(self.database())
         if not self.known.changed:
             return self._solution_of(base, [renamed_model(self.known)])
@@ -415,7 +418,7 @@ class Workbench:
 
         with torch_threads(self.threads):
             descriptors = write_corners(self.database(base), self.images_folder, masks, network, features)
-            pairs = likely_pairs(descriptors, self.params.exhaustive_max)
+            pairs = likely_pairs(descriptors, self.params.preemptive_max)
             write_matches(self.database(base), descriptors, pairs, matches)
         self._verify_again(base)
         self._tell(PART_MATCHES, "poses")
@@ -436,15 +439,18 @@ class Workbench:
 
     def _pairs_to_try(self, base: Base, best: Solution | None) -> list[tuple[int, int]]:
         """Image ids of all pairs with a photo that has no pose; of all pairs where no photo has one."""
+        return self._pairs_with(base, self.names - (frozenset() if best is None else best.registered))
+
+    def _pairs_with(self, base: Base, names: Collection[str]) -> list[tuple[int, int]]:
+        """Image ids of all pairs with one of these photos."""
         import pycolmap
 
-        registered = frozenset[str]() if best is None else best.registered
         with pycolmap.Database.open(self.database(base)) as database:
             images = sorted((image.image_id, image.name) for image in database.read_all_images())
         return [
             (first, second)
             for (first, name), (second, other) in combinations(images, 2)
-            if name not in registered or other not in registered
+            if name in names or other in names
         ]
 
     def _import(self, base: Base) -> None:
@@ -698,7 +704,7 @@ def choose_matcher(params: Any, located: int, num_images: int) -> str:
         )
     if params.matcher != "auto":
         return params.matcher
-    if num_images <= params.exhaustive_max:
+    if num_images <= params.preemptive_max:
         return PREEMPTIVE
     return "spatial" if located > 0.9 * num_images else "sequential"
 

@@ -16,7 +16,7 @@ from stages.stereo.matching import disparities, evened, in_pixels, warped
 from stages.stereo.rectification import Rectified, View, rectify, tolerance_of
 
 if TYPE_CHECKING:
-    from jaxtyping import Float, Float32, Int16, UInt8
+    from jaxtyping import Float, Float32, Int, Int16, UInt8
 
 # Of the pairs that know a depth, so many must agree; and never fewer than two.
 MAJORITY = 0.6
@@ -57,23 +57,33 @@ def depth_maps(
         points_seen: the known points that each photo sees; they tell between which depths to search.
         progress: called with the number of photos that are done.
     """
-    maps = []
+    maps: dict[int, np.ndarray] = {}
     with ThreadPoolExecutor(max_workers=max(1, workers)) as pool:
-        for k, compared in enumerate(_by_photo(len(views), greys, views, pairs, points_seen, pool)):
-            maps.append(_agreed(views[k], list(pool.map(partial(_depth, k, views[k]), compared))))
-            progress(k + 1)
-    return maps
+        for k, compared in _by_photo(_along(pairs, len(views)), greys, views, pairs, points_seen, pool):
+            maps[k] = _agreed(views[k], list(pool.map(partial(_depth, k, views[k]), compared)))
+            progress(len(maps))
+    return [maps[k] for k in range(len(views))]
+
+
+def _along(pairs: Sequence[tuple[int, int]], count: int) -> Int[np.ndarray, " n"]:
+    """An order of the photos in which those of a pair come soon after each other: few pairs are held at a time."""
+    from scipy.sparse import csr_array
+    from scipy.sparse.csgraph import reverse_cuthill_mckee
+
+    left, right = np.array(pairs, np.int64).reshape(-1, 2).T
+    graph = csr_array((np.ones(len(left)), (left, right)), shape=(count, count))
+    return reverse_cuthill_mckee((graph + graph.T).tocsr(), symmetric_mode=True)
 
 
 def _by_photo(
-    count: int,
+    order: Int[np.ndarray, " n"],
     greys: Sequence[UInt8[np.ndarray, "h w"]],
     views: Sequence[View],
     pairs: Sequence[tuple[int, int]],
     points_seen: Sequence[Float[np.ndarray, "p 3"]],
     pool: ThreadPoolExecutor,
-) -> Iterator[list[_Compared]]:
-    """The pairs of each photo in turn; one is compared when its first photo needs it, forgotten after the second."""
+) -> Iterator[tuple[int, list[_Compared]]]:
+    """Each photo in this order, with its pairs; one is compared for its first photo, forgotten after the second."""
     of_photo = defaultdict(list)
     for pair in pairs:
         for k in pair:
@@ -88,12 +98,13 @@ def _by_photo(
         turned = [warped(greys[k], views[k], plane, k == right) for k in pair]
         return _Compared(left, right, plane, disparities(*evened(*turned), plane))
 
-    for k in range(count):
+    turn = np.argsort(order)
+    for k in order.tolist():
         new = [pair for pair in of_photo[k] if pair not in known]
         known.update(zip(new, pool.map(compare, new), strict=True))
-        yield [compared for pair in of_photo[k] if (compared := known[pair]) is not None]
+        yield k, [compared for pair in of_photo[k] if (compared := known[pair]) is not None]
         for pair in of_photo[k]:
-            if max(pair) == k:
+            if turn[list(pair)].max() == turn[k]:
                 del known[pair]
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -25,11 +25,12 @@ def fused(
     views: Sequence[View],
     depths: Sequence[Float32[np.ndarray, "h w"]],
     trusts: Sequence[Float32[np.ndarray, "h w"]],
-    colors: Sequence[UInt8[np.ndarray, "h w 3"]],
+    colors: Iterable[UInt8[np.ndarray, "h w 3"]],
 ) -> PointCloud:
     """The depths with some trust as points: means, weighed by trust, of those that lie in one cell about a pixel wide.
 
-    Cells double where pixels do, so that a close-up keeps its detail beside a photo from afar.
+    Cells double where pixels do, so that a close-up keeps its detail beside a photo from afar. Colours are taken one
+    photo at a time, so that they need not all be held.
     """
     total = sum(int((trust > 0).sum()) for trust in trusts)
     if not total:
@@ -38,11 +39,11 @@ def fused(
     counts = [int((trust[::stride, ::stride] > 0).sum()) for trust in trusts]
     ends = np.cumsum(counts)
     rows, cells = np.empty((ends[-1], 10), np.float32), np.empty(ends[-1], np.uint64)
-    for k, (view, depth, trust) in enumerate(zip(views, depths, trusts, strict=True)):
+    for k, (view, depth, trust, color) in enumerate(zip(views, depths, trusts, colors, strict=True)):
         v, u = (stride * each for each in np.nonzero(trust[::stride, ::stride] > 0))
         at, of_photo = places(view, depth, v, u), slice(ends[k] - counts[k], ends[k])
         row = rows[of_photo]
-        row[:, :3], row[:, 3:6], row[:, 6:9], row[:, 9] = at, normals_at(view, depth, v, u), colors[k][v, u], 1
+        row[:, :3], row[:, 3:6], row[:, 6:9], row[:, 9] = at, normals_at(view, depth, v, u), color[v, u], 1
         row *= trust[v, u][:, None]
         cells[of_photo] = _cells(at, depth[v, u] * stride / view.focal)
     return _means(rows, np.repeat(np.arange(len(views), dtype=np.int32), counts), cells)

@@ -49,10 +49,13 @@ class _Photos:
     find: Bool[np.ndarray, " i"]
 
 
-def trust_of(views: Sequence[View], depths: Sequence[Float32[np.ndarray, "h w"]]) -> list[Float32[np.ndarray, "h w"]]:
+def trust_of(views: Sequence[View], depths: list[Float32[np.ndarray, "h w"]]) -> list[Float32[np.ndarray, "h w"]]:
     """Trust in [0, 1] of each photo's depths [h, w], 0 where there is none.
 
     In two rounds: only the first one's trusted places excuse photos from seeing what is behind them in the second.
+
+    Args:
+        depths: they become views of one array: all of them would be a large part of the memory to hold twice.
     """
     sizes = np.array([view.size for view in views]).reshape(-1, 2)
     photos = _Photos(
@@ -60,7 +63,7 @@ def trust_of(views: Sequence[View], depths: Sequence[Float32[np.ndarray, "h w"]]
         centers=np.stack([view.center for view in views]),
         sizes=sizes,
         starts=np.concatenate([[0], np.cumsum(sizes.prod(1))]),
-        depths=np.concatenate([depth.ravel() for depth in depths]),
+        depths=_in_one(depths),
         tolerances=np.array([TOLERANCES * tolerance_of(view) for view in views]),
         find=np.array([(depth > 0).any() for depth in depths]),
     )
@@ -68,6 +71,17 @@ def trust_of(views: Sequence[View], depths: Sequence[Float32[np.ndarray, "h w"]]
     nothing = np.zeros(len(photos.depths), bool)
     known = np.concatenate([_judged(k, *each, photos, nothing).ravel() > KNOWN for k, each in owned])
     return [_judged(k, *each, photos, known) for k, each in owned]
+
+
+def _in_one(maps: list[Float32[np.ndarray, "h w"]]) -> Float32[np.ndarray, " all"]:
+    """All maps one after the other, and each of the list a view of its part."""
+    whole, start = np.empty(sum(each.size for each in maps), np.float32), 0
+    for k, each in enumerate(maps):
+        part = whole[start : start + each.size].reshape(each.shape)
+        part[:] = each
+        maps[k] = part
+        start += each.size
+    return whole
 
 
 def _judged(

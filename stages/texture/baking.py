@@ -189,23 +189,27 @@ class _Prepare:
         if index in self.kept:
             return self.kept[index]
         photo, mask = self.load_photo(index)
-        view = prepare_view(self.cameras, index, photo, mask, self.atlas.vertices, self.atlas.faces, self.texel_side)
-        if view.nbytes <= self.room:
+        return prepare_view(self.cameras, index, photo, mask, self.atlas.vertices, self.atlas.faces, self.texel_side)
+
+    def keep(self, index: int, view: View) -> None:
+        """Keep a photo where there is room. Not for threads: they would take one another's."""
+        if index not in self.kept and view.nbytes <= self.room:
             self.room -= view.nbytes
             self.kept[index] = view
-        return view
 
 
-def _prefetch(pool: ThreadPoolExecutor, prepare: Callable[[int], View], count: int, ahead: int) -> Iterator[View]:
-    """Views 0..count-1 in order, `ahead` of them (at most `_MAX_AHEAD`) being made in the background."""
+def _prefetch(pool: ThreadPoolExecutor, prepare: _Prepare, count: int, ahead: int) -> Iterator[View]:
+    """Views 0..count-1 in order, `ahead` of them (at most `_MAX_AHEAD`) being made in the background, and kept."""
     waiting: list[Future[View]] = []
     ahead = min(ahead, _MAX_AHEAD)
     submitted = 0
-    for _ in range(count):
+    for index in range(count):
         while submitted < count and len(waiting) <= ahead:
             waiting.append(pool.submit(prepare, submitted))
             submitted += 1
-        yield waiting.pop(0).result()
+        view = waiting.pop(0).result()
+        prepare.keep(index, view)
+        yield view
 
 
 def _visited(prepared: Iterator[View], visit: Visitor, gains: np.ndarray) -> Iterator[View]:

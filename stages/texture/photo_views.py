@@ -93,7 +93,7 @@ def prepare_view(
     xy, inverse_depths = projected(cameras, index, vertices)
     left, top, right, bottom = _box(xy[inverse_depths > 0], width, height)
     _, inverse_depth = rasterize(xy - (left, top), inverse_depths, faces, right - left, bottom - top)
-    photo = np.ascontiguousarray(photo[top:bottom, left:right])
+    photo = photo[top:bottom, left:right].copy()  # a view would keep all of the photo in memory
     on_object = inverse_depth > 0
     if mask is not None:
         on_object &= mask[top:bottom, left:right]
