@@ -89,6 +89,16 @@ def test_what_is_no_evidence_moves_nothing(sphere, cloud):
     assert fit.used == fit.folds == 0
 
 
+def test_only_points_about_the_mesh_are_looked_up(sphere, monkeypatch):
+    near, far = round_cloud(RADIUS + CELL, count=3000), round_cloud(3.0, count=3000)
+    both = cloud_of(np.concatenate([near.points, far.points]), np.concatenate([near.normals, far.normals]))
+    looked_up, beside = [], fitting._beside
+    monkeypatch.setattr(fitting, "_beside", lambda *given: looked_up.append(len(given[3])) or beside(*given))
+    fits = [fit_to_points(*sphere, cloud, CELL) for cloud in (near, both)]
+    assert looked_up == [3000, 3000]
+    np.testing.assert_array_equal(fits[0].vertices, fits[1].vertices)
+
+
 def test_few_points_and_points_of_one_photo_move_little(sphere):
     few = fit_to_points(*sphere, round_cloud(RADIUS + CELL, count=30), CELL)
     one = fit_to_points(*sphere, round_cloud(RADIUS + CELL, noise=0.15 * CELL, photos=1), CELL)
@@ -193,6 +203,8 @@ def test_ring_means_by_an_obvious_loop(sphere):
     for v in (0, 17, len(vertices) - 1):
         around = {v, *faces[(faces == v).any(1)].ravel().tolist()}
         np.testing.assert_allclose(means[v], vertices[sorted(around)].mean(0), rtol=1e-6)
+    rows = np.array([17, 3])
+    np.testing.assert_array_equal(rings.mean_at(rows, vertices), means[rows])
 
 
 def test_a_noisy_box_comes_out_flat_with_its_edges():

@@ -26,9 +26,9 @@ def describe_stereo(results: Sequence[PhotoResult], numbers: Mapping[str, Any]) 
     sentences = [f"Stereo explains {100 * mean:.0f} % of the photos' pixels, by {numbers['points']:,} dense points."]
     if mean < LITTLE:
         sentences.append(
-            "That is little: plain walls, shiny, see-through and moving things give none, nor do photos that are "
-            "blurred, far from their neighbours, or taken from the same place as these. Photos in between, from a step "
-            "aside, help, as do even light and something printed beside what is plain."
+            "That is little. Plain walls and things that shine, move or can be seen through give no points; nor do "
+            "photos that are blurred, or taken far from all others, or from the same place. It helps to take photos in "
+            "between, each a step from the last, in even light, with something printed beside what is plain."
         )
     blank = [name for name, share in shares.items() if share < NOTHING]
     if 0 < len(blank) < len(shares) / 2:

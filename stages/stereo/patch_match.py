@@ -6,9 +6,8 @@ CPU, and its files read back.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -154,8 +153,9 @@ def _match(folder: Path, photos: int, progress: Callable[[float, float, str], No
     options.cache_size = CACHE_GB
     with ThreadPoolExecutor(1) as pool:
         run = pool.submit(pycolmap.patch_match_stereo, folder, options=options)
-        while not run.done():
-            time.sleep(POLL_S)
+        finished = False
+        while not finished:
+            finished = bool(wait([run], POLL_S).done)
             done = sum(1 for _ in (folder / "stereo" / "depth_maps").iterdir())
             progress(done, 2 * photos, "matching")
         run.result()

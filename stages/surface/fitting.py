@@ -112,13 +112,20 @@ def fit_to_points(
         return same
     rings = rings_of(faces, len(vertices))
     directions = directions_of(vertices, faces, rings)
-    evidence = _beside(vertices, faces, directions, cloud.chosen(cloud.trust > 0), cell)
+    evidence = _beside(vertices, faces, directions, cloud.chosen(_about(vertices, cloud, cell)), cell)
     if not len(evidence.weights):
         return same
     moves = cell * _displacements(evidence, rings)[:, None] * directions
     moved = vertices + within_gaps(vertices, faces, directions, moves, cell)
     moved, folds = without_folds(vertices, faces, directions, moved, rings)
     return Fit(moved.astype(np.float32), len(evidence.weights), folds)
+
+
+def _about(vertices: np.ndarray, cloud: PointCloud, cell: float) -> np.ndarray:
+    """Which points [n] have trust and lie within reach of the mesh's bounding box."""
+    low, high = vertices.min(0) - REACH * cell, vertices.max(0) + REACH * cell
+    rows: np.ndarray = (cloud.trust > 0) & ((cloud.points >= low) & (cloud.points <= high)).all(1)
+    return rows
 
 
 def _beside(

@@ -37,9 +37,14 @@ class Rings:
 
     def mean(self, values: Float[np.ndarray, "v c"], times: int = 1) -> Float[np.ndarray, "v c"]:
         """Each vertex averaged with its neighbours, so many times over."""
+        everywhere = np.arange(len(values))
         for _ in range(times):
-            values = _ring_means(self.starts, self.others, values)
+            values = _ring_means(self.starts, self.others, values, everywhere)
         return values
+
+    def mean_at(self, rows: Int[np.ndarray, " n"], values: Float[np.ndarray, "v c"]) -> Float[np.ndarray, "n c"]:
+        """Only these vertices, each averaged with its neighbours."""
+        return _ring_means(self.starts, self.others, values, rows)
 
 
 def rings_of(faces: Int[np.ndarray, "f 3"], num_vertices: int) -> Rings:
@@ -121,36 +126,47 @@ def without_folds(
     """
     towards = unit(directions[faces].sum(1))
 
-    def folded(places: np.ndarray) -> np.ndarray:
-        crosses = face_normals(places, faces)
-        return np.einsum("fc,fc->f", crosses, towards) <= FOLD_COSINE * np.linalg.norm(crosses, axis=1)
+    def folded(places: np.ndarray, beside: np.ndarray) -> np.ndarray:
+        """Which of the faces `beside` are turned over."""
+        crosses = face_normals(places, faces[beside])
+        return np.einsum("fc,fc->f", crosses, towards[beside]) <= FOLD_COSINE * np.linalg.norm(crosses, axis=1)
 
-    before, would = folded(vertices), 0
-    moved = moved.copy()
+    beside, moved = np.arange(len(faces)), moved.copy()
+    before = folded(vertices, beside)
+    new = np.flatnonzero(folded(moved, beside) & ~before)
+    would = len(new)
     for attempt in range(SLIDES + HALVINGS):
-        new = folded(moved) & ~before
-        would = would or int(np.count_nonzero(new))
-        if not new.any():
+        if not len(new):
             break
-        touched = np.zeros((len(vertices), 1))
-        touched[faces[new]] = 1
-        rows = np.flatnonzero(rings.mean(touched)[:, 0])
+        rows = np.unique(faces[_with_corners(faces, faces[new], len(vertices))])
         if attempt < SLIDES:
-            slide = (rings.mean(moved) - moved)[rows]
+            slide = rings.mean_at(rows, moved) - moved[rows]
             moved[rows] += slide - np.einsum("nc,nc->n", slide, directions[rows])[:, None] * directions[rows]
         else:
             part = 0.5 if attempt < SLIDES + HALVINGS - 1 else 0.0
             moved[rows] = vertices[rows] + part * (moved[rows] - vertices[rows])
+        beside = _with_corners(faces, rows, len(vertices))  # no others can have changed
+        new = beside[folded(moved, beside) & ~before[beside]]
     return moved, would
 
 
+def _with_corners(faces: np.ndarray, vertices: np.ndarray, num_vertices: int) -> np.ndarray:
+    """Indices of the faces that have one of these vertices as a corner."""
+    chosen = np.zeros(num_vertices, bool)
+    chosen[vertices] = True
+    first, second, third = chosen[faces].T
+    return np.flatnonzero(first | second | third)
+
+
 @njit(cache=True, nogil=True)
-def _ring_means(starts: np.ndarray, others: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """See `Rings.mean`."""
-    means = values.astype(np.float64)
-    for v in range(len(starts) - 1):
+def _ring_means(starts: np.ndarray, others: np.ndarray, values: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """See `Rings.mean_at`."""
+    means = np.empty((len(rows), values.shape[1]))
+    for i in range(len(rows)):
+        v = rows[i]
         for c in range(values.shape[1]):
+            total = np.float64(values[v, c])
             for k in range(starts[v], starts[v + 1]):
-                means[v, c] += values[others[k], c]
-            means[v, c] /= 1 + starts[v + 1] - starts[v]
+                total += values[others[k], c]
+            means[i, c] = total / (1 + starts[v + 1] - starts[v])
     return means

@@ -18,7 +18,8 @@ STEPS_UNSIGNED = 64.0
 STEPS_SIGNED = 32.0
 # Robust spread (colour levels) never counts as less than this: photo noise.
 NOISE_FLOOR = 3.0
-# Points projected at a time.
+# Points projected at a time, by the two loops over points themselves: with a function for it that both call, inlined or
+# not, they took three to six times as long.
 _BLOCK = 512
 # Unsigned, or numba would look at each index whether it counts from the end, at a fifth of the time.
 _ONE = np.uintp(1)
