@@ -98,6 +98,7 @@ VARIANTS: dict[str, dict[str, str]] = {
     # what a step leaves out, put back
     "rays-even": {"train.sampling.needed_share": "0"},
     "colors-16": {"train.schedule.deferred_from": "null"},
+    "samples-16": {"train.sampling.samples_end": "16"},
     "background-16": {"train.sampling.background_samples": "16"},
     "proposal": {"train.sampling.sampler": "proposal"},
     # the paper's "integrated into" rows: each backbone without and with the terms

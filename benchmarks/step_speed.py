@@ -47,7 +47,7 @@ PARTS = (
     "ambiguity-paper", "visibility-paper", "visibility-mesh", "reflection-paper", "planar-paper", "eikonal-paper",
     "all-paper",
     "density-neus", "scale-learned", "gradients-numerical", "planar-mlp",
-    "rays-even", "colors-16", "background-16",
+    "rays-even", "colors-16", "samples-16", "background-16",
 )  # fmt: skip
 PARTS_PROGRESS = 0.5  # all parts at work
 LEARNING_STEPS = 100

@@ -58,6 +58,9 @@ class SamplingParams(Section):
 
     rays: int = Field(512, ge=1, description="rays per step")
     samples: int = Field(16, ge=2, description="samples per ray inside the region of interest")
+    samples_end: int = Field(
+        12, ge=2, description="samples per ray once the density is sharp, fewer and fewer from 0.3 of the budget on"
+    )
     needed_share: float = Field(
         0.7, ge=0, le=1, description="part of the rays that goes where the surface is, and where colours are met worse"
     )

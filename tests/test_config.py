@@ -240,7 +240,7 @@ def test_a_stage_s_old_settings_compare_equal_to_the_same_ones_of_today():
         "extract": {"fit", "denoising"},
         "train": {
             "steps_if_covered", "losses.dense", "losses.dense_tolerance", "losses.dense_step", "losses.dense_batch",
-            "sampling.needed_share", "schedule.deferred_from",
+            "sampling.samples_end", "sampling.needed_share", "schedule.deferred_from",
         },
     }  # fmt: skip
     for section in ("train", "undistort", "extract"):

@@ -26,6 +26,7 @@ from stages.neural.sampling import (
     intersect_unit_sphere,
     stratified,
 )
+from stages.neural.schedules import even_steps
 
 
 def test_laplace_density_at_known_places():
@@ -252,3 +253,12 @@ def test_the_means_of_a_ray_that_meets_nothing_have_finite_gradients():
     assert torch.isfinite(weights.grad).all()
     none = ray_means(torch.zeros(0, 7), torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0, 4))
     assert [tuple(part.shape) for part in none] == [(0, 1), (0, 3), (0, 3), (0, 4)]
+
+
+def test_samples_get_fewer_in_even_steps():
+    counts = [even_steps(i / 100, 16, 8, 0.3, 0.9) for i in range(101)]
+    assert counts[:31] == [16] * 31
+    assert counts[90:] == [8] * 11
+    assert counts[60] == 12
+    assert sorted(set(counts), reverse=True) == list(range(16, 7, -1))
+    assert [even_steps(p, 16, 8, 0.3, 0.3) for p in (0.3, 0.31)] == [16, 8]

@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 
 # Samples that weigh less than this get no colour: together they change a pixel by less than one grey level.
 _COLOR_THRESHOLD = 2e-4
+# Progress until which a ray has all its samples: the surface is found by then.
+_FEWER_FROM = 0.3
 # Rays that let less than this through show nothing of the background: two grey levels at most.
 _BACKGROUND_THRESHOLD = 0.01
 # The background's last sample is this near to infinity, as a part of the contracted shell: 200 radii away.
@@ -53,8 +55,11 @@ class Renderer:
         else:
             end = max(density.scale_end, 0.5 * grid.voxel_size())
             scale = schedules.exponential(progress / density.sharpen_until, density.scale_start, end)
+        sampling = self.params.sampling
+        last = min(sampling.samples_end, sampling.samples)
+        samples = schedules.even_steps(progress, sampling.samples, last, _FEWER_FROM, density.sharpen_until)
         deferred = schedule.deferred_from is not None and progress >= schedule.deferred_from
-        return Moment(progress, scale, levels, grid.voxel_size(levels), deferred)
+        return Moment(progress, scale, levels, grid.voxel_size(levels), samples, deferred)
 
     def render(
         self,
@@ -93,9 +98,9 @@ class Renderer:
         """Distances of the samples, and the proposal network's histogram where it made them."""
         params = self.params.sampling
         if self.fields.proposal is None:
-            return importance_distances(self.cache, batch, params.samples, moment.scale, generator), None
+            return importance_distances(self.cache, batch, moment.samples, moment.scale, generator), None
         distances, edges, weights = proposal_distances(
-            self.fields.proposal, batch, params.proposal_samples, params.samples, generator
+            self.fields.proposal, batch, params.proposal_samples, moment.samples, generator
         )
         return distances, (edges, weights)
 

@@ -17,6 +17,7 @@ class Moment:
         scale: the density's scale b, scene units; a tensor with a gradient where it is learned.
         levels: how many levels of the encoding are in use.
         voxel: side h of a cell of the finest of them, scene units.
+        samples: how many samples a ray has inside the region.
         deferred: whether a ray's colour is that of its mean surface point, not the mean of its samples' colours.
     """
 
@@ -24,6 +25,7 @@ class Moment:
     scale: torch.Tensor | float
     levels: int
     voxel: float
+    samples: int
     deferred: bool
 
     @property
@@ -63,3 +65,11 @@ def active_levels(progress: float, levels: int, start: int, until: float) -> int
     if progress >= until:
         return levels
     return min(levels, start + int((levels - start + 1) * progress / until))
+
+
+def even_steps(progress: float, first: int, last: int, begin: float, end: float) -> int:
+    """A count that goes from `first`, until `begin`, to `last`, from `end` on, in even steps of one between."""
+    if progress <= begin:
+        return first
+    part = min((progress - begin) / (end - begin), 1.0) if end > begin else 1.0
+    return round(first + (last - first) * part)

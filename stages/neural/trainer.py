@@ -143,7 +143,7 @@ class Trainer:
             self._scale.fill_(moment.scale)
             self._sparse_weight.fill_(sparse_weight)
             current = replace(moment, scale=self._scale)
-            kind = moment.levels, moment.deferred
+            kind = moment.levels, moment.samples, moment.deferred
             numbers = self.replay(lambda: self._update(current, self._sparse_weight), kind)
         self.step_index += 1
         return numbers
