@@ -61,6 +61,8 @@ SAME_FRAME = 1e-6  # of the region's radius
 def run(context: StageContext[TrainParams]) -> dict[str, Any]:
     """Train until the budget of steps or minutes is spent; write field.pt, the scene, metrics.jsonl and previews.
 
+    How many steps that is depends on how much of the first shape dense points cover.
+
     A region that was found is looked at once on the way: where its border cuts what the photos are about, it grows, and
     training goes on in the larger one from the shape that it has learned.
     """
@@ -212,6 +214,9 @@ class _Training:
         from stages.surface.covering import covered_share
 
         params, scene = self.context.params, self.scene
+        if params.minutes:
+            self.steps = params.steps
+            return
         covered = 0.0
         if params.steps_if_covered < 1:
             vertices, faces = self.trainer.coarse_surface()
