@@ -20,13 +20,10 @@ from stages.artifacts import DEPTH_MAPS, FIRST_SCENE, PINHOLE_PHOTOS, POINT_CLOU
 from stages.engine.stage import Stage, StageContext
 from stages.errors import SystemRequirementError
 from stages.geometry.cameras import PosedScene
-from stages.geometry.point_cloud import PointCloud
+from stages.geometry.point_cloud import TRUSTED, PointCloud
 from stages.stereo.rectification import View
 
 log = logging.getLogger(__name__)
-
-# A depth counts as explained from this trust on.
-EXPLAINED = 0.5
 
 
 @dataclass(frozen=True)
@@ -154,9 +151,10 @@ def _depths(context: StageContext[HeldOutDensifyParams], photos: _Capture) -> li
 
 def _by_semi_global_matching(context: StageContext[HeldOutDensifyParams], photos: _Capture) -> list[np.ndarray]:
     from stages.stereo.depths import depth_maps
+    from stages.stereo.pairs import points_seen
 
-    scene, count = photos.scene, len(photos.views)
-    seen = [scene.points[scene.observations[scene.observations[:, 0] == k, 1]] for k in range(count)]
+    count = len(photos.views)
+    seen = points_seen(photos.scene.points, photos.scene.observations, count)
     greys = [photos.grey(k) for k in range(count)]
     return depth_maps(
         photos.views, greys, photos.pairs, seen, context.workers, lambda k: context.progress(k, count + 1)
@@ -210,7 +208,7 @@ def _publish(context: StageContext[HeldOutDensifyParams], photos: _Capture, dept
 def _explained(trust: np.ndarray, within: np.ndarray | None) -> float:
     """Share of a photo's pixels [h, w], of those on its mask where it has one, whose depth is trusted."""
     asked = trust.size if within is None else int(within.sum())
-    return float((trust >= EXPLAINED).sum()) / max(asked, 1)
+    return float((trust >= TRUSTED).sum()) / max(asked, 1)
 
 
 DENSIFY: Stage[HeldOutDensifyParams] = Stage(

@@ -50,7 +50,7 @@ def run(context: StageContext[ExtractParams]) -> dict[str, Any]:
         )
     vertices, faces, used = surface.vertices, surface.faces, 0
     if context.params.fit:
-        cloud = context.read(POINT_CLOUD).moved(scene.poses_from_scene.inverse())
+        cloud = context.read(POINT_CLOUD).within(scene.poses_from_scene)
         fit = fit_to_points(vertices, faces, cloud, 2 / resolution)
         vertices, used = fit.vertices, fit.used
     vertices = denoised(vertices, faces, context.params.denoising)

@@ -307,7 +307,7 @@ def _make_trainer(context: StageContext[TrainParams], scene: PosedScene) -> Any:
 
 def _cloud(context: StageContext[TrainParams], scene: PosedScene) -> PointCloud:
     """The dense points in the frame of a scene."""
-    return context.read(POINT_CLOUD).moved(scene.poses_from_scene.inverse())
+    return context.read(POINT_CLOUD).within(scene.poses_from_scene)
 
 
 # ---------------------------------------------------------------- a region that grows

@@ -13,6 +13,7 @@ import numpy as np
 from stages.artifacts import AtlasMesh
 from stages.compiling import njit
 from stages.geometry.cameras import PinholeCameras
+from stages.geometry.vectors import unit
 
 NO_FACE = -1
 # Triangles reaching closer to the projection centre than this (scene units; the object's radius is 1) are
@@ -189,5 +190,4 @@ def surface_points(atlas: AtlasMesh, face_ids: np.ndarray, corner: np.ndarray) -
         ids = atlas.faces[face_ids, k]
         points += corner[:, k, None] * atlas.vertices[ids]
         normals += corner[:, k, None] * atlas.normals[ids]
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-    return points, normals
+    return points, unit(normals)

@@ -9,6 +9,7 @@ from stages.artifacts import AtlasMesh
 from stages.drawing.rasterizing import NO_FACE, corner_weights, projected, rasterize
 from stages.geometry.cameras import PinholeCameras
 from stages.geometry.normalisation import perpendicular
+from stages.geometry.vectors import unit
 
 BACKGROUND = (255, 255, 255)
 FOV_DEG, ELEVATION_DEG = 35.0, 20.0
@@ -98,10 +99,8 @@ def render_textured(
         corners = mesh.faces[face_ids]
         colors = sample_texture(texture, np.einsum("pc,pcd->pd", weights, mesh.uvs[corners]))
         if shaded:
-            shading = np.einsum("pc,pcd->pd", weights, mesh.normals[corners])
-            shading /= np.maximum(np.linalg.norm(shading, axis=1, keepdims=True), 1e-12)
-            towards = camera.centers[0] - np.einsum("pc,pcd->pd", weights, mesh.vertices[corners])
-            towards /= np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-12)
+            shading = unit(np.einsum("pc,pcd->pd", weights, mesh.normals[corners]))
+            towards = unit(camera.centers[0] - np.einsum("pc,pcd->pd", weights, mesh.vertices[corners]))
             facing = np.abs((shading * towards).sum(1, keepdims=True))
             colors = colors * (0.35 + 0.65 * facing)
         image[hit] = colors

@@ -12,6 +12,9 @@ from stages.geometry.similarity import Similarity
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int, UInt8
 
+# Points, and depths, of at least this trust count as known.
+TRUSTED = 0.5
+
 
 @dataclass(frozen=True)
 class PointCloud:
@@ -47,6 +50,10 @@ class PointCloud:
         points = target_from_poses.apply(self.points.astype(np.float64))
         normals = (self.normals @ target_from_poses.rotation.T).astype(np.float32)
         return PointCloud(points, normals, self.colors, self.trust, self.starts, self.photos)
+
+    def within(self, poses_from_scene: Similarity) -> PointCloud:
+        """These points of the poses' frame, in the scene frame."""
+        return self.moved(poses_from_scene.inverse())
 
     def chosen(self, rows: Bool[np.ndarray, " n"]) -> PointCloud:
         """Only the points where `rows` is true."""

@@ -1,8 +1,8 @@
 """Which rays a step needs: those that meet the surface, and more of them where the colours are met worse.
 
 A uniform draw over the photos spends most rays on what lies behind the object. The photos are cut into cells, and a
-part of the rays goes to cells whose middle ray meets the surface of the sampler's grid, or passes near
-it, in proportion to the colour error found there so far.
+part of the rays goes to cells whose middle ray meets the surface of the sampler's grid, or passes near it, in
+proportion to the colour error found there so far.
 
 Shapes: C cells of all photos together, R rays.
 """

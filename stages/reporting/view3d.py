@@ -16,7 +16,7 @@ from stages.drawing.rendering import look_at
 from stages.geometry.cameras import PinholeCameras, PosedScene
 from stages.geometry.normalisation import perpendicular
 from stages.geometry.place import GivenRegion, Place
-from stages.geometry.point_cloud import PointCloud
+from stages.geometry.point_cloud import TRUSTED, PointCloud
 from stages.geometry.similarity import Similarity
 from stages.geometry.up import y_up_rotation
 from stages.reporting.next_views import NextView
@@ -26,8 +26,8 @@ from stages.reporting.pictures import jpeg_uri, shrink
 MAX_FACES = 400_000
 TEXTURE_SIDE = 2048
 MAX_POINTS = 40_000
-# Dense points: at most so many in the region and around it, which add 0.6 MB to the page; none that is trusted less.
-MAX_DENSE, MAX_AROUND, MIN_TRUST = 40_000, 10_000, 0.5
+# Dense points: at most so many trusted ones in the region and around it, which add 0.6 MB to the page.
+MAX_DENSE, MAX_AROUND = 40_000, 10_000
 # Measures are packed as 0..254; this says that a vertex has none.
 NO_VALUE = 255
 # All sparse points within this many radii of the region are drawn, and of all together the nearest, but for this share:
@@ -126,8 +126,8 @@ def pack_dense(cloud: PointCloud, scene: PosedScene) -> dict[str, Any] | None:
     Args:
         cloud: in the frame of the poses.
     """
-    moved, random = cloud.moved(scene.poses_from_scene.inverse()), np.random.default_rng(0)
-    distances = np.where(moved.trust >= MIN_TRUST, np.linalg.norm(moved.points, axis=1), np.inf)
+    moved, random = cloud.within(scene.poses_from_scene), np.random.default_rng(0)
+    distances = np.where(moved.trust >= TRUSTED, np.linalg.norm(moved.points, axis=1), np.inf)
     inside, around = distances <= 1, (distances > 1) & (distances <= POINTS_REACH)
     rows = np.concatenate(
         [random.permutation(np.flatnonzero(some))[:most] for some, most in ((inside, MAX_DENSE), (around, MAX_AROUND))]

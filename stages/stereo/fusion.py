@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from stages.geometry.point_cloud import PointCloud
+from stages.geometry.vectors import unit
 from stages.stereo.rectification import View
 from stages.stereo.trust import normals_at, places
 
@@ -71,10 +72,9 @@ def _means(
     seen_first = np.concatenate([[True], (key[1:] != key[:-1]) | (photos[1:] != photos[:-1])])
     starts = np.concatenate([np.cumsum(seen_first)[first] - 1, [seen_first.sum()]])
     trust = sums[:, 9] / np.diff(np.append(first, len(key)))
-    normals = sums[:, 3:6] / np.maximum(np.linalg.norm(sums[:, 3:6], axis=1, keepdims=True), 1e-12)
     return PointCloud(
         points=sums[:, :3] / sums[:, 9:],
-        normals=normals,
+        normals=unit(sums[:, 3:6]),
         colors=np.round(sums[:, 6:9] / sums[:, 9:]).astype(np.uint8),
         trust=trust.astype(np.float32),
         starts=starts.astype(np.int64),

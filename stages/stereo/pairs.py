@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from stages.geometry.vectors import unit
 from stages.stereo.rectification import View, comparable, rectify
 
 if TYPE_CHECKING:
@@ -34,7 +35,7 @@ def pairs_of(
     """
     suited = scores(views, points, observations)
     centers = np.stack([view.center for view in views])
-    seen = [points[observations[observations[:, 0] == i, 1]] for i in range(len(views))]
+    seen = points_seen(points, observations, len(views))
     found: set[tuple[int, int]] = set()
     for i, row in enumerate(suited):
 
@@ -43,9 +44,16 @@ def pairs_of(
             return rectify(views[left], views[right], np.concatenate([seen[left], seen[right]])) is not None
 
         if len(seen[i]):
-            directions = _unit(centers - np.median(seen[i], axis=0))
+            directions = unit(centers - np.median(seen[i], axis=0))
             found |= {(min(i, j), max(i, j)) for j in _best(row, directions, neighbors, usable)}
     return sorted(found)
+
+
+def points_seen(
+    points: Float[np.ndarray, "p 3"], observations: Integer[np.ndarray, "m 2"], num_photos: int
+) -> list[Float[np.ndarray, "_ 3"]]:
+    """The known points that each photo sees."""
+    return [points[observations[observations[:, 0] == k, 1]] for k in range(num_photos)]
 
 
 def scores(
@@ -72,7 +80,7 @@ def scores(
         here, there = at - centers[i], at - centers[j]
         widths = np.linalg.norm(here, axis=1) / focals[i], np.linalg.norm(there, axis=1) / focals[j]
         alike = np.minimum(*widths) / np.maximum(np.maximum(*widths), 1e-12)
-        weights = _by_angle(np.degrees(np.arccos(np.clip((_unit(here) * _unit(there)).sum(1), -1, 1)))) * alike
+        weights = _by_angle(np.degrees(np.arccos(np.clip((unit(here) * unit(there)).sum(1), -1, 1)))) * alike
         shared = np.bincount(j, minlength=count) >= MIN_SHARED
         result[i] = np.bincount(j, weights, count) * shared
         result[i] *= [k != i and shared[k] and comparable(views[i], view) for k, view in enumerate(views)]
@@ -105,7 +113,3 @@ def _best(
         left *= np.minimum(degrees / APART, 1)
         left[best] = 0
     return chosen
-
-
-def _unit(vectors: np.ndarray) -> np.ndarray:
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)

@@ -49,12 +49,7 @@ def border_cut(
     vertices: np.ndarray, faces: np.ndarray, cameras: PinholeCameras, ground: Plane | None
 ) -> BorderCut | None:
     """Where a mesh of the scene ends at the region's border in the middle of many photos; None: nowhere."""
-    near = np.zeros(len(vertices), dtype=bool)
-    near[faces] = True  # vertices without a face are no surface
-    near &= np.linalg.norm(vertices, axis=1) > NEAR_BORDER
-    if ground is not None:
-        near &= ground.heights(vertices) > ABOVE_GROUND
-    rows = np.flatnonzero(near)
+    rows = np.flatnonzero(off_ground(vertices, faces, ground) & (np.linalg.norm(vertices, axis=1) > NEAR_BORDER))
     rows = rows[:: max(1, -(-len(rows) // MAX_PLACES))]
     if not len(rows):
         return None
@@ -63,6 +58,15 @@ def border_cut(
     if cut.sum() <= MAX_WRONG:
         return None
     return BorderCut(vertices[rows[cut]], int((views[cut].mean(0) > MIN_SHOWN).sum()))
+
+
+def off_ground(vertices: np.ndarray, faces: np.ndarray, ground: Plane | None) -> np.ndarray:
+    """Which vertices [V] bool are of the surface, that is of a face, and not of the ground."""
+    surface = np.zeros(len(vertices), dtype=bool)
+    surface[faces] = True
+    if ground is not None:
+        surface &= ground.heights(vertices) > ABOVE_GROUND
+    return surface
 
 
 def region_without_cut(cut: BorderCut) -> tuple[np.ndarray, float]:

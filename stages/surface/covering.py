@@ -6,13 +6,12 @@ import numpy as np
 
 from stages.geometry.cameras import PinholeCameras
 from stages.geometry.plane import Plane
-from stages.geometry.point_cloud import PointCloud
+from stages.geometry.point_cloud import TRUSTED, PointCloud
+from stages.surface.border import off_ground
 from stages.surface.selection import count_views
 
-# Points with less trust than this cover nothing.
-MIN_TRUST = 0.5
-# What is asked: places of the surface within this radius, so high above the ground, that so many photos see.
-WITHIN, ABOVE_GROUND, SEEN_BY = 0.9, 0.06, 2
+# What is asked: places of the surface within this radius, off the ground, that so many photos see.
+WITHIN, SEEN_BY = 0.9, 2
 # A place is covered where this part of the points lie within `REACH` (scene units) that would lie there if each pixel
 # of one photo had one.
 REACH, COVERED = 0.05, 0.1
@@ -32,23 +31,15 @@ def covered_share(
     """
     from scipy.spatial import cKDTree
 
-    rows = np.flatnonzero(_asked(vertices, faces, cameras, ground))
-    points = cloud.points[(cloud.trust >= MIN_TRUST) & (np.linalg.norm(cloud.points, axis=1) < 1)]
-    if not len(rows) or not len(points):
+    points = cloud.points[(cloud.trust >= TRUSTED) & (np.linalg.norm(cloud.points, axis=1) < 1)]
+    if not len(faces) or not len(points):
+        return 0.0
+    asked = off_ground(vertices, faces, ground) & (np.linalg.norm(vertices, axis=1) < WITHIN)
+    rows = np.flatnonzero(asked & (count_views(vertices, faces, cameras, SEEN_BY) >= SEEN_BY))
+    if not len(rows):
         return 0.0
     places = vertices[rows[:: -(-len(rows) // MAX_PLACES)]]
     counts = cKDTree(points).query_ball_point(places, REACH, return_length=True)
-    distances = np.linalg.norm(cameras.centers[:, None] - places.mean(0), axis=2)[:, 0]
+    distances = np.linalg.norm(cameras.centers - places.mean(0), axis=1)
     pixel = float(np.median(distances / cameras.intrinsics[:, 0, 0]))
     return float((counts > COVERED * np.pi * (REACH / pixel) ** 2).mean())
-
-
-def _asked(vertices: np.ndarray, faces: np.ndarray, cameras: PinholeCameras, ground: Plane | None) -> np.ndarray:
-    if not len(faces):
-        return np.zeros(len(vertices), bool)
-    asked: np.ndarray = np.zeros(len(vertices), bool)
-    asked[faces] = True
-    asked &= np.linalg.norm(vertices, axis=1) < WITHIN
-    if ground is not None:
-        asked &= ground.heights(vertices) > ABOVE_GROUND
-    return asked & (count_views(vertices, faces, cameras, SEEN_BY) >= SEEN_BY)

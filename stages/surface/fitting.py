@@ -22,7 +22,8 @@ import numpy as np
 
 from stages.compiling import njit
 from stages.geometry.point_cloud import PointCloud
-from stages.surface.moving import Rings, directions_of, rings_of, unit, within_gaps, without_folds
+from stages.geometry.vectors import unit
+from stages.surface.moving import Rings, directions_of, rings_of, within_gaps, without_folds
 from stages.surface.triangle_mesh import raycaster
 
 if TYPE_CHECKING:

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from stages.artifacts import AtlasMesh
+from stages.geometry.vectors import unit
 from stages.surface.decimation import decimate_textured
 from stages.surface.triangle_mesh import raycaster, vertex_normals
 
@@ -61,7 +62,6 @@ def _normals_at(points: np.ndarray, own: np.ndarray, atlas: AtlasMesh) -> np.nda
     nearest = raycaster(atlas.vertices, atlas.faces).compute_closest_points(o3d.core.Tensor(points))
     corners = atlas.faces[nearest["primitive_ids"].numpy().astype(np.int64)]
     v, w = nearest["primitive_uvs"].numpy().astype(np.float64).T
-    found = np.einsum("pc,pcd->pd", np.stack([1 - v - w, v, w], axis=1), atlas.normals[corners])
-    found /= np.maximum(np.linalg.norm(found, axis=1, keepdims=True), 1e-12)
+    found = unit(np.einsum("pc,pcd->pd", np.stack([1 - v - w, v, w], axis=1), atlas.normals[corners]))
     agree = (found * own).sum(1, keepdims=True) > MIN_AGREEMENT
     return np.where(agree, found, own)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from stages.compiling import njit
+from stages.geometry.vectors import unit
 from stages.surface.triangle_mesh import MAX_RAYS, face_normals, raycaster, vertex_normals
 
 if TYPE_CHECKING:
@@ -62,11 +63,6 @@ def directions_of(
 ) -> Float[np.ndarray, "v 3"]:
     """Unit normals, averaged over the surroundings."""
     return unit(rings.mean(vertex_normals(vertices, faces), DIRECTION_RINGS))
-
-
-def unit(vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    """The vectors at length 1; zero stays zero."""
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), np.finfo(np.float32).tiny)
 
 
 def within_gaps(

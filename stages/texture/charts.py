@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
+from stages.geometry.vectors import unit
 from stages.surface.triangle_mesh import face_adjacency, face_areas, face_normals, label_pieces, vertex_normals
 
 # xatlas charts may cover at most the mesh's area over this: its time grows steeply with the size of a chart.
@@ -126,8 +127,7 @@ def _axis_of_faces(units: np.ndarray, adjacency: np.ndarray) -> np.ndarray:
     directions = np.repeat(np.eye(3), 2, axis=0) * np.tile([1.0, -1.0], 3)[:, None]
     smooth = units.copy()
     for _ in range(SMOOTHING_ROUNDS):
-        smooth = smooth + neighbours @ smooth
-        smooth /= np.maximum(np.linalg.norm(smooth, axis=1, keepdims=True), 1e-12)
+        smooth = unit(smooth + neighbours @ smooth)
     tilt = units @ directions.T
     allowed = tilt > MIN_TILT
     axis = np.where(allowed, smooth @ directions.T, -2 + tilt).argmax(1)

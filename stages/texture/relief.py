@@ -9,6 +9,7 @@ import numpy as np
 
 from stages.artifacts import AtlasMesh
 from stages.drawing.rasterizing import Texels, rasterize_atlas, surface_points
+from stages.geometry.vectors import unit
 from stages.surface.triangle_mesh import MAX_RAYS, face_areas, median_edge, raycaster, vertex_normals
 from stages.texture.padding import pad_charts
 from stages.texture.tangents import to_tangent_space, vertex_tangents
@@ -108,8 +109,7 @@ def _normals_near(
         rows = np.flatnonzero(distance < np.minimum(reach, nearest))
         u, v = hit["primitive_uvs"].numpy()[rows].T
         corners = full_normals[faces[hit["primitive_ids"].numpy()[rows]]]
-        there = np.einsum("kt,tkc->tc", np.stack([1 - u - v, u, v]), corners)
-        there /= np.maximum(np.linalg.norm(there, axis=1, keepdims=True), 1e-12)
+        there = unit(np.einsum("kt,tkc->tc", np.stack([1 - u - v, u, v]), corners))
         alike = (there * normals[rows]).sum(1) > MIN_COSINE
         nearest[rows[alike]], answer[rows[alike]] = distance[rows[alike]], there[alike]
     return np.isfinite(nearest), answer
