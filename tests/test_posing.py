@@ -631,7 +631,7 @@ def test_points_of_a_real_set_fit_its_cameras(data_dir: Path, tmp_path: Path):
         camera.name: (camera, ImageRecord(camera.name, camera.name, *camera.size, None, "", 1.0, False, ""))
         for camera in read_poses(root).cameras[:4]
     }
-    params = SfmParams(max_features=2000, max_image_size=400)
+    params = SfmParams(max_features=2000, max_image_size=800)
     model, _ = triangulate(tmp_path, root, chosen, params, 1, 2, cuda=False, progress=lambda *progress: None)
     assert model.num_points3D() > 50
     assert model.compute_mean_reprojection_error() < 0.8
