@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import takewhile
 from pathlib import Path
-from typing import IO, Any, NamedTuple
+from typing import IO, TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -22,6 +22,7 @@ from configs.training import TrainParams
 from stages import artifacts
 from stages.artifacts import (
     CAMERAS,
+    DEPTH_MAPS,
     FIELD,
     FIRST_SCENE,
     HELD_OUT,
@@ -39,6 +40,9 @@ from stages.geometry.cameras import PinholeCameras, PosedScene
 from stages.geometry.normalisation import regrown
 from stages.geometry.point_cloud import PointCloud
 from stages.geometry.similarity import Similarity
+
+if TYPE_CHECKING:
+    from stages.neural.doubt import Doubt
 
 log = logging.getLogger(__name__)
 
@@ -302,7 +306,16 @@ def _make_trainer(context: StageContext[TrainParams], scene: PosedScene) -> Any:
     training = (~held_out).numpy()
     sightings = Sightings.from_scene(scene, context.device, training)
     dense = Sightings.from_cloud(_cloud(context, scene), scene.cameras.centers, context.device, training)
-    return Trainer(photos, sightings, dense, params, context.device)
+    return Trainer(photos, sightings, dense, params, context.device, _doubt(context, scene))
+
+
+def _doubt(context: StageContext[TrainParams], scene: PosedScene) -> Doubt:
+    """Where the depth maps deny each other, in the scene frame."""
+    from stages.neural.doubt import Doubt
+
+    maps, unit = context.read(DEPTH_MAPS), np.float32(scene.poses_from_scene.scale)
+    found = (maps.load(name) for name in scene.cameras.names)
+    return Doubt.of((pair and (pair[0] / unit, pair[1]) for pair in found), scene.cameras, context.device)
 
 
 def _cloud(context: StageContext[TrainParams], scene: PosedScene) -> PointCloud:
@@ -542,10 +555,10 @@ def _last_numbers(metrics: Path) -> dict[str, float]:
 
 TRAIN: Stage[TrainParams] = Stage(
     name="train",
-    version=9,
+    version=10,
     settings=lambda config: config.train,
     run=run,
-    reads=(FIRST_SCENE, PINHOLE_PHOTOS, POINT_CLOUD),
+    reads=(FIRST_SCENE, PINHOLE_PHOTOS, DEPTH_MAPS, POINT_CLOUD),
     writes=(FIELD, CAMERAS, SCENE, METRICS, PREVIEWS, HELD_OUT),
     continues=True,
     summary="learn a signed distance field and its colours from the posed images",

@@ -16,8 +16,9 @@ from stages.neural.acceleration import short_products, takes_kernel
 from stages.neural.appearance import FeatureMlp
 from stages.neural.encoding_shapes import Encoding, Frequencies, HashGrid
 from stages.neural.encodings import encode, encode_features
-from stages.neural.mlp import Mlp, kaiming_uniform, mlp, spherical_harmonics
+from stages.neural.mlp import Mlp, kaiming_uniform, mlp
 from stages.neural.proposal import ProposalNetwork
+from stages.neural.radiance import Radiance
 from stages.neural.reflection_network import ReflectionNetwork
 
 if TYPE_CHECKING:
@@ -80,6 +81,7 @@ class FieldShape:
         sdf_layers, sdf_width: hidden layers of the SDF's MLP.
         radiance_layers, radiance_width: hidden layers of the radiance MLP; the other networks are as wide.
         reflected: whether the radiance MLP gets the reflected direction and n.v beside the view.
+        shaded: whether colours are albedo times irradiance where the radiance MLP is not needed.
         features: geometry features handed from the SDF network to the radiance network.
         sphere_radius: radius of the sphere that the SDF is before training.
         background_grid: hash encoding of the background, or None without one.
@@ -104,6 +106,7 @@ class FieldShape:
     reflection: bool = False
     appearance: bool = False
     proposal: bool = False
+    shaded: bool = False
 
 
 class SdfNetwork(nn.Module):
@@ -188,34 +191,6 @@ class SdfNetwork(nn.Module):
         return ((high - low) / (2 * step)).T
 
 
-class RadianceNetwork(nn.Module):
-    """Colour from position, normal, view direction and geometry features; and reflected direction and facing ratio.
-
-    The reflected direction lets a mirror-like surface be explained by its surroundings instead of by dents
-    (Ref-NeRF); n.v carries the Fresnel-like brightening towards grazing angles. The paper's network has neither.
-    """
-
-    def __init__(self, shape: FieldShape, generator: torch.Generator) -> None:
-        super().__init__()
-        self.reflected = shape.reflected
-        inputs = shape.features + 3 + 3 + 3 + (1 + 15 if shape.reflected else 0)
-        self.layers = mlp([inputs, *[shape.radiance_width] * shape.radiance_layers, 3], generator)
-
-    def forward(
-        self,
-        points: Float[Tensor, "n 3"],
-        normals: Float[Tensor, "n 3"],
-        view_dirs: Float[Tensor, "n 3"],
-        features: Float[Tensor, "n g"],
-    ) -> Float[Tensor, "n 3"]:
-        """sRGB colour in [0, 1]; normals are unit, view_dirs unit from camera to point."""
-        inputs = [features, points, normals, view_dirs]
-        if self.reflected:
-            facing = (normals * view_dirs).sum(1, keepdim=True)
-            inputs += [facing, spherical_harmonics(view_dirs - 2 * facing * normals)]
-        return torch.sigmoid(self.layers(torch.cat(inputs, 1)))
-
-
 class BackgroundNetwork(nn.Module):
     """Density and colour outside the unit sphere, in contracted space (Mip-NeRF 360, eq. 10)."""
 
@@ -243,7 +218,9 @@ class Fields(nn.Module):
         generator = torch.Generator().manual_seed(seed)
         self.shape = shape
         self.sdf = SdfNetwork(shape, generator)
-        self.radiance = RadianceNetwork(shape, generator)
+        self.radiance = Radiance(
+            shape.features, shape.radiance_layers, shape.radiance_width, shape.reflected, shape.shaded, generator
+        )
         self.background = BackgroundNetwork(shape, generator) if shape.background_grid else None
         self.log_gains = nn.Parameter(torch.zeros(shape.num_images, 3))
         self.reflection = (

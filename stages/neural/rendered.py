@@ -35,6 +35,7 @@ class Rendered:
         gradients: of the SDF at the samples.
         features: geometry features at the samples.
         reflected: part of the colour that came from reflections of the object itself.
+        gloss: part of the colour that is not shaded, see `stages.neural.radiance`.
         proposal: edges and weights of the proposal network, or None where a grid guides the samples.
         extra_sdf, extra_gradients: f and its gradients at the extra points that were asked for.
     """
@@ -48,6 +49,7 @@ class Rendered:
     gradients: Float[Tensor, "r*k 3"]
     features: Float[Tensor, "r*k g"]
     reflected: Float[Tensor, " r"]
+    gloss: Float[Tensor, " r"]
     proposal: tuple[Float[Tensor, "r p"], Float[Tensor, "r p-1"]] | None
     extra_sdf: Float[Tensor, " e"]
     extra_gradients: Float[Tensor, "e 3"]

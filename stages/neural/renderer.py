@@ -15,9 +15,10 @@ from stages.neural import schedules
 from stages.neural.acceleration import fixed_shapes
 from stages.neural.fields import BackgroundNetwork, Fields
 from stages.neural.proposal import proposal_distances
+from stages.neural.radiance import Colored
 from stages.neural.rendered import Rendered
 from stages.neural.rendering import composite, ray_means, rendering_weights, weights_from_optical_depth
-from stages.neural.sampling import SdfCache, importance_distances, stratified
+from stages.neural.sampling import SdfCache, free_outside, importance_distances, stratified
 from stages.neural.schedules import Moment
 from stages.neural.terms import Terms
 from stages.neural.training_photos import RayBatch
@@ -83,12 +84,12 @@ class Renderer:
         )
 
         shade = self._deferred_colors if moment.deferred else self._colors
-        colors = shade(batch, weights, points, gradients[:num_points], features[:num_points])
+        colors, gloss = shade(batch, weights, points, gradients[:num_points], features[:num_points])
         if self.fields.background is not None:
             colors = colors + self._background(self.fields.background, batch, transmittance, generator)
         rendered = Rendered(
             batch, colors, 1 - transmittance, weights, distances, points, gradients[:num_points], features[:num_points],
-            torch.zeros(num_rays, device=points.device), proposal, sdf[num_points:], gradients[num_points:],
+            torch.zeros(num_rays, device=points.device), gloss, proposal, sdf[num_points:], gradients[num_points:],
         )  # fmt: skip
         return self.terms.recolored(rendered, moment, generator)
 
@@ -111,21 +112,32 @@ class Renderer:
         points: Float[Tensor, "r*k 3"],
         gradients: Float[Tensor, "r*k 3"],
         features: Float[Tensor, "r*k g"],
-    ) -> Float[Tensor, "r 3"]:
-        """Colour of the samples that weigh enough, weighted and summed over each ray."""
+    ) -> Colored:
+        """Colour and gloss of the samples that weigh enough, weighted and summed over each ray.
+
+        Gloss has no gradient with respect to the weights: a surface is not to fade where it shines.
+        """
         num_rays, num_samples = weights.shape
         heavy = weights.detach().view(-1) > _COLOR_THRESHOLD
         if fixed_shapes(weights.device):
             directions = batch.directions[:, None].expand(-1, num_samples, -1).reshape(-1, 3)
             normals = torch.nn.functional.normalize(gradients, dim=1)
-            colors = self.fields.radiance(points, normals, directions, features)
-            return composite(weights * heavy.view_as(weights), colors.view(num_rays, num_samples, 3))
+            colors, gloss = self.fields.radiance(points, normals, directions, features, self._surroundings)
+            kept = weights * heavy.view_as(weights)
+            gloss = (kept.detach() * gloss.view_as(kept)).sum(1)
+            return Colored(composite(kept, colors.view(num_rays, num_samples, 3)), gloss)
         seen = torch.nonzero(heavy).squeeze(1)
         ray = seen // num_samples
         normals = torch.nn.functional.normalize(gradients[seen], dim=1)
-        colors = self.fields.radiance(points[seen], normals, batch.directions[ray], features[seen])
+        colors, gloss = self.fields.radiance(
+            points[seen], normals, batch.directions[ray], features[seen], self._surroundings
+        )
+        weight = weights.view(-1)[seen]
         nothing = torch.zeros(num_rays, 3, device=points.device)
-        return nothing.index_add(0, ray, weights.view(-1)[seen, None] * colors)
+        return Colored(
+            nothing.index_add(0, ray, weight[:, None] * colors),
+            nothing[:, 0].index_add(0, ray, weight.detach() * gloss),
+        )
 
     def _deferred_colors(
         self,
@@ -134,10 +146,18 @@ class Renderer:
         points: Float[Tensor, "r*k 3"],
         gradients: Float[Tensor, "r*k 3"],
         features: Float[Tensor, "r*k g"],
-    ) -> Float[Tensor, "r 3"]:
-        """Opacity of each ray times the colour at its mean point, of its mean normal and features: one colour a ray."""
+    ) -> Colored:
+        """Opacity of each ray times the colour at its mean point, of its mean normal and features: one colour a ray.
+
+        And the opacity, without gradient, times the gloss there.
+        """
         opacity, point, normal, feature = ray_means(weights, points, gradients, features)
-        return opacity * self.fields.radiance(point, normal, batch.directions, feature)
+        colors, gloss = self.fields.radiance(point, normal, batch.directions, feature, self._surroundings)
+        return Colored(opacity * colors, opacity.detach().squeeze(1) * gloss)
+
+    def _surroundings(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
+        """The cached SDF; nothing outside the sphere."""
+        return free_outside(self.cache.lookup(points), torch.linalg.vector_norm(points, dim=1))
 
     def _background(
         self,

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from stages.neural.acceleration import points_at_a_time
 from stages.neural.encoding_shapes import Encoding, Frequencies, HashGrid
@@ -38,20 +37,6 @@ class TrainedField:
     def normals(self, points: Float[np.ndarray, "n 3"]) -> Float32[np.ndarray, "n 3"]:
         """Unit normals, pointing outwards."""
         return self._chunked(lambda p: torch.nn.functional.normalize(self.fields.sdf(p, self.levels)[2], dim=1), points)
-
-    def color(
-        self,
-        points: Float[np.ndarray, "n 3"],
-        normals: Float[np.ndarray, "n 3"],
-        view_dirs: Float[np.ndarray, "n 3"],
-    ) -> Float32[np.ndarray, "n 3"]:
-        """sRGB colour in [0, 1] of surface points seen along unit view_dirs (camera to point)."""
-
-        def evaluate(p: Tensor, n: Tensor, v: Tensor) -> Tensor:
-            _, features, _ = self.fields.sdf(p, self.levels)
-            return self.fields.radiance(p, n, v, features)
-
-        return self._chunked(evaluate, points, normals, view_dirs)
 
     @torch.no_grad()
     def _chunked(self, function, *arrays: np.ndarray) -> np.ndarray:

@@ -12,6 +12,7 @@ from torch import Tensor
 from configs.training import TrainParams
 from stages.neural import losses, schedules
 from stages.neural.acceleration import is_mixed, points_at_a_time, short_products
+from stages.neural.doubt import Doubt
 from stages.neural.encoding_shapes import Frequencies, HashGrid
 from stages.neural.fields import Fields, FieldShape
 from stages.neural.needed_rays import NeededRays
@@ -56,6 +57,7 @@ def field_shape(params: TrainParams, num_images: int, background: bool) -> Field
         reflection=params.terms.reflection.form != "off",
         appearance=has_feature_mlp(params.terms),
         proposal=params.sampling.sampler == "proposal",
+        shaded=field.colors == "shaded",
     )
 
 
@@ -63,8 +65,16 @@ class Trainer:
     """Networks, optimiser, sampler and random state: all that a checkpoint must hold."""
 
     def __init__(
-        self, photos: Photos, sightings: Sightings, dense: Sightings, params: TrainParams, device: torch.device | str
+        self,
+        photos: Photos,
+        sightings: Sightings,
+        dense: Sightings,
+        params: TrainParams,
+        device: torch.device | str,
+        doubt: Doubt | None = None,
     ) -> None:
+        """doubt: without it nothing is taken for shiny."""
+        self.doubt = doubt
         self.photos, self.sightings, self.dense, self.params = photos, sightings, dense, params
         self.device = torch.device(device)
         background = params.field.background and photos.masks is None
@@ -180,6 +190,8 @@ class Trainer:
         dense_loss = sighting_loss(
             rendered.extra_sdf[first:last], dense.weights, weights.dense_tolerance, weights.dense_step
         )
+        shiny = rendered.gloss.new_zeros(()) if self.doubt is None else self.doubt.shiny(rendered.surface[0])
+        gloss_loss = losses.gloss_error(rendered.gloss, shiny).mean()
         exposure_loss = losses.exposure_error(self.fields.log_gains).mean()
         proposal_loss = self._proposal_loss(rendered)
 
@@ -191,6 +203,7 @@ class Trainer:
             + weights.dense * dense_loss
             + weights.mask * mask_loss
             + weights.exposure * exposure_loss
+            + weights.gloss * gloss_loss
             + proposal_loss
         )
         self._forget_gradients()
@@ -215,6 +228,7 @@ class Trainer:
                 "psnr": -10 * torch.log10(mse.clamp(min=1e-10)),
                 "gradient_norm": torch.linalg.vector_norm(rendered.gradients, dim=1).mean(),
                 "opacity": rendered.opacity.detach().mean(),
+                "gloss": rendered.gloss.detach().mean(),
                 "reflected": rendered.reflected.mean(),
                 "trust": trust.detach().min(),
             }
