@@ -152,20 +152,26 @@ class ReflectionParams(Section):
 
 
 class PlanarParams(Section):
-    """The paper's planar term: hold the SDF to be linear around surface points of even appearance."""
+    """The planar term: hold the surface to be flat where photos show one even colour."""
 
-    form: Literal["off", "paper", "stable"] = Field("off", description="off, as the paper writes it, or stable")
-    weight: float = Field(1.0, ge=0, description="weight of the planar term")
-    features: Literal["radiance", "mlp"] = Field(
-        "radiance", description="appearance features: those the radiance MLP gets, or those of an MLP of its own"
+    form: Literal["off", "paper", "stable"] = Field("stable", description="off, as the paper writes it, or stable")
+    weight: float = Field(0.1, ge=0, description="weight of the planar term")
+    start: float = Field(
+        0.5, ge=0, le=1, description="progress at which the stable form begins: holes have to be open by then"
     )
-    scale_start: float = Field(0.1, gt=0, le=1, description="lambda_pla is scaled by this at the start and by 1 later")
-    scale_until: float = Field(1.0, gt=0, le=1, description="progress from which lambda_pla is not scaled down")
-    radius: float = Field(
-        0.05, gt=0, description="reach of the planar term at the start, scene units; three voxels at the end"
-    )
+    radius: float = Field(0.05, gt=0, description="reach of the planar term, scene units")
     rays: int = Field(256, ge=1, description="rays per step that the planar term looks at")
-    neighbors: int = Field(4, ge=1, description="places around each of their surface points")
+    neighbors: int = Field(4, ge=1, description="the paper's form: places before each of their surface points")
+    features: Literal["radiance", "mlp"] = Field(
+        "radiance",
+        description="the paper's form: appearance features that the radiance MLP gets, or those of an MLP of its own",
+    )
+    scale_start: float = Field(
+        0.1, gt=0, le=1, description="the paper's form: lambda_pla is scaled by this at the start and by 1 later"
+    )
+    scale_until: float = Field(
+        1.0, gt=0, le=1, description="the paper's form: progress from which lambda_pla is not scaled down"
+    )
 
 
 class EikonalParams(Section):

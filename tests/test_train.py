@@ -264,6 +264,10 @@ def test_the_published_field_answers_in_numpy(tmp_path):
     sdf, normals = field.sdf(points), field.normals(points)
     assert sdf[0] > 0 > sdf[1]
     assert np.allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-5)
+    colors = field.color(points, normals, -normals)
+    assert colors.shape == (2, 3)
+    assert colors.min() >= 0
+    assert colors.max() <= 1
 
 
 @pytest.mark.slow

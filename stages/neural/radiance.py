@@ -43,17 +43,19 @@ class Colored(NamedTuple):
 
 
 def openness(
-    sdf: Callable[[Tensor], Tensor], points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"]
-) -> Float[Tensor, "n 5"]:
-    """How far what is around leaves a place open: f(x + t n) / t at the `REACHES` t along its normal, at most 1.
+    sdf: Callable[[Tensor], Tensor],
+    points: Float[Tensor, "n 3"],
+    normals: Float[Tensor, "n 3"],
+    reaches: Float[Tensor, " t"],
+) -> Float[Tensor, "n t"]:
+    """How far what is around leaves a place open: f(x + t n) / t at some distances t along its normal, in [0, 1].
 
     1 above a plane and anything convex; less in corners, gaps and bores [Evans, Fast approximations for global
     illumination on dynamic scenes, 2006]. Without gradient.
     """
     with torch.no_grad():
-        reaches = torch.tensor(REACHES, device=points.device)
         places = points[:, None] + reaches[:, None] * normals[:, None]
-        return (sdf(places.view(-1, 3)).view(-1, len(REACHES)) / reaches).clamp(0, 1)
+        return (sdf(places.view(-1, 3)).view(-1, len(reaches)) / reaches).clamp(0, 1)
 
 
 class RadianceNetwork(nn.Module):
@@ -89,12 +91,16 @@ class Shading(nn.Module):
 
     Attributes:
         surface: MLP from geometry features to albedo and gloss, before their sigmoids.
+        reaches: `REACHES`, on the device: a graph cannot bring them there.
         light: MLP from spherical harmonics of the normal up to degree 2, openness and place to irradiance, before its
             softplus.
     """
 
+    reaches: Tensor
+
     def __init__(self, features: int, generator: torch.Generator) -> None:
         super().__init__()
+        self.register_buffer("reaches", torch.tensor(REACHES), persistent=False)
         self.surface = mlp([features, _WIDTH, 4], generator)
         self.light = mlp([8 + len(REACHES) + 3, _WIDTH, _WIDTH, 3], generator)
 
@@ -104,7 +110,7 @@ class Shading(nn.Module):
         return torch.sigmoid(outputs[:, :3]), torch.sigmoid(outputs[:, 3:] + _GLOSS_LOGIT)
 
     def irradiance(
-        self, points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"], open_parts: Float[Tensor, "n 5"]
+        self, points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"], open_parts: Float[Tensor, "n t"]
     ) -> Float[Tensor, "n 3"]:
         """Light that reaches a surface point with this unit normal, linear RGB, not negative."""
         inputs = torch.cat([spherical_harmonics(normals)[:, :8], open_parts, points], 1)
@@ -137,6 +143,6 @@ class Radiance(nn.Module):
         if self.shading is None:
             return Colored(colors, torch.ones(len(points), device=points.device))
         albedo, gloss = self.shading.albedo_and_gloss(features)
-        light = self.shading.irradiance(points, normals, openness(sdf, points, normals))
+        light = self.shading.irradiance(points, normals, openness(sdf, points, normals, self.shading.reaches))
         matte = (albedo * light + _DARK) ** (1 / _GAMMA)
         return Colored(torch.lerp(matte, colors, gloss), gloss.squeeze(1))

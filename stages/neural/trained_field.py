@@ -12,6 +12,7 @@ import torch
 from stages.neural.acceleration import points_at_a_time
 from stages.neural.encoding_shapes import Encoding, Frequencies, HashGrid
 from stages.neural.fields import Fields, FieldShape
+from stages.neural.sampling import free_outside
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Float32
@@ -37,6 +38,23 @@ class TrainedField:
     def normals(self, points: Float[np.ndarray, "n 3"]) -> Float32[np.ndarray, "n 3"]:
         """Unit normals, pointing outwards."""
         return self._chunked(lambda p: torch.nn.functional.normalize(self.fields.sdf(p, self.levels)[2], dim=1), points)
+
+    def color(
+        self,
+        points: Float[np.ndarray, "n 3"],
+        normals: Float[np.ndarray, "n 3"],
+        view_dirs: Float[np.ndarray, "n 3"],
+    ) -> Float32[np.ndarray, "n 3"]:
+        """sRGB colour in [0, 1] of surface points seen along unit view_dirs (camera to point)."""
+
+        def surroundings(p: Tensor) -> Tensor:
+            return free_outside(self.fields.sdf.sdf(p, self.levels), torch.linalg.vector_norm(p, dim=1))
+
+        def evaluate(p: Tensor, n: Tensor, v: Tensor) -> Tensor:
+            _, features, _ = self.fields.sdf(p, self.levels)
+            return self.fields.radiance(p, n, v, features, surroundings).colors.clamp(max=1)
+
+        return self._chunked(evaluate, points, normals, view_dirs)
 
     @torch.no_grad()
     def _chunked(self, function, *arrays: np.ndarray) -> np.ndarray:

@@ -153,7 +153,8 @@ class Trainer:
             self._scale.fill_(moment.scale)
             self._sparse_weight.fill_(sparse_weight)
             current = replace(moment, scale=self._scale)
-            kind = moment.levels, moment.samples, moment.deferred
+            planar = moment.progress >= self.params.terms.planar.start
+            kind = moment.levels, moment.samples, moment.deferred, planar
             numbers = self.replay(lambda: self._update(current, self._sparse_weight), kind)
         self.step_index += 1
         return numbers
@@ -236,10 +237,11 @@ class Trainer:
     def _replays(self) -> bool:
         """Whether steps can be a CUDA graph: few things change in how they go, each a few times.
 
-        The paper's terms look at the progress and may wait for the device; a proposal network is not trained in each.
+        Most of the paper's terms look at the progress and may wait for the device; a proposal network is not trained in
+        each.
         """
         scheduled = self.params.density.scale == "scheduled" and self.fields.proposal is None
-        return self.device.type == "cuda" and scheduled and not self.terms.at_work
+        return self.device.type == "cuda" and scheduled and not self.terms.waits
 
     def _prepare_rates(self) -> None:
         """Learning rates that a graph reads anew, where there is one; plain numbers elsewhere.

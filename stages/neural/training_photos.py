@@ -112,6 +112,17 @@ class Photos:
             inside &= self.masks[rows] > 127
         return self.pixels[rows].float() / 255, inside
 
+    def colors_at(
+        self, images: Int[Tensor, " r"], points: Float[Tensor, "r 3"]
+    ) -> tuple[Float[Tensor, "r 3"], Bool[Tensor, " r"]]:
+        """What one photo each shows at scene points, as `observe` does of all."""
+        in_pixels = torch.bmm(self.pixel_from_scene[images], (points - self.centers[images]).unsqueeze(2)).squeeze(2)
+        depth, size = in_pixels[:, 2], self.sizes[images]
+        place = (in_pixels[:, :2] / depth.clamp(min=1e-6).unsqueeze(1)).floor().long()
+        inside = (depth > 0) & ((place >= 0) & (place < size)).all(1)
+        rows = (self.first[images] + place[:, 1] * size[:, 0] + place[:, 0]).masked_fill(~inside, 0)
+        return self.pixels[rows].float() / 255, inside
+
     def directions(self, images: Int[Tensor, " r"], pixels: Float[Tensor, "r 2"]) -> Float[Tensor, "r 3"]:
         """Unit directions of the rays through the centres of integer pixels (x, y) of photos."""
         homogeneous = torch.nn.functional.pad(pixels + 0.5, (0, 1), value=1.0)

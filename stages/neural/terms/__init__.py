@@ -35,7 +35,8 @@ class Terms:
     """All terms on a batch; see `Term` for what each may do.
 
     Attributes:
-        at_work: whether the settings ask for any of them, now or later in the training.
+        waits: whether any of those that the settings ask for, now or later, look at the progress as it changes, or may
+            wait for the device: all but the planar term's stable form, which begins at one step and goes on.
     """
 
     def __init__(
@@ -46,8 +47,9 @@ class Terms:
         photos: Photos | None = None,
         generator: torch.Generator | None = None,
     ) -> None:
-        forms = (params.terms.ambiguity.form, params.terms.reflection.form, params.terms.planar.form)
-        self.at_work = set(forms) != {"off"} or params.terms.eikonal.form != "plain"
+        terms = params.terms
+        forms = (terms.ambiguity.form, terms.reflection.form)
+        self.waits = set(forms) != {"off"} or terms.eikonal.form != "plain" or terms.planar.form == "paper"
         self.all = tuple(kind(fields, cache, params, photos, generator) for kind in KINDS)
 
     def recolored(self, rendered: Rendered, moment: Moment, generator: torch.Generator | None) -> Rendered:

@@ -1,4 +1,4 @@
-"""The SDF is held to be linear around surface points of even appearance (paper L_planar, lambda_pla).
+"""The surface is held to be flat where it looks even (paper L_planar, lambda_pla).
 
 Shapes: Q rays with a surface point each, J neighbours of each, F appearance features.
 """
@@ -12,15 +12,20 @@ from torch import Tensor
 
 from configs.training import PlanarParams, TermParams
 from stages.neural import losses, schedules
+from stages.neural.acceleration import first_rows, fixed_shapes
 from stages.neural.rendered import OPAQUE, Rendered
 from stages.neural.schedules import Moment
 from stages.neural.terms.term import Term
 
 if TYPE_CHECKING:
-    from jaxtyping import Float
+    from jaxtyping import Float, Int
 
-# Slope error from which the planar term pulls linearly: about 6 degrees, so that a sharp edge is not rounded away.
-_PLANAR_DELTA = 0.1
+# Mean difference of a photo's colours that noise makes, and below which they are the same.
+_NOISE = 0.02
+# Difference of two unit normals from which it counts linearly: half a degree.
+_BENT = 0.01
+# The nearest neighbours are this part of the reach away.
+_NEAREST = 0.2
 # The literal planar term divides by a length, which may be 0.
 _LENGTH_FLOOR = 1e-9
 
@@ -37,22 +42,27 @@ def planar_error_literal(
     return (sdf / length - torch.einsum("qc,qkc->qk", normals, offsets) / length).abs()
 
 
-def planar_error(
-    sdf: Float[Tensor, "q j"],
-    sdf_center: Float[Tensor, " q"],
-    normals: Float[Tensor, "q 3"],
-    offsets: Float[Tensor, "q j 3"],
-    radius: float,
-) -> Float[Tensor, "q j"]:
-    """Huber of (f(x_k) - f(x_0) - n_0.(x_k - x_0)) / max(|x_k - x_0|, eta/4) per neighbour (paper L_planar).
+def evenness(difference: Float[Tensor, " q"], least: float = _NOISE) -> Float[Tensor, " q"]:
+    """lambda_pla = exp(-|C(p) - C(p_0)| / tau) per pair of pixels of a photo, tau = 0.02 (paper lambda_pla^k).
 
-    How far f is from linear around surface points: sdf at x_0 + offsets, sdf_center and unit normals at x_0, eta =
-    radius. Zero for a plane at any distance. The paper leaves f(x_0) out, divides by |x_k - x_0| alone and takes the
-    absolute value: an x_0 that is off by 1e-3 then outweighs the shape.
+    Args:
+        difference: mean over the channels of the colours' absolute differences, colours in [0, 1].
+
+    Near 1 where the photo shows one even colour, so that nothing but the light can differ: there the surface is flat,
+    as far as anybody can tell. The paper compares features that training may choose, with tau = 1e-3.
     """
-    linear = sdf_center[:, None] + torch.einsum("qc,qkc->qk", normals, offsets)
-    length = torch.linalg.vector_norm(offsets, dim=2).clamp(min=0.25 * radius)
-    return torch.nn.functional.huber_loss(sdf / length, linear / length, reduction="none", delta=_PLANAR_DELTA)
+    return torch.exp(-difference / least)
+
+
+def bending_error(normals: Float[Tensor, "q 3"], others: Float[Tensor, "q 3"]) -> Float[Tensor, " q"]:
+    """|n_k - n_0| of unit normals per pair, smoothed below a degree (paper L_planar, of which it is the derivative).
+
+    Zero on a plane, wherever f's zero is; on an edge every pair across it counts alike, so that edges stay sharp. The
+    paper asks f(x_k) to be linear along the ray, and divides by the distance: an x_0 that is off by 1e-3 then outweighs
+    the shape.
+    """
+    squared = ((normals - others) ** 2).sum(1)
+    return torch.sqrt(squared + _BENT**2) - _BENT
 
 
 def planarity_literal(
@@ -98,43 +108,60 @@ class Planar(Term):
         }
 
     def _planar_loss(self, rendered: Rendered, moment: Moment) -> Float[Tensor, ""]:
-        """Mean planar error around the surface points of some of the rays, adaptively weighted (paper L_planar).
-
-        The paper's neighbours lie on the ray before the surface; in the stable form half of them do, the others lie on
-        a disk in the tangent plane, and the reach shrinks to three voxels.
-        """
+        """Mean planar error around the surface points of some of the rays, adaptively weighted (paper L_planar)."""
         params = self.params.terms.planar
         nothing = torch.zeros((), device=self.device)
-        if params.form == "off":
+        if params.form == "off" or (params.form == "stable" and moment.progress < params.start):
             return nothing
-        chosen = torch.nonzero(rendered.opacity.detach() > OPAQUE).squeeze(1)[: params.rays]
+        met = rendered.opacity.detach() > OPAQUE
+        if params.form == "stable" and fixed_shapes(self.device):
+            return self._bending(rendered, first_rows(met, params.rays), moment)
+        chosen = torch.nonzero(met).squeeze(1)[: params.rays]
         if len(chosen) == 0:
             return nothing
-        surface, normals = (part[chosen] for part in rendered.surface)
-        dirs = rendered.batch.directions[chosen]
-        radius = params.radius
         if params.form == "stable":
-            finest = 3 * self.fields.shape.sdf_grid.voxel_size()
-            radius = schedules.exponential(moment.progress, radius, min(finest, radius))
-        offsets = self._neighbors(normals, dirs, radius)
-        count = offsets.shape[1]
-        neighbors = (surface[:, None] + offsets).reshape(-1, 3)
-        places = torch.cat([surface, neighbors])
+            return self._bending(rendered, chosen, moment)
+        return self._planar_loss_literal(rendered, chosen, moment)
+
+    def _bending(self, rendered: Rendered, chosen: Int[Tensor, " q"], moment: Moment) -> Float[Tensor, ""]:
+        """How much the normals differ from those of places beside them that have the same colour in the ray's photo."""
+        assert self.photos is not None
+        surface, normals = (part[chosen] for part in rendered.surface)
+        beside = surface + self._beside(normals)
+        images = rendered.batch.images[chosen]
+        colors, shown = self.photos.colors_at(images, beside)
+        shown &= rendered.opacity.detach()[chosen] > OPAQUE
+        difference = (colors - rendered.batch.colors[chosen]).abs().mean(1)
+        _, _, gradients = self.fields.sdf(torch.cat([surface, beside]), moment.levels)
+        here, there = torch.nn.functional.normalize(gradients, dim=1).chunk(2)
+        return (shown * evenness(difference) * bending_error(here, there)).mean()
+
+    def _beside(self, normals: Float[Tensor, "q 3"]) -> Float[Tensor, "q 3"]:
+        """Offsets along the surface, as many of each size on a log scale."""
+        params = self.params.terms.planar
+        draws = torch.randn(normals.shape, generator=self.generator, device=self.device)
+        tangent = draws - (draws * normals).sum(1, keepdim=True) * normals
+        part = torch.rand(len(normals), 1, generator=self.generator, device=self.device)
+        return torch.nn.functional.normalize(tangent, dim=1) * params.radius * _NEAREST**part
+
+    def _planar_loss_literal(self, rendered: Rendered, chosen: Int[Tensor, " q"], moment: Moment) -> Float[Tensor, ""]:
+        """The paper's form: neighbours lie on the ray before the surface."""
+        params = self.params.terms.planar
+        surface, _ = (part[chosen] for part in rendered.surface)
+        dirs = rendered.batch.directions[chosen]
+        shape = (len(chosen), params.neighbors)
+        reach = params.radius * torch.rand(*shape, 1, generator=self.generator, device=self.device)
+        offsets = -dirs[:, None] * reach
+        places = torch.cat([surface, (surface[:, None] + offsets).reshape(-1, 3)])
         sdf, features, gradients = self.fields.sdf(places, moment.levels)
-        # c_feat looks from x_k at the surface on its ray, which is along the ray, also for neighbours beside it.
-        along = torch.cat([dirs, dirs.repeat_interleave(count, 0)])
+        # c_feat looks from x_k at the surface on its ray, which is along the ray.
+        along = torch.cat([dirs, dirs.repeat_interleave(params.neighbors, 0)])
         if self.fields.appearance is not None:
             features = self.fields.appearance(places, along)
-        center, around = features[: len(chosen)], features[len(chosen) :].view(len(chosen), count, -1)
+        center, around = features[: len(chosen)], features[len(chosen) :].view(*shape, -1)
         unit_normals = torch.nn.functional.normalize(gradients[: len(chosen)], dim=1)
-        sdf_center, sdf_around = sdf[: len(chosen)], sdf[len(chosen) :].view(len(chosen), count)
-        if params.form == "paper":
-            weight = planarity_literal(around, center)
-            error = planar_error_literal(sdf_around, unit_normals, offsets)
-        else:
-            weight = planarity(around, center)
-            error = planar_error(sdf_around, sdf_center, unit_normals, offsets, radius)
-        return planarity_scale(moment, params) * (weight * error).mean()
+        error = planar_error_literal(sdf[len(chosen) :].view(shape), unit_normals, offsets)
+        return planarity_scale(moment, params) * (planarity_literal(around, center) * error).mean()
 
     def _appearance_loss(self, rendered: Rendered) -> Float[Tensor, ""]:
         """Mean colour error of the feature MLP at surface points: what trains it in the stable form.
@@ -152,19 +179,3 @@ class Planar(Term):
         gains = torch.exp(self.fields.log_gains.detach())[batch.images[hit]]
         error = losses.rgb_error(predicted * gains, batch.colors[hit])
         return (error if batch.masks is None else error * batch.masks[hit]).mean()
-
-    def _neighbors(
-        self, normals: Float[Tensor, "q 3"], dirs: Float[Tensor, "q 3"], radius: float
-    ) -> Float[Tensor, "q j 3"]:
-        """Offsets of neighbours from surface points with these normals, seen along dirs."""
-        params = self.params.terms.planar
-        shape = (len(normals), params.neighbors)
-        reach = radius * torch.rand(*shape, 1, generator=self.generator, device=self.device)
-        on_ray = -dirs[:, None].expand(*shape, 3)
-        if params.form == "paper":
-            return on_ray * reach
-        draws = torch.randn(*shape, 3, generator=self.generator, device=self.device)
-        tangent = draws - torch.einsum("qkc,qc->qk", draws, normals)[..., None] * normals[:, None]
-        disk = torch.nn.functional.normalize(tangent, dim=2) * (reach * radius).sqrt()  # even over the disk's area
-        half = torch.arange(shape[1], device=self.device) % 2 == 0
-        return torch.where(half[None, :, None], on_ray * reach, disk)
