@@ -79,24 +79,21 @@ def test_literal_relaxation_lets_the_eikonal_term_vanish():
     assert stable.item() == pytest.approx(0.2 + 0.8 * math.exp(-0.25) * 0.75)  # 0.67: the median weight is 1/2
 
 
-def test_planar_error_is_zero_on_a_plane_at_any_distance_and_not_on_an_edge():
-    generator = torch.Generator().manual_seed(0)
-    offsets = 0.1 * (torch.rand(5, 8, 3, generator=generator) - 0.5)
-    normals = torch.nn.functional.normalize(torch.randn(5, 3, generator=generator), dim=1)
-    center = torch.full((5,), 0.003)
-    plane = center[:, None] + torch.einsum("qc,qkc->qk", normals, offsets)
-    assert planar.planar_error(plane, center, normals, offsets, 0.05).abs().max() < 1e-8
-    edge = plane + offsets[..., 0].abs()
-    assert planar.planar_error(edge, center, normals, offsets, 0.05).mean() > 1e-3
+def test_bending_is_nothing_between_equal_normals_and_counts_an_edge_like_a_chord():
+    up, aside = torch.tensor([[0.0, 0, 1]]), torch.tensor([[1.0, 0, 0]])
+    assert planar.bending_error(up, up).tolist() == [0]
+    assert planar.bending_error(up, aside).item() == pytest.approx(math.sqrt(2), abs=0.01)
 
 
-def test_planar_error_pulls_the_neighbour_towards_the_plane():
-    sdf = torch.tensor([[0.02]], requires_grad=True)
-    offsets, normals = torch.tensor([[[0.04, 0, 0]]]), torch.tensor([[0.0, 0, 1]])
-    error = planar.planar_error(sdf, torch.zeros(1), normals, offsets, 0.05)
-    assert error.item() == pytest.approx(0.1 * (0.5 - 0.05))  # slope error 0.5, Huber with delta 0.1
-    error.sum().backward()
-    assert sdf.grad.item() == pytest.approx(0.1 / 0.04)
+def test_bending_pulls_normals_together_also_where_they_nearly_agree():
+    normal = torch.tensor([[0.02, 0, 1]], requires_grad=True)
+    planar.bending_error(normal, torch.tensor([[0.0, 0, 1]])).sum().backward()
+    assert normal.grad[0, 0].item() == pytest.approx(2 / math.sqrt(5))
+
+
+def test_evenness_is_one_where_colours_are_equal_and_fades_over_a_few_grey_levels():
+    difference = torch.tensor([0.0, 0.02, 0.2])
+    assert planar.evenness(difference).tolist() == pytest.approx([1, math.exp(-1), math.exp(-10)])
 
 
 def test_literal_planar_error_is_zero_on_a_plane_through_x_0_and_not_on_one_beside_it():
@@ -107,8 +104,6 @@ def test_literal_planar_error_is_zero_on_a_plane_through_x_0_and_not_on_one_besi
     assert planar.planar_error_literal(plane, normals, offsets).max() < 1e-5
     beside = planar.planar_error_literal(plane + 1e-3, normals, offsets)
     torch.testing.assert_close(beside, 1e-3 / offsets.norm(dim=2), rtol=1e-3, atol=1e-5)
-    center = torch.full((5,), 1e-3)
-    assert planar.planar_error(plane + 1e-3, center, normals, offsets, 0.05).max() < 1e-8
 
 
 def test_literal_planar_error_weighs_an_error_by_the_inverse_length():

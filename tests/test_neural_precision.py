@@ -90,7 +90,7 @@ def test_mixed_precision_finds_the_ball():
 def test_a_field_is_read_back_in_float32(tmp_path):
     trainer = make_trainer(mixed())
     torch.save(field_state(trainer.fields), tmp_path / "field.pt")
-    assert trainer.fields.radiance.layers.mixed
+    assert trainer.fields.radiance.network.layers.mixed
     fields = load_field(tmp_path / "field.pt").fields
-    assert not fields.radiance.layers.mixed
+    assert not fields.radiance.network.layers.mixed
     assert not fields.sdf.short

@@ -16,6 +16,7 @@ from configs.load import load_config
 from configs.training import TrainParams
 from stages.neural import visibility
 from stages.neural.terms.ambiguity import Ambiguity
+from stages.neural.terms.planar import Planar
 from stages.neural.trainer import Trainer
 
 FORMS = {
@@ -225,14 +226,40 @@ def test_every_backbone_trains(backbone):
 
 
 def test_the_feature_mlp_is_trained_by_colours_where_a_stable_term_reads_it():
-    for term in ("planar", "eikonal"):
-        trainer = rough_trainer({"terms.planar.features": "mlp", f"terms.{term}.form": "stable"})
-        assert trainer.step(0.5)["appearance"] > 0
-        assert trainer.fields.appearance.head.weight.grad.abs().max() > 0
+    trainer = rough_trainer({"terms.planar.features": "mlp", "terms.eikonal.form": "stable"})
+    assert trainer.step(0.5)["appearance"] > 0
+    assert trainer.fields.appearance.head.weight.grad.abs().max() > 0
     literal = rough_trainer({"terms.planar.features": "mlp", "terms.planar.form": "paper"})
     assert literal.step(0.5)["appearance"] == 0
     assert literal.fields.appearance.layers[0].weight.grad.abs().max() > 0  # by lambda_pla alone
     assert literal.fields.appearance.head.weight.grad is None
+
+
+def planar_of(trainer: Trainer, low: int, high: int, progress: float = 0.5) -> float:
+    """The planar term on photos of random colours between two grey levels."""
+    generator = torch.Generator().manual_seed(0)
+    trainer.photos.pixels.random_(low, high + 1, generator=generator)
+    trainer.generator.manual_seed(0)
+    batch = even_rays(trainer.photos, 400)
+    with torch.no_grad():
+        rendered, moment = trainer.render(batch, progress), trainer.moment(progress)
+        term = next(term for term in trainer.terms.all if isinstance(term, Planar))
+        return float(term.losses(rendered, moment)["planar"][1])
+
+
+def test_the_planar_term_waits_and_then_looks_at_even_places_only():
+    trainer = rough_trainer({"terms.planar.form": "stable"})
+    assert planar_of(trainer, 128, 128, progress=0.49) == 0
+    even = planar_of(trainer, 128, 128)
+    assert even > 0.01
+    assert planar_of(trainer, 0, 255) < 0.6 * even  # neighbours in the same pixel stay
+
+
+def test_the_planar_term_is_the_same_where_shapes_are_fixed(monkeypatch):
+    trainer = rough_trainer({"terms.planar.form": "stable", "terms.planar.rays": 2000})
+    shrinking = planar_of(trainer, 128, 128)
+    monkeypatch.setattr("stages.neural.terms.planar.fixed_shapes", lambda device: True)
+    assert planar_of(trainer, 128, 128) == pytest.approx(shrinking, rel=0.2)  # with other neighbours
 
 
 def test_the_proposal_network_learns_in_its_steps_only():

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from stages.neural.acceleration import points_at_a_time
 from stages.neural.encoding_shapes import Encoding, Frequencies, HashGrid

@@ -93,8 +93,8 @@ def planarity_scale(moment: Moment, params: PlanarParams) -> float:
 
 
 def has_feature_mlp(params: TermParams) -> bool:
-    """Whether an MLP makes the features of lambda_pla; the relaxed Eikonal term reads lambda_pla, too."""
-    return params.planar.features == "mlp" and (params.planar.form != "off" or params.eikonal.form != "plain")
+    """Whether an MLP makes the features of the paper's lambda_pla, which the relaxed Eikonal term reads, too."""
+    return params.planar.features == "mlp" and (params.planar.form == "paper" or params.eikonal.form != "plain")
 
 
 # ---------------------------------------------------------------------- in a step
@@ -164,13 +164,13 @@ class Planar(Term):
         return planarity_scale(moment, params) * (planarity_literal(around, center) * error).mean()
 
     def _appearance_loss(self, rendered: Rendered) -> Float[Tensor, ""]:
-        """Mean colour error of the feature MLP at surface points: what trains it in the stable form.
+        """Mean colour error of the feature MLP at surface points: what trains it for the stable Eikonal term.
 
         Zero without the MLP, and in the paper's form.
         """
         mlp, batch, terms = self.fields.appearance, rendered.batch, self.params.terms
         nothing = torch.zeros((), device=self.device)
-        if mlp is None or "stable" not in (terms.planar.form, terms.eikonal.form):
+        if mlp is None or terms.eikonal.form != "stable":
             return nothing
         hit = torch.nonzero(rendered.opacity.detach() > OPAQUE).squeeze(1)[: terms.planar.rays]
         if len(hit) == 0:

@@ -1,0 +1,38 @@
+import numpy as np
+import torch
+from sphere_scene import ring_of_cameras
+
+from stages.neural.doubt import Doubt
+
+
+def towards_the_centre(cameras, trust: float):
+    """Depth maps that all find the scene's centre in the middle of the photo."""
+    maps = []
+    for index, (width, height) in enumerate(cameras.sizes.tolist()):
+        depth = np.zeros((height, width), np.float32)
+        pixel, distance = cameras.project(index, np.zeros((1, 3)))
+        column, row = pixel[0].astype(int)
+        depth[max(row - 8, 0) : row + 8, max(column - 8, 0) : column + 8] = distance[0]
+        maps.append((depth, np.full_like(depth, trust)))
+    return maps
+
+
+CENTRE_AND_ASIDE = torch.tensor([[0.0, 0, 0], [0.7, 0.0, 0.0]])
+
+
+def test_what_photos_deny_is_shiny_there_and_nowhere_else():
+    cameras = ring_of_cameras()
+    denied = Doubt.of(towards_the_centre(cameras, trust=0.05), cameras, "cpu")
+    assert denied.shiny(CENTRE_AND_ASIDE).tolist() == [1.0, 0.0]
+
+
+def test_what_photos_agree_on_is_not_shiny_nor_is_what_they_say_nothing_of():
+    cameras = ring_of_cameras()
+    for maps in (towards_the_centre(cameras, trust=0.9), [None] * len(cameras)):
+        assert Doubt.of(maps, cameras, "cpu").shiny(CENTRE_AND_ASIDE).tolist() == [0.0, 0.0]
+
+
+def test_depth_maps_may_be_smaller_than_their_photos():
+    cameras = ring_of_cameras()
+    small = [(depth[::2, ::2], trust[::2, ::2]) for depth, trust in towards_the_centre(cameras, trust=0.05)]
+    assert Doubt.of(small, cameras, "cpu").shiny(CENTRE_AND_ASIDE).tolist() == [1.0, 0.0]
