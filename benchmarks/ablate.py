@@ -14,8 +14,8 @@ out of the training. Other sets run where they are named, with poses found from 
 Photos, poses and dense points are made ready once a set and shared by all its runs. A run is the stages train, extract
 and cleanup, called in a process of its own with one thread; as many run side by side as there are cores. Results go to
 benchmarks/results/ablation/SET-VARIANT-SEED-STEPS-POSES.json as each ends; runs that have one with the same steps,
-preset, settings and poses are skipped, so an interrupted call goes on where it stopped. Run folders lie in
-benchmarks/out/ablation/ until scored, and the log of a run that failed stays there.
+poses and settings (those of presets and defaults too) are skipped, so an interrupted call goes on where it stopped. Run
+folders lie in benchmarks/out/ablation/ until scored, and the log of a run that failed stays there.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ def _term(name: str, off: str = "off", **paper: str) -> Part:
     return Part({form: off}, {"stable": {form: "stable"}, "paper": {form: "paper", **literal}})
 
 
-# A new part is a line here: all else follows from it.
+# A new part is a line here, all else follows from it; its only form of ours is called as the others' first is.
 PARTS: dict[str, Part] = {
     "ambiguity": _term("ambiguity", visibility="paper"),
     "reflection": _term("reflection"),
@@ -233,6 +233,7 @@ class Run:
         held_out_psnr: of photos left out of the training, dB; None where none were.
         train_wall_s, train_cpu_s: seconds of the training stage.
         steps: that the training took.
+        config: hash of all settings, those of presets and defaults included.
     """
 
     plan: Plan
@@ -246,6 +247,7 @@ class Run:
     train_wall_s: float
     train_cpu_s: float
     steps: int
+    config: str
 
     @property
     def value(self) -> float | None:
@@ -358,6 +360,13 @@ def poses_hash(shared: Path) -> str:
     return digest(files)[:12]
 
 
+def config_hash(plan: Plan) -> str:
+    """Hash of all settings of a run: a result is one of now only where presets and defaults are the same."""
+    from stages.engine.fingerprint import digest
+
+    return digest(load_config(plan.preset, None, plan.sets).model_dump(mode="json"))[:12]
+
+
 def code_hash() -> str:
     """Hash of the sources that decide what a training comes to."""
     sources = sorted((ROOT / "stages" / "neural").rglob("*.py"))
@@ -421,6 +430,7 @@ def measure(plan: Plan, data: Path, jobs: int = 1, keep: bool = False) -> Run:
         train_wall_s=wall["train"],
         train_cpu_s=cpu["train"],
         steps=trained.get("steps", plan.steps),
+        config=config_hash(plan),
     )
     if not keep:
         shutil.rmtree(folder)
@@ -788,8 +798,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             except (RuntimeError, HineusError) as error:
                 print(f"{name}: {error}", file=sys.stderr)
                 failed += [plan.name for plan in plans if plan.set == name]
-        done = set() if arguments.again else {(run.plan, run.poses) for run in load_runs()}
-        plans = [plan for plan in plans if plan.set in poses and (plan, poses[plan.set]) not in done]
+        done = set() if arguments.again else {(run.plan, run.poses, run.config) for run in load_runs()}
+        plans = [plan for plan in plans if plan.set in poses and (plan, poses[plan.set], config_hash(plan)) not in done]
         print(f"{len(plans)} runs to make (others have a result; --again measures them anew)", file=sys.stderr)
         jobs = arguments.jobs or (1 if has_cuda() else available_cores())
         failed += run_plans(plans, data, jobs, arguments.keep)

@@ -37,7 +37,7 @@ def _run(variant=BASE, seed=0, mean: float | None = 1.0, cpu=100.0, psnr=30.0, s
     score = None if mean is None else {"mean": mean}
     return Run(**{"plan": _plan(variant, seed, steps, name), "command": "ablate", "machine": {"cpu": "x"}, "poses": "p",
                   "code": "c", "score": score, "psnr": psnr, "held_out_psnr": None, "train_wall_s": cpu / 2,
-                  "train_cpu_s": cpu, "steps": steps, **changes})  # fmt: skip
+                  "train_cpu_s": cpu, "steps": steps, "config": "s", **changes})  # fmt: skip
 
 
 def _rows(runs):
@@ -79,6 +79,11 @@ def test_the_defaults_are_those_of_a_run_whatever_they_become():
     assert settings_of(DEFAULTS, VARIANTS[DEFAULTS]) == ()
     assert settings_of("defaults-planar", {"train.terms.planar.form": "off"}) == ("train.terms.planar.form=off",)
     assert (ablate.compared_with("defaults-planar"), ablate.compared_with("planar")) == (DEFAULTS, BASE)
+
+
+def test_settings_that_the_plan_does_not_name_count_too():
+    plans = [_plan(), replace(_plan(), preset="gpu"), _plan("planar")]
+    assert len({ablate.config_hash(plan) for plan in plans}) == 3
 
 
 def test_every_part_can_be_left_out_and_all_but_one_left():
@@ -249,6 +254,7 @@ def test_runs_that_have_a_result_are_skipped_and_a_failure_stops_no_other(here, 
 
     monkeypatch.setattr(ablate, "run_apart", run_apart)
     monkeypatch.setattr(ablate, "poses_hash", lambda folder: "p")
+    monkeypatch.setattr(ablate, "config_hash", lambda plan: "s")
     command = [str(here / "data"), "--steps", "9", "--variants", "planar,terms-off", "--preset", "cpu", "--jobs", "1"]
     every = ["helmet-terms-off-0", "scan-terms-off-0", "helmet-terms-off-1", "scan-terms-off-1",
              "helmet-planar-0", "scan-planar-0", "helmet-planar-1", "scan-planar-1"]  # fmt: skip
@@ -262,8 +268,11 @@ def test_runs_that_have_a_result_are_skipped_and_a_failure_stops_no_other(here, 
     monkeypatch.setattr(ablate, "poses_hash", lambda folder: "q")  # photos and poses were made ready anew
     ablate.main([*command, "--steps", "10", "--seeds", "1"])
     assert len(made) == 17
+    monkeypatch.setattr(ablate, "config_hash", lambda plan: "t")  # a default is another now
+    ablate.main([*command, "--steps", "10", "--seeds", "1"])
+    assert len(made) == 21
     ablate.main([*command, "--table-only"])
-    assert len(made) == 17
+    assert len(made) == 21
     page = (here / "page.md").read_text()
     assert page.startswith("top\n")
     assert "| planar | 10 |" in page
