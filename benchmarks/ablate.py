@@ -1,19 +1,21 @@
-"""Measure variants of the training settings at equal budget, over sets of photos and seeds.
+"""Measure the defaults against the same with all terms off, and other variants of the training settings.
 
-python -m benchmarks.ablate DATA                                            every variant on every set that has a truth
-python -m benchmarks.ablate DATA synth_helmet --variants base,ambiguity     these
+python -m benchmarks.ablate DATA                                            both, two seeds, every set that has a truth
+python -m benchmarks.ablate DATA plain mirror --steps 2000                  these sets, a fixed number of steps
+python -m benchmarks.ablate DATA plain --variants parts                     each part of the method alone, or left out
+python -m benchmarks.ablate DATA --variants paper --budget 4                the paper's ablation, four times the budget
 python -m benchmarks.ablate DATA --extra far:all,terms.reflection.reach=0.3 and one more: `all` with that setting
-python -m benchmarks.ablate --table-only                                    only rewrite the table
+python -m benchmarks.ablate --table-only                                    only rewrite the tables
 
 A truth is a known surface (`gt_mesh.ply`, `transforms.json`), and the score is the distance of the clean mesh to it; or
 known cameras (`cameras_sphere.npz`, with masks where there are any), and the score is the PSNR of photos that were left
-out of the training.
+out of the training. Other sets run where they are named, with poses found from all photos.
 
 Photos, poses and dense points are made ready once a set and shared by all its runs. A run is the stages train, extract
 and cleanup, called in a process of its own with one thread; as many run side by side as there are cores. Results go to
 benchmarks/results/ablation/SET-VARIANT-SEED-STEPS-POSES.json as each ends; runs that have one with the same steps,
-preset, settings and poses are skipped, so an interrupted call goes on where it stopped. Run folders lie in
-benchmarks/out/ablation/ until scored, and the log of a run that failed stays there.
+poses and settings (those of presets and defaults too) are skipped, so an interrupted call goes on where it stopped. Run
+folders lie in benchmarks/out/ablation/ until scored, and the log of a run that failed stays there.
 """
 
 from __future__ import annotations
@@ -30,88 +32,146 @@ import tempfile
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from statistics import fmean
 from typing import Any
 
 from benchmarks.pages import NOT_MEASURED, markdown_table, write_tables
 from benchmarks.run_sets import OUT, RESULTS, ROOT, find_sets, known_cameras, machine, photos_of, run_hineus
+from configs.load import load_config
 from configs.params import Config
 from configs.renames import RENAMED
+from configs.training import TrainParams
 from stages.engine.stage import Stage, StageContext
 from stages.errors import HineusError
+from stages.evaluation.suites.paper import PaperRow, paper_tables
+from stages.evaluation.suites.registry import SUITES
 from stages.posing import neus
 
-BASE = "base"
-# What every variant starts from: colours and the plain Eikonal term. Written out, so that it stays the base whatever
-# the presets and defaults become.
-BASE_SETTINGS = {
-    "train.terms.ambiguity.form": "off",
+DEFAULTS, BASE = "defaults", "terms-off"
+
+
+@dataclass(frozen=True)
+class Part:
+    """A part of the method that can be left out.
+
+    Attributes:
+        off: what leaves it out.
+        forms: name -> what puts it in, of each of its forms.
+    """
+
+    off: dict[str, str]
+    forms: dict[str, dict[str, str]]
+
+
+def _term(name: str, off: str = "off", **paper: str) -> Part:
+    """One of the paper's terms; `paper`: what its published form sets besides, of the same term."""
+    form = f"train.terms.{name}.form"
+    literal = {f"train.terms.{name}.{key}": value for key, value in paper.items()}
+    return Part({form: off}, {"stable": {form: "stable"}, "paper": {form: "paper", **literal}})
+
+
+# A new part is a line here, all else follows from it; its only form of ours is called as the others' first is.
+PARTS: dict[str, Part] = {
+    "ambiguity": _term("ambiguity", visibility="paper"),
+    "reflection": _term("reflection"),
+    "planar": _term("planar"),
+    "eikonal": _term("eikonal", off="plain"),
+}
+# What every variant starts from but the defaults: colours, the plain Eikonal term and points. Written out, so that it
+# stays what it is whatever the presets and defaults become.
+TERMS_OFF = {
+    **{key: value for part in PARTS.values() for key, value in part.off.items()},
     "train.terms.ambiguity.visibility": "stable",
-    "train.terms.reflection.form": "off",
-    "train.terms.planar.form": "off",
     "train.terms.planar.features": "radiance",
-    "train.terms.eikonal.form": "plain",
     "train.density.form": "laplace",
     "train.density.scale": "scheduled",
     "train.field.gradients": "analytic",
 }
 BACKBONES = ("neus2", "hfneus", "neuralangelo")
 NO_STEREO = {"train.losses.dense": "0"}
-TERMS = {f"train.terms.{term}.form": "stable" for term in ("ambiguity", "reflection", "planar", "eikonal")}
 
 
-def _all_but(term: str) -> dict[str, str]:
-    return {key: value for key, value in TERMS.items() if key != f"train.terms.{term}.form"}
+def _in_form(form: str, without: str | None = None) -> dict[str, str]:
+    """All parts that have a form in that form, but for one."""
+    return {
+        key: value for name, part in PARTS.items() if name != without for key, value in part.forms.get(form, {}).items()
+    }
 
 
-# What each variant sets otherwise, the most telling first: they run in this order.
-VARIANTS: dict[str, dict[str, str]] = {
-    BASE: {},
-    "ambiguity": {"train.terms.ambiguity.form": "stable"},
-    "reflection": {"train.terms.reflection.form": "stable"},
-    "planar": {"train.terms.planar.form": "stable"},
-    "eikonal": {"train.terms.eikonal.form": "stable"},
-    "all": TERMS,
-    "all-ambiguity": _all_but("ambiguity"),
-    "all-reflection": _all_but("reflection"),
-    "all-planar": _all_but("planar"),
-    "all-eikonal": _all_but("eikonal"),
-    "ambiguity-paper": {"train.terms.ambiguity.form": "paper", "train.terms.ambiguity.visibility": "paper"},
-    "visibility-paper": {"train.terms.ambiguity.form": "stable", "train.terms.ambiguity.visibility": "paper"},
-    "visibility-mesh": {"train.terms.ambiguity.form": "stable", "train.terms.ambiguity.visibility": "mesh"},
-    "reflection-paper": {"train.terms.reflection.form": "paper"},
-    "planar-paper": {"train.terms.planar.form": "paper"},
-    # its weight is made of the planar term's
-    "eikonal-paper": {"train.terms.planar.form": "paper", "train.terms.eikonal.form": "paper"},
-    "all-paper": {**dict.fromkeys(TERMS, "paper"), "train.terms.ambiguity.visibility": "paper"},
-    # the colours and the Eikonal term alone, as in NeuS: no points, no reflected direction
-    "rgb+eikonal": {**NO_STEREO, "train.losses.sparse": "0", "train.field.radiance_inputs": "view"},
-    # as it was before dense stereo: held to the SfM points alone
-    "no-stereo": NO_STEREO,
-    "density-neus": {"train.density.form": "neus"},
-    "scale-learned": {"train.density.scale": "learned"},
-    "gradients-numerical": {"train.field.gradients": "numerical"},
-    "planar-mlp": {"train.terms.planar.form": "stable", "train.terms.planar.features": "mlp"},
-    "view-only": {"train.field.radiance_inputs": "view"},
+def _is_default(settings: dict[str, str]) -> bool:
+    return load_config(None, None, [f"{key}={value}" for key, value in settings.items()]) == load_config(None, None, [])
+
+
+def _all_of_paper(form: str) -> dict[str, dict[str, str]]:
+    """All terms in a form, and the paper's ablation of them; the names are in `PAPER_ROWS`, too."""
+    name = ALL[form]
+    rows = {name: _in_form(form), f"{name}-mesh": {**_in_form(form), "train.terms.ambiguity.visibility": "mesh"}}
+    return rows | {f"{name}-{part}": _in_form(form, part) for part in PARTS if form in PARTS[part].forms}
+
+
+FORMS = tuple(dict.fromkeys(form for part in PARTS.values() for form in part.forms))
+ALL = {form: "all" if form == FORMS[0] else f"all-{form}" for form in FORMS}
+# What each variant sets otherwise, by group, the most telling first: they run in this order. Those whose name begins
+# with "defaults-" start from the defaults and are compared with them, all others with `BASE`.
+GROUPS: dict[str, dict[str, dict[str, str]]] = {
+    "terms": {BASE: {}, DEFAULTS: {}},
+    "parts": {
+        **{f"{DEFAULTS}-{name}": part.off for name, part in PARTS.items() if not _is_default(part.off)},
+        **{
+            name if form == FORMS[0] else f"{name}-{form}": settings
+            for name, part in PARTS.items()
+            for form, settings in part.forms.items()
+        },
+        "visibility-paper": {**PARTS["ambiguity"].forms["stable"], "train.terms.ambiguity.visibility": "paper"},
+        "visibility-mesh": {**PARTS["ambiguity"].forms["stable"], "train.terms.ambiguity.visibility": "mesh"},
+        "planar-mlp": {**PARTS["planar"].forms["stable"], "train.terms.planar.features": "mlp"},
+    },
+    "paper": {name: changes for form in FORMS for name, changes in _all_of_paper(form).items()},
+    # what is in the base, taken out or otherwise
+    "base": {
+        # the colours and the Eikonal term alone, as in NeuS: no points, no reflected direction
+        "rgb+eikonal": {**NO_STEREO, "train.losses.sparse": "0", "train.field.radiance_inputs": "view"},
+        # held to the SfM points alone
+        "no-stereo": NO_STEREO,
+        "density-neus": {"train.density.form": "neus"},
+        "scale-learned": {"train.density.scale": "learned"},
+        "gradients-numerical": {"train.field.gradients": "numerical"},
+        "view-only": {"train.field.radiance_inputs": "view"},
+    },
     # what a step leaves out, put back
-    "rays-even": {"train.sampling.needed_share": "0"},
-    "colors-16": {"train.schedule.deferred_from": "null"},
-    "samples-16": {"train.sampling.samples_end": "16"},
-    "background-16": {"train.sampling.background_samples": "16"},
-    "proposal": {"train.sampling.sampler": "proposal"},
+    "steps": {
+        "rays-even": {"train.sampling.needed_share": "0"},
+        "colors-16": {"train.schedule.deferred_from": "null"},
+        "samples-16": {"train.sampling.samples_end": "16"},
+        "background-16": {"train.sampling.background_samples": "16"},
+        "proposal": {"train.sampling.sampler": "proposal"},
+    },
     # the paper's "integrated into" rows: each backbone without and with the terms
-    **{
+    "backbones": {
         f"{name}{tail}": {"train.backbone": name, **terms}
         for name in BACKBONES
-        for tail, terms in (("", {}), ("+all", TERMS))
+        for tail, terms in (("", {}), ("+all", _in_form(FORMS[0])))
     },
-    # the supplement's knobs, around the defaults of t_max 0.1, gamma 5, clip 0.2, hash resolution 512
-    **{f"all-tmax-{value}": {**TERMS, "train.terms.reflection.reach": value} for value in ("0.05", "0.2")},
-    **{f"all-gamma-{value}": {**TERMS, "train.terms.eikonal.gamma": value} for value in ("3", "10")},
-    **{f"all-clip-{value}": {**TERMS, "train.terms.eikonal.clip": value} for value in ("0.1", "0.3")},
-    **{f"all-hash-{value}": {**TERMS, "train.field.finest": value} for value in ("1024", "2048")},
+}
+VARIANTS = {name: changes for group in GROUPS.values() for name, changes in group.items()}
+
+# The paper's ablation: its rows, what is left out of all terms in each, and the sets at hand that stand for its suites.
+PAPER_ROWS = {
+    "HiNeuS": "",
+    "HiNeuS, no ambiguity weight": "-ambiguity",
+    "HiNeuS, no self-reflection": "-reflection",
+    "HiNeuS, visibility of a mesh": "-mesh",
+    "HiNeuS, visibility as RefNeuS": "-mesh",
+    "HiNeuS, no planar term": "-planar",
+    "HiNeuS, plain Eikonal term": "-eikonal",
+}
+STAND_INS = {
+    "dtu": ("dtu_scan24",),
+    "nerf-synthetic": ("synth_helmet", "textured", "thin"),
+    "glossy-synthetic": ("polished", "mirror", "synth_spotmetal"),
+    "mipnerf360": ("treetrunk", "banana"),
 }
 
 RUNS = RESULTS / "ablation"
@@ -127,7 +187,13 @@ ONE_THREAD = {
 
 @dataclass(frozen=True)
 class Plan:
-    """One run to make: a variant's settings on one set of photos with one seed and budget."""
+    """One run to make: a variant's settings on one set of photos with one seed and budget.
+
+    Attributes:
+        steps: of the training; with `covered` the most, as in `train.steps`.
+        covered: whether points that cover the surface shorten it, as in a default run.
+        settings: of the variant, on top of the preset. holdout: every so many photos one is left out; 0: none.
+    """
 
     set: str
     variant: str
@@ -136,6 +202,7 @@ class Plan:
     preset: str
     settings: tuple[str, ...]
     holdout: int = 0
+    covered: bool = False
 
     @property
     def name(self) -> str:
@@ -144,10 +211,10 @@ class Plan:
     @property
     def sets(self) -> list[str]:
         """All that is set on top of the preset."""
-        # Minutes would overrule a budget of steps, dense points would shorten it; a preview at the end is enough.
-        budget = [
-            "train.minutes=null", f"train.steps={self.steps}", "train.steps_if_covered=1", "train.preview_every=1",
-        ]  # fmt: skip
+        # Minutes would overrule a budget of steps; a preview at the end is enough.
+        budget = ["train.minutes=null", f"train.steps={self.steps}", "train.preview_every=1"]
+        if not self.covered:
+            budget.append("train.steps_if_covered=1")
         return [*self.settings, *budget, f"train.seed={self.seed}", f"train.hold_out={self.holdout}"]
 
 
@@ -165,6 +232,8 @@ class Run:
         psnr: of the training's rays at its end, dB.
         held_out_psnr: of photos left out of the training, dB; None where none were.
         train_wall_s, train_cpu_s: seconds of the training stage.
+        steps: that the training took.
+        config: hash of all settings, those of presets and defaults included.
     """
 
     plan: Plan
@@ -177,6 +246,8 @@ class Run:
     held_out_psnr: float | None
     train_wall_s: float
     train_cpu_s: float
+    steps: int
+    config: str
 
     @property
     def value(self) -> float | None:
@@ -185,13 +256,34 @@ class Run:
 
 
 # ---------------------------------------------------------------- variants
-def settings_of(changes: dict[str, str]) -> tuple[str, ...]:
-    """A variant's settings, those of the base that it does not change included."""
-    base = dict(BASE_SETTINGS)
+def compared_with(variant: str) -> str:
+    """What a variant is compared with, and starts from."""
+    return DEFAULTS if variant.startswith(f"{DEFAULTS}-") else BASE
+
+
+def settings_of(variant: str, changes: dict[str, str]) -> tuple[str, ...]:
+    """A variant's settings, those of `BASE` that it does not change included; of `DEFAULTS` none."""
+    if DEFAULTS in (variant, compared_with(variant)):
+        return tuple(f"{key}={value}" for key, value in changes.items())
+    base = dict(TERMS_OFF)
     if "train.backbone" in changes:  # sets these itself
         for key in ("train.density.form", "train.density.scale", "train.field.gradients"):
             del base[key]
     return tuple(f"{key}={value}" for key, value in {**base, **changes}.items())
+
+
+def named_variants(text: str) -> dict[str, dict[str, str]]:
+    """The variants that names or groups of them, separated by commas, stand for: those to compare with first.
+
+    Raises:
+        ValueError: there is no such variant or group.
+    """
+    words = text.split(",")
+    if unknown := [word for word in words if word not in GROUPS and word not in VARIANTS]:
+        groups, names = ", ".join(GROUPS), ", ".join(VARIANTS)
+        raise ValueError(f"no variant {', '.join(unknown)}; there are the groups {groups} and the variants {names}")
+    named = {name: VARIANTS[name] for word in words for name in GROUPS.get(word, (word,))}
+    return dict(sorted(named.items(), key=lambda item: item[0] not in GROUPS["terms"]))
 
 
 def parse_extra(text: str) -> tuple[str, dict[str, str]]:
@@ -217,16 +309,22 @@ def parse_extra(text: str) -> tuple[str, dict[str, str]]:
 
 
 def make_plans(
-    sets: dict[str, int], variants: dict[str, dict[str, str]], seeds: int, steps: int, preset: str
+    sets: dict[str, int],
+    variants: dict[str, dict[str, str]],
+    seeds: int,
+    steps: int,
+    preset: str,
+    covered: bool = False,
 ) -> list[Plan]:
     """All runs: by variant, then seed, then set, so that what is done when it is interrupted can be compared.
 
     Args:
         sets: name -> every so many photos one is left out, 0: none.
         variants: name -> what it changes.
+        steps, covered: see `Plan`.
     """
     return [
-        Plan(name, variant, seed, steps, preset, settings_of(changes), holdout)
+        Plan(name, variant, seed, steps, preset, settings_of(variant, changes), holdout, covered)
         for variant, changes in variants.items()
         for seed in range(seeds)
         for name, holdout in sets.items()
@@ -262,6 +360,13 @@ def poses_hash(shared: Path) -> str:
     return digest(files)[:12]
 
 
+def config_hash(plan: Plan) -> str:
+    """Hash of all settings of a run: a result is one of now only where presets and defaults are the same."""
+    from stages.engine.fingerprint import digest
+
+    return digest(load_config(plan.preset, None, plan.sets).model_dump(mode="json"))[:12]
+
+
 def code_hash() -> str:
     """Hash of the sources that decide what a training comes to."""
     sources = sorted((ROOT / "stages" / "neural").rglob("*.py"))
@@ -285,7 +390,6 @@ def measure(plan: Plan, data: Path, jobs: int = 1, keep: bool = False) -> Run:
     Raises:
         HineusError: a stage failed, or the mesh cannot be scored.
     """
-    from configs.load import load_config
     from stages.reconstruct import has_cuda
 
     code = code_hash()
@@ -325,6 +429,8 @@ def measure(plan: Plan, data: Path, jobs: int = 1, keep: bool = False) -> Run:
         held_out_psnr=trained.get("held_out_psnr"),
         train_wall_s=wall["train"],
         train_cpu_s=cpu["train"],
+        steps=trained.get("steps", plan.steps),
+        config=config_hash(plan),
     )
     if not keep:
         shutil.rmtree(folder)
@@ -333,12 +439,14 @@ def measure(plan: Plan, data: Path, jobs: int = 1, keep: bool = False) -> Run:
 
 def command(plan: Plan) -> str:
     """The call that makes this run (and those of lower seeds)."""
-    words = ["python -m benchmarks.ablate DATA", plan.set, f"--steps {plan.steps} --preset {plan.preset}"]
+    budget = f"--budget {plan.steps / TrainParams().steps:g}" if plan.covered else f"--steps {plan.steps}"
+    words = ["python -m benchmarks.ablate DATA", plan.set, f"{budget} --preset {plan.preset}"]
     if plan.variant in VARIANTS:
         words.append(f"--variants {plan.variant}")
     else:
-        changed = [text for text in plan.settings if text not in settings_of({})]
-        words.append(f"--variants {BASE} --extra {plan.variant}:{','.join(changed)}")
+        start = compared_with(plan.variant)
+        changed = [text for text in plan.settings if text not in settings_of(start, {})]
+        words.append(f"--variants {start} --extra {plan.variant}:{','.join(changed)}")
     return " ".join([*words, f"--seeds {plan.seed + 1}"])
 
 
@@ -417,7 +525,8 @@ def run_plans(plans: Sequence[Plan], data: Path, jobs: int, keep: bool) -> list[
 # ---------------------------------------------------------------- result files
 def save_run(run: Run) -> None:
     RUNS.mkdir(parents=True, exist_ok=True)
-    path = RUNS / f"{run.plan.name}-{run.plan.steps}-{run.poses}.json"
+    most = "-covered" if run.plan.covered else ""
+    path = RUNS / f"{run.plan.name}-{run.plan.steps}{most}-{run.poses}.json"
     partial = path.with_suffix(".partial")
     partial.write_text(json.dumps(asdict(run), indent=1, allow_nan=False) + "\n", encoding="utf-8")
     partial.replace(path)
@@ -439,7 +548,37 @@ def _plan(data: dict[str, Any]) -> Plan:
     return Plan(**{**data, "settings": tuple(f"{RENAMED.get(key, key)}={value}" for key, _, value in settings)})
 
 
-# ---------------------------------------------------------------- table
+# ---------------------------------------------------------------- tables
+def terms_table(runs: Sequence[Run]) -> str:
+    """The defaults against the same with all terms off: a row a set and budget."""
+    header = [
+        "set", "steps", "seeds", "distance % or held-out PSNR dB, terms off", "defaults", "change", "verdict",
+        "normals °, terms off", "defaults", "training CPU a step",
+    ]  # fmt: skip
+    groups: dict[tuple[object, ...], list[tuple[Run, Run]]] = {}
+    for run in runs:
+        for base in runs if run.plan.variant == DEFAULTS else ():
+            if _compares(run, base):
+                plan = run.plan
+                key = (plan.set, plan.steps, plan.covered, plan.preset, run.poses)
+                groups.setdefault(key, []).append((run, base))
+    rows = []
+    for pairs in groups.values():
+        ours, theirs = zip(*pairs, strict=True)
+        rows.append(
+            [
+                ours[0].plan.set,
+                _steps(ours),
+                str(len(pairs)),
+                *(_values(side) for side in (theirs, ours)),
+                *_change_and_verdict(pairs),
+                *(_mean(_normals(side), 1) for side in (theirs, ours)),
+                _cpu_ratio(pairs),
+            ]
+        )
+    return markdown_table(header, rows) if rows else NOT_MEASURED
+
+
 def ablation_table(runs: Sequence[Run]) -> str:
     """A table a set with a row a variant, what code they were made with, and at last what each variant sets."""
     parts = []
@@ -448,50 +587,118 @@ def ablation_table(runs: Sequence[Run]) -> str:
         parts += [f"**{name}**", _set_table(of_set)]
         if note := _code_note(of_set):
             parts.append(note)
-    base = settings_of({})
-    changed = {run.plan.variant: [text for text in run.plan.settings if text not in base] for run in runs}
-    legend = [
-        f"- {variant}: {', '.join(f'`{text}`' for text in texts or (base if variant == BASE else ()))}"
-        for variant, texts in changed.items()
-    ]
+    changed = {
+        run.plan.variant: [
+            text for text in run.plan.settings
+            if run.plan.variant == BASE or text not in settings_of(compared_with(run.plan.variant), {})
+        ]
+        for run in runs if run.plan.settings
+    }  # fmt: skip
+    legend = [f"- {variant}: {', '.join(f'`{text}`' for text in texts)}" for variant, texts in changed.items()]
     return "\n\n".join([*parts, "\n".join(legend)])
 
 
 def _set_table(runs: Sequence[Run]) -> str:
     header = [
-        "variant", "steps", "seeds", "distance %", "held-out PSNR dB", "spread", "change", "verdict", "training CPU",
-        "training PSNR dB",
+        "variant", "steps", "seeds", "distance %", "normals °", "held-out PSNR dB", "spread", "change", "verdict",
+        "training CPU a step", "training PSNR dB",
     ]  # fmt: skip
-    groups: dict[tuple[object, ...], list[Run]] = {}
-    for run in runs:
-        plan = run.plan
-        groups.setdefault((plan.variant, plan.steps, plan.preset, plan.settings, run.poses), []).append(run)
     rows = []
-    for group in groups.values():
+    for group in _by_variant(runs):
         values = [run.value for run in group if run.value is not None]
         pairs = [(run, base) for run in group for base in runs if _compares(run, base)]
-        timed = [(a.train_cpu_s, b.train_cpu_s) for a, b in pairs if a.machine == b.machine]
         rows.append(
             [
                 group[0].plan.variant,
-                str(group[0].plan.steps),
+                _steps(group),
                 str(len(group)),
                 _mean([run.score["mean"] for run in group if run.score], 3),
+                _mean(_normals(group), 1),
                 _mean([run.held_out_psnr for run in group if run.held_out_psnr is not None], 2),
                 f"{_spread(values):.3f}" if len(values) > 1 else "-",
                 *_change_and_verdict(pairs),
-                f"x {sum(a for a, _ in timed) / max(sum(b for _, b in timed), 1e-9):.2f}" if timed else "-",
+                _cpu_ratio(pairs),
                 _mean([run.psnr for run in group if run.psnr is not None], 2),
             ]
         )
     return markdown_table(header, rows)
 
 
+def paper_table(runs: Sequence[Run]) -> str:
+    """The paper's ablation: what it claims that leaving a term out does, and what that does on the sets at hand."""
+    header = ["suite", "row", "claimed", "set", "steps", *(f"seen, {form}" for form in FORMS)]
+    rows = []
+    for suite, sets in STAND_INS.items():
+        full, *others = (row for row in paper_tables()[suite].rows if row.method in PAPER_ROWS)
+        for row in others:
+            for name in sets:
+                seen = [_seen(runs, name, ALL[form], PAPER_ROWS[row.method]) for form in FORMS]
+                if any(seen):
+                    steps = _steps([run for pairs in seen for pair in pairs for run in pair])
+                    cells = [_change_and_verdict(pairs)[0] for pairs in seen]
+                    rows.append([SUITES[suite].title, row.method, _claim(suite, row, full), name, steps, *cells])
+    return markdown_table(header, rows) if rows else NOT_MEASURED
+
+
+def _claim(suite: str, row: PaperRow, full: PaperRow) -> str:
+    """How a row's average differs from that of the whole method, by the figures in the table."""
+    if SUITES[suite].unit == "dB":
+        return f"{row.average - full.average:+.2f} dB"
+    return f"{100 * (row.average / full.average - 1):+.1f} %"
+
+
+def _seen(runs: Sequence[Run], name: str, everything: str, left_out: str) -> list[tuple[Run, Run]]:
+    """Runs of a set without one of the terms, each with the run that has them all; those of the largest budget."""
+    pairs = [
+        (a, b)
+        for a in runs if (a.plan.set, a.plan.variant) == (name, everything + left_out)
+        for b in runs if b.plan.variant == everything and _same_but_variant(a, b)
+    ]  # fmt: skip
+    most = max((a.plan.steps for a, _ in pairs), default=0)
+    return [(a, b) for a, b in pairs if a.plan.steps == most]
+
+
+def _by_variant(runs: Sequence[Run]) -> list[list[Run]]:
+    """Those that differ in the seed alone, together."""
+    groups: dict[tuple[object, ...], list[Run]] = {}
+    for run in runs:
+        plan = run.plan
+        key = (plan.set, plan.variant, plan.steps, plan.covered, plan.preset, plan.settings, run.poses)
+        groups.setdefault(key, []).append(run)
+    return list(groups.values())
+
+
 def _compares(run: Run, base: Run) -> bool:
-    """Whether `run` is no base, and `base` is one that differs from it in the variant's settings alone."""
-    a, b = run.plan, base.plan
-    same = (a.set, a.seed, a.steps, a.preset, a.holdout) == (b.set, b.seed, b.steps, b.preset, b.holdout)
-    return a.variant != BASE and b.variant == BASE and same and run.poses == base.poses
+    """Whether `base` is what `run` is compared with, and differs from it in the variant's settings alone."""
+    return run.plan.variant != base.plan.variant == compared_with(run.plan.variant) and _same_but_variant(run, base)
+
+
+def _same_but_variant(run: Run, other: Run) -> bool:
+    a, b = (replace(each.plan, variant="", settings=()) for each in (run, other))
+    return a == b and run.poses == other.poses
+
+
+def _steps(runs: Sequence[Run]) -> str:
+    """Steps that were taken, by each seed where they differ."""
+    taken = sorted({run.steps for run in runs})
+    return f"{taken[0]}" if len(taken) == 1 else f"{taken[0]} to {taken[-1]}"
+
+
+def _values(runs: Sequence[Run]) -> str:
+    """The mean of what variants are compared by, and the values of the seeds."""
+    values = [run.value for run in runs if run.value is not None]
+    several = f" ({', '.join(f'{value:.2f}' for value in values)})" if len(values) > 1 else ""
+    return f"{_mean(values, 3)}{several}"
+
+
+def _normals(runs: Sequence[Run]) -> list[float]:
+    return [run.score["normals_deg"] for run in runs if run.score and "normals_deg" in run.score]
+
+
+def _cpu_ratio(pairs: Sequence[tuple[Run, Run]]) -> str:
+    """CPU seconds of a step against those of the other side, over the pairs that one machine made."""
+    timed = [(a.train_cpu_s / a.steps, b.train_cpu_s / b.steps) for a, b in pairs if a.machine == b.machine]
+    return f"x {sum(a for a, _ in timed) / max(sum(b for _, b in timed), 1e-9):.2f}" if timed else "-"
 
 
 def _change_and_verdict(pairs: Sequence[tuple[Run, Run]]) -> tuple[str, str]:
@@ -534,7 +741,11 @@ def _mean(values: Sequence[float], digits: int) -> str:
 def tables() -> dict[str, str]:
     """The tables, from the result files."""
     runs = load_runs()
-    return {"ablation": ablation_table(runs) if runs else NOT_MEASURED}
+    return {
+        "ablation terms": terms_table(runs),
+        "ablation": ablation_table(runs) if runs else NOT_MEASURED,
+        "ablation paper": paper_table(runs),
+    }
 
 
 # ---------------------------------------------------------------- command
@@ -546,9 +757,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("data", type=Path, nargs="?", help="folder of sets")
     parser.add_argument("sets", nargs="*", help="names of sets; default: all with a known surface or known cameras")
-    parser.add_argument("--steps", type=int, default=2000, help="training steps of every run")
+    budget = parser.add_mutually_exclusive_group()
+    budget.add_argument("--budget", type=float, default=1.0, help="times the steps of a default run (default: 1)")
+    budget.add_argument("--steps", type=int, help="training steps of every run instead, however much points cover")
     parser.add_argument("--seeds", type=int, default=2, help="how many seeds, from 0")
-    parser.add_argument("--variants", default=",".join(VARIANTS), help="names, separated by commas")
+    parser.add_argument(
+        "--variants", default="terms", help=f"names, separated by commas, or groups of them: {', '.join(GROUPS)}"
+    )
     parser.add_argument("--extra", action="append", default=[], help="NAME:setting=value,...: one more variant")
     parser.add_argument("--preset", help="default: that of `hineus run`")
     parser.add_argument("--jobs", type=int, help="runs side by side; default: one a core, or one on a GPU")
@@ -562,12 +777,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0
     failed: list[str] = []
     if not arguments.table_only:
-        named = arguments.variants.split(",")
-        if unknown := [name for name in named if name not in VARIANTS]:
-            parser.error(f"no variant {', '.join(unknown)}; there are {', '.join(VARIANTS)}")
-        variants = {name: VARIANTS[name] for name in sorted(named, key=lambda name: name != BASE)}
         try:
-            variants |= dict(map(parse_extra, arguments.extra))
+            variants = named_variants(arguments.variants) | dict(map(parse_extra, arguments.extra))
         except ValueError as error:
             parser.error(str(error))
         if arguments.data is None:
@@ -577,7 +788,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         if not arguments.sets:
             names = [name for name in names if has_truth(data / name) or known_cameras(data / name)]
         sets = {name: 0 if has_truth(data / name) else HOLDOUT for name in names}
-        plans = make_plans(sets, variants, arguments.seeds, arguments.steps, preset)
+        steps = arguments.steps or round(arguments.budget * TrainParams().steps)
+        plans = make_plans(sets, variants, arguments.seeds, steps, preset, covered=arguments.steps is None)
         poses: dict[str, str] = {}
         for name in sets:
             try:
@@ -586,8 +798,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             except (RuntimeError, HineusError) as error:
                 print(f"{name}: {error}", file=sys.stderr)
                 failed += [plan.name for plan in plans if plan.set == name]
-        done = set() if arguments.again else {(run.plan, run.poses) for run in load_runs()}
-        plans = [plan for plan in plans if plan.set in poses and (plan, poses[plan.set]) not in done]
+        done = set() if arguments.again else {(run.plan, run.poses, run.config) for run in load_runs()}
+        plans = [plan for plan in plans if plan.set in poses and (plan, poses[plan.set], config_hash(plan)) not in done]
         print(f"{len(plans)} runs to make (others have a result; --again measures them anew)", file=sys.stderr)
         jobs = arguments.jobs or (1 if has_cuda() else available_cores())
         failed += run_plans(plans, data, jobs, arguments.keep)

@@ -254,7 +254,7 @@ def summary_table(results: Sequence[Result]) -> str:
     """One row a set: what was registered and what it cost with the first seed, and the mean distances of all seeds."""
     header = [
         "set", "seeds", "photos registered", "wall min", "CPU min", "peak GiB", "faces", "GLB MB",
-        "distance %", "accuracy %", "completeness %", "F at 1 %", "glTF errors / warnings",
+        "distance %", "accuracy %", "completeness %", "F at 1 %", "normals °", "glTF errors / warnings",
     ]  # fmt: skip
     by_name: dict[str, list[Result]] = {}
     for result in results:
@@ -274,7 +274,7 @@ def _summary_row(seeds: Sequence[Result]) -> list[str]:
         f"{first.peak_rss / GIB:.2f}",
         _text(first.number("cleanup", "faces")),
         f"{first.glb_bytes / 1e6:.1f}",
-        *(_score_cell(seeds, name) for name in ("mean", "accuracy", "completeness", "f_one_percent")),
+        *(_score_cell(seeds, name) for name in ("mean", "accuracy", "completeness", "f_one_percent", "normals_deg")),
         f"{validator['errors']} / {validator['warnings']}" if validator else "-",
     ]
 
@@ -333,7 +333,7 @@ def tables() -> dict[str, str]:
 
 def _score_cell(seeds: Sequence[Result], name: str) -> str:
     """The mean over the seeds, and of several seeds' distances the least and the largest."""
-    values = [result.score[name] for result in seeds if result.score]
+    values = [result.score[name] for result in seeds if result.score and name in result.score]
     if not values:
         return "-"
     several = name == "mean" and len(values) > 1

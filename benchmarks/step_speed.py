@@ -43,7 +43,7 @@ PROGRESS = 0.7  # all levels in use
 
 # What is timed if nothing else is asked for: each part alone and all together, then the paper's forms, then choices.
 PARTS = (
-    "ambiguity", "reflection", "planar", "eikonal", "all",
+    "defaults", "ambiguity", "reflection", "planar", "eikonal", "all",
     "ambiguity-paper", "visibility-paper", "visibility-mesh", "reflection-paper", "planar-paper", "eikonal-paper",
     "all-paper",
     "density-neus", "scale-learned", "gradients-numerical", "planar-mlp",
@@ -192,7 +192,7 @@ def variant_trainers(names: Sequence[str], device: str = "cpu") -> dict[str, Tra
     sightings = ball_heap.sightings(cameras, device)
     preset = preset_for(device)
     trainers = {
-        name: Trainer(photos, *sightings, load_config(preset, None, settings_of(VARIANTS[name])).train, device)
+        name: Trainer(photos, *sightings, load_config(preset, None, settings_of(name, VARIANTS[name])).train, device)
         for name in names
     }
     first, *others = trainers.values()

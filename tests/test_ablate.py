@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -12,21 +12,32 @@ import numpy as np
 import pytest
 
 from benchmarks import ablate, pages
-from benchmarks.ablate import BASE, VARIANTS, Plan, Run, ablation_table, load_runs, parse_extra, save_run, settings_of
+from benchmarks.ablate import (
+    BASE,
+    DEFAULTS,
+    VARIANTS,
+    Plan,
+    Run,
+    ablation_table,
+    load_runs,
+    parse_extra,
+    save_run,
+    settings_of,
+)
 from configs.load import load_config
 from stages import artifacts
 from stages.engine.stage import Stage, StageContext
 
 
 def _plan(variant=BASE, seed=0, steps=1500, name="helmet", holdout=0) -> Plan:
-    return Plan(name, variant, seed, steps, "cpu", settings_of(VARIANTS[variant]), holdout)
+    return Plan(name, variant, seed, steps, "cpu", settings_of(variant, VARIANTS[variant]), holdout)
 
 
 def _run(variant=BASE, seed=0, mean: float | None = 1.0, cpu=100.0, psnr=30.0, steps=1500, name="helmet", **changes):
     score = None if mean is None else {"mean": mean}
     return Run(**{"plan": _plan(variant, seed, steps, name), "command": "ablate", "machine": {"cpu": "x"}, "poses": "p",
                   "code": "c", "score": score, "psnr": psnr, "held_out_psnr": None, "train_wall_s": cpu / 2,
-                  "train_cpu_s": cpu, **changes})  # fmt: skip
+                  "train_cpu_s": cpu, "steps": steps, "config": "s", **changes})  # fmt: skip
 
 
 def _rows(runs):
@@ -40,7 +51,8 @@ def here(tmp_path, monkeypatch):
     monkeypatch.setattr(ablate, "RUNS", tmp_path / "runs")
     monkeypatch.setattr(ablate, "FOLDERS", tmp_path / "out")
     monkeypatch.setattr(pages, "DOCS", tmp_path)
-    (tmp_path / "page.md").write_text("top\n<!-- table ablation -->\n<!-- end ablation -->\nbottom\n")
+    tables = "".join(f"<!-- table {name} -->\n<!-- end {name} -->\n" for name in ablate.tables())
+    (tmp_path / "page.md").write_text(f"top\n{tables}bottom\n")
     for name in ("helmet", "scan"):
         (tmp_path / "data" / name / "images").mkdir(parents=True)
         for stage in ("undistort", "densify"):
@@ -53,16 +65,45 @@ def here(tmp_path, monkeypatch):
 # ---------------------------------------------------------------- variants
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_every_variant_changes_settings_that_exist(variant):
-    plain, changed = (load_config("cpu", None, settings_of(changes)) for changes in ({}, VARIANTS[variant]))
-    assert (changed != plain) == (variant != BASE)
+    start = ablate.compared_with(variant)
+    plain, changed = (load_config("cpu", None, settings_of(start, changes)) for changes in ({}, VARIANTS[variant]))
+    assert (changed != plain) == (variant not in (BASE, DEFAULTS))
 
 
 def test_no_two_variants_are_the_same():
-    assert len({settings_of(changes) for changes in VARIANTS.values()}) == len(VARIANTS)
+    assert len({settings_of(name, changes) for name, changes in VARIANTS.items()}) == len(VARIANTS)
+    assert sum(map(len, ablate.GROUPS.values())) == len(VARIANTS)
+
+
+def test_the_defaults_are_those_of_a_run_whatever_they_become():
+    assert settings_of(DEFAULTS, VARIANTS[DEFAULTS]) == ()
+    assert settings_of("defaults-planar", {"train.terms.planar.form": "off"}) == ("train.terms.planar.form=off",)
+    assert (ablate.compared_with("defaults-planar"), ablate.compared_with("planar")) == (DEFAULTS, BASE)
+
+
+def test_settings_that_the_plan_does_not_name_count_too():
+    plans = [_plan(), replace(_plan(), preset="gpu"), _plan("planar")]
+    assert len({ablate.config_hash(plan) for plan in plans}) == 3
+
+
+def test_every_part_can_be_left_out_and_all_but_one_left():
+    for name, part in ablate.PARTS.items():
+        assert part.off.items() <= ablate.TERMS_OFF.items()
+        for form, settings in part.forms.items():
+            rest = VARIANTS[f"{ablate.ALL[form]}-{name}"]
+            assert {**rest, **settings} == VARIANTS[ablate.ALL[form]]
+            assert len(rest) < len(VARIANTS[ablate.ALL[form]])
+
+
+def test_variants_are_named_one_by_one_or_by_group():
+    assert list(ablate.named_variants("planar,terms")) == [BASE, DEFAULTS, "planar"]
+    assert list(ablate.named_variants("steps")) == list(ablate.GROUPS["steps"])
+    with pytest.raises(ValueError, match="no variant plane; there are the groups terms, "):
+        ablate.named_variants("plane")
 
 
 def test_the_base_has_every_term_off_whatever_the_defaults():
-    sets = ["train.terms.planar.form=paper", "train.terms.ambiguity.form=stable", *settings_of({})]
+    sets = ["train.terms.planar.form=paper", "train.terms.ambiguity.form=stable", *settings_of(BASE, {})]
     train = load_config("cpu", None, sets).train
     terms = train.terms
     forms = (terms.ambiguity.form, terms.reflection.form, terms.planar.form, terms.eikonal.form)
@@ -71,9 +112,11 @@ def test_the_base_has_every_term_off_whatever_the_defaults():
 
 @pytest.mark.parametrize("preset", ["cpu", "gpu", "demo"])
 def test_a_plan_fixes_steps_seed_and_hold_out_whatever_the_preset(preset):
-    plan = Plan("helmet", "ambiguity", 3, 700, preset, settings_of(VARIANTS["ambiguity"]), 8)
+    plan = Plan("helmet", "ambiguity", 3, 700, preset, settings_of("ambiguity", VARIANTS["ambiguity"]), 8)
     train = load_config(preset, None, plan.sets).train
     assert (train.steps, train.minutes, train.seed, train.hold_out) == (700, None, 3, 8)
+    assert train.steps_if_covered == 1
+    assert load_config(preset, None, replace(plan, covered=True).sets).train.steps_if_covered < 1
     assert train.terms.ambiguity.form == "stable"
 
 
@@ -83,7 +126,7 @@ def test_an_extra_variant_is_named_settings_on_top_of_the_base_or_of_a_variant()
     )  # fmt: skip
     _, changes = parse_extra("far:planar-mlp,weight_planar=0.3")
     assert changes == {**VARIANTS["planar-mlp"], "train.terms.planar.weight": "0.3"}
-    assert load_config("cpu", None, settings_of(changes)).train.terms.planar.weight == 0.3
+    assert load_config("cpu", None, settings_of("far", changes)).train.terms.planar.weight == 0.3
 
 
 @pytest.mark.parametrize("text", ["far", "far:", "planar:steps=3", "a/b:steps=3", "far:nothing"])
@@ -95,7 +138,7 @@ def test_an_extra_variant_of_another_form_is_refused(text):
 def test_runs_go_by_variant_then_seed_then_set():
     plans = ablate.make_plans({"a": 0, "b": 8}, {BASE: {}, "planar": VARIANTS["planar"]}, 2, 9, "cpu")
     names = [plan.name for plan in plans]
-    assert names[:5] == ["a-base-0", "b-base-0", "a-base-1", "b-base-1", "a-planar-0"]
+    assert names[:5] == ["a-terms-off-0", "b-terms-off-0", "a-terms-off-1", "b-terms-off-1", "a-planar-0"]
     assert [plan.holdout for plan in plans[:2]] == [0, 8]
 
 
@@ -104,8 +147,8 @@ def test_a_variant_is_compared_with_base_over_the_seeds():
     runs = [_run(mean=1.0), _run(seed=1, mean=1.2), _run("planar", mean=0.9, cpu=150.0, psnr=29.0),
             _run("planar", seed=1, mean=0.86, cpu=130.0, psnr=31.0)]  # fmt: skip
     assert _rows(runs) == [
-        ["base", "1500", "2", "1.100", "-", "0.200", "-", "-", "-", "30.00"],
-        ["planar", "1500", "2", "0.880", "-", "0.040", "-20.0 %", "helps", "x 1.40", "30.00"],
+        ["terms-off", "1500", "2", "1.100", "-", "-", "0.200", "-", "-", "-", "30.00"],
+        ["planar", "1500", "2", "0.880", "-", "-", "0.040", "-20.0 %", "helps", "x 1.40", "30.00"],
     ]
     table = ablation_table(runs)
     assert table.startswith("**helmet**\n\n| variant |")
@@ -119,39 +162,77 @@ def test_a_variant_is_compared_with_base_over_the_seeds():
 def test_a_change_counts_when_it_is_more_than_the_larger_spread(means, verdict):
     runs = [_run(mean=1.0), _run(seed=1, mean=1.1)]
     runs += [_run("planar", seed=seed, mean=mean) for seed, mean in enumerate(means)]
-    assert _rows(runs)[1][7] == verdict
+    assert _rows(runs)[1][8] == verdict
 
 
 def test_only_the_seeds_that_both_have_are_compared():
     runs = [_run(mean=1.0), _run("planar", mean=0.5), _run("planar", seed=1, mean=9.0)]
-    assert _rows(runs)[1][3:8] == ["4.750", "-", "8.500", "-50.0 %", "-"]
+    assert _rows(runs)[1][3:9] == ["4.750", "-", "-", "8.500", "-50.0 %", "-"]
 
 
 @pytest.mark.parametrize("other", [{"steps": 300}, {"name": "viking"}, {"poses": "q"}])
 def test_runs_of_another_budget_set_or_start_are_not_compared(other):
     rows = [row for row in _rows([_run(), _run("planar", **other)]) if row[0] == "planar"]
-    assert rows[0][6:9] == ["-", "-", "-"]
+    assert rows[0][7:10] == ["-", "-", "-"]
 
 
 def test_seconds_of_another_machine_are_not_compared():
-    assert _rows([_run(), _run("planar", mean=0.5, machine={"cpu": "y"})])[1][6:9] == ["-50.0 %", "-", "-"]
+    assert _rows([_run(), _run("planar", mean=0.5, machine={"cpu": "y"})])[1][7:10] == ["-50.0 %", "-", "-"]
 
 
 def test_sets_without_a_surface_are_compared_by_the_photos_left_out():
     runs = [_run(variant, seed, None, held_out_psnr=psnr + 0.1 * seed)
             for variant, psnr in ((BASE, 25.0), ("planar", 25.6), ("eikonal", 24.0)) for seed in (0, 1)]  # fmt: skip
-    assert [row[3:8] for row in _rows(runs)] == [
-        ["-", "25.05", "0.100", "-", "-"],
-        ["-", "25.65", "0.100", "+0.60 dB", "helps"],
-        ["-", "24.05", "0.100", "-1.00 dB", "hurts"],
+    assert [row[5:9] for row in _rows(runs)] == [
+        ["25.05", "0.100", "-", "-"],
+        ["25.65", "0.100", "+0.60 dB", "helps"],
+        ["24.05", "0.100", "-1.00 dB", "hurts"],
     ]
 
 
 def test_results_of_other_code_are_marked():
     runs = [_run(), _run("planar", mean=0.5, code="d"), _run("eikonal", mean=0.5)]
-    assert [row[6] for row in _rows(runs)] == ["-", "-50.0 % *", "-50.0 %"]
-    assert "Versions: `c` base, eikonal; `d` planar." in ablation_table(runs)
+    assert [row[7] for row in _rows(runs)] == ["-", "-50.0 % *", "-50.0 %"]
+    assert "Versions: `c` terms-off, eikonal; `d` planar." in ablation_table(runs)
     assert "Versions" not in ablation_table([_run(), _run("planar")])
+
+
+def test_the_defaults_stand_beside_the_same_without_terms():
+    """A row a set and budget: distances of both, of each seed, the normals, and what a step costs."""
+
+    def scored(variant, seed, mean, cpu=100.0, **changes):
+        return _run(variant, seed, cpu=cpu, score={"mean": mean, "normals_deg": 20 * mean}, **changes)
+
+    runs = [scored(BASE, 0, 1.0), scored(BASE, 1, 1.1), scored(DEFAULTS, 0, 0.7, 240.0, steps=1500),
+            scored(DEFAULTS, 1, 0.8, 240.0), scored("planar", 0, 0.1),
+            scored(DEFAULTS, 0, 0.5, name="other")]  # fmt: skip
+    runs[2] = replace(runs[2], steps=3000)  # it took more
+    lines = ablate.terms_table(runs).splitlines()
+    assert len(lines) == 3
+    assert [cell.strip() for cell in lines[2].strip("|").split("|")] == [
+        "helmet", "1500 to 3000", "2", "1.050 (1.00, 1.10)", "0.750 (0.70, 0.80)", "-28.6 %", "helps", "21.0", "15.0",
+        "x 1.80",
+    ]  # fmt: skip
+    assert ablate.terms_table(runs[:2]) == pages.NOT_MEASURED
+
+
+def test_what_the_paper_claims_stands_beside_what_is_seen():
+    names = {"all": 1.0, "all-ambiguity": 1.2, "all-paper": 2.0, "all-paper-ambiguity": 1.0, "planar": 1.0}
+    runs = [_run(variant, mean=mean, name="mirror") for variant, mean in names.items()]
+    runs += [_run("all-ambiguity", mean=9.0, name="mirror", steps=9)]  # another budget
+    runs += [_run("all-reflection", None, mean=None, name="treetrunk", held_out_psnr=20.0)]
+    lines = ablate.paper_table(runs).splitlines()
+    assert [cell.strip() for cell in lines[2].strip("|").split("|")] == [
+        "GlossySynthetic", "HiNeuS, no ambiguity weight", "+15.2 %", "mirror", "1500", "+20.0 %", "-50.0 %"
+    ]  # fmt: skip
+    assert len(lines) == 3
+
+
+def test_every_row_of_the_papers_ablation_is_a_variant():
+    rows = {row.method for table in ablate.paper_tables().values() for row in table.rows}
+    ours = {method for method in rows if method.startswith("HiNeuS")}
+    assert ours == set(ablate.PAPER_ROWS)
+    assert {ablate.ALL[form] + left for form in ablate.FORMS for left in ablate.PAPER_ROWS.values()} <= set(VARIANTS)
 
 
 # ---------------------------------------------------------------- running
@@ -169,12 +250,13 @@ def test_runs_that_have_a_result_are_skipped_and_a_failure_stops_no_other(here, 
         made.append(plan.name)
         if plan.name == "scan-planar-1":
             raise RuntimeError("no")
-        save_run(_run(plan=plan))
+        save_run(_run(plan=plan, steps=plan.steps))
 
     monkeypatch.setattr(ablate, "run_apart", run_apart)
     monkeypatch.setattr(ablate, "poses_hash", lambda folder: "p")
-    command = [str(here / "data"), "--steps", "9", "--variants", "planar,base", "--preset", "cpu", "--jobs", "1"]
-    every = ["helmet-base-0", "scan-base-0", "helmet-base-1", "scan-base-1",
+    monkeypatch.setattr(ablate, "config_hash", lambda plan: "s")
+    command = [str(here / "data"), "--steps", "9", "--variants", "planar,terms-off", "--preset", "cpu", "--jobs", "1"]
+    every = ["helmet-terms-off-0", "scan-terms-off-0", "helmet-terms-off-1", "scan-terms-off-1",
              "helmet-planar-0", "scan-planar-0", "helmet-planar-1", "scan-planar-1"]  # fmt: skip
     (here / "data" / "scan" / "cameras_sphere.npz").write_text("")
     assert ablate.main(command) == 1  # one failed, the others have results
@@ -186,8 +268,11 @@ def test_runs_that_have_a_result_are_skipped_and_a_failure_stops_no_other(here, 
     monkeypatch.setattr(ablate, "poses_hash", lambda folder: "q")  # photos and poses were made ready anew
     ablate.main([*command, "--steps", "10", "--seeds", "1"])
     assert len(made) == 17
+    monkeypatch.setattr(ablate, "config_hash", lambda plan: "t")  # a default is another now
+    ablate.main([*command, "--steps", "10", "--seeds", "1"])
+    assert len(made) == 21
     ablate.main([*command, "--table-only"])
-    assert len(made) == 17
+    assert len(made) == 21
     page = (here / "page.md").read_text()
     assert page.startswith("top\n")
     assert "| planar | 10 |" in page
@@ -279,8 +364,13 @@ def test_the_command_of_a_run_makes_that_run_again():
         "python -m benchmarks.ablate DATA helmet --steps 9 --preset cpu --variants planar --seeds 2"
     )
     name, changes = parse_extra("far:planar,weight_planar=0.3")
-    words = ablate.command(Plan("helmet", name, 0, 9, "cpu", settings_of(changes))).split()
+    words = ablate.command(Plan("helmet", name, 0, 9, "cpu", settings_of(name, changes))).split()
     assert parse_extra(words[words.index("--extra") + 1]) == (name, changes)
+    late = Plan("helmet", "defaults-late", 0, 16000, "cpu", ("train.schedule.coarse_until=0.6",), covered=True)
+    assert ablate.command(late) == (
+        "python -m benchmarks.ablate DATA helmet --budget 2 --preset cpu --variants defaults "
+        "--extra defaults-late:train.schedule.coarse_until=0.6 --seeds 1"
+    )
 
 
 def test_poses_that_are_there_are_not_made_again(here, monkeypatch):

@@ -69,6 +69,20 @@ def test_the_score_is_relative_to_the_extent(known):
     assert score.accuracy == pytest.approx(2.0, abs=0.05)
 
 
+def test_normals_are_those_of_the_nearest_place_whichever_way_they_point(known):
+    """A sphere of 80 faces: by a slow search for the nearest face. A fine one has none, turned inside out or not."""
+    coarse = trimesh.creation.icosphere(subdivisions=1, radius=0.5)
+    score = score_surface(np.asarray(coarse.vertices), np.asarray(coarse.faces), known, samples=100_000)
+    seen = np.random.default_rng(0).permutation(seen_surface(known))[:2000]
+    faces = trimesh.proximity.closest_point_naive(coarse, seen)[2]
+    cosines = np.abs((coarse.face_normals[faces] * seen).sum(1)) / np.linalg.norm(seen, axis=1)
+    expected = np.degrees(np.arccos(cosines)).mean()
+    assert expected > 5
+    assert score.normals_deg == pytest.approx(expected, abs=0.3)
+    for turned in (known.faces, known.faces[:, ::-1]):
+        assert score_surface(known.vertices, turned, known, samples=100_000).normals_deg < 1
+
+
 def test_what_no_camera_sees_need_not_be_there():
     """One camera sees less than half of the sphere: the other half may be missing."""
     known = _known_sphere([(2.0, 0, 0)])

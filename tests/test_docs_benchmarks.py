@@ -31,7 +31,7 @@ def _result(name="banana", score=None):
     return Result(name, f"hineus run DATA/{name}/images", {"cpu": "x"}, stages, score, validator, 5_250_000)
 
 
-SCORE = {"mean": 0.655, "accuracy": 0.5, "completeness": 0.81, "f_one_percent": 84.0}
+SCORE = {"mean": 0.655, "accuracy": 0.5, "completeness": 0.81, "f_one_percent": 84.0, "normals_deg": 12.34}
 
 
 def test_summary_adds_up_the_stages():
@@ -40,7 +40,7 @@ def test_summary_adds_up_the_stages():
     table = run_sets.summary_table([_result(score=SCORE)])
     row = [cell.strip() for cell in table.splitlines()[2].strip("|").split("|")]
     assert row == ["banana", "1", "15 of 16", "4.3", "7.7", "3.00", "99000", "5.2",
-                   "0.66", "0.50", "0.81", "84.00", "0 / 1"]  # fmt: skip
+                   "0.66", "0.50", "0.81", "84.00", "12.34", "0 / 1"]  # fmt: skip
 
 
 def test_seeds_share_a_row_with_their_spread_and_the_other_tables_have_the_first(tmp_path):
@@ -57,7 +57,7 @@ def test_seeds_share_a_row_with_their_spread_and_the_other_tables_have_the_first
 
 def test_sets_without_truth_or_validator_get_a_dash():
     result = _result()
-    assert run_sets.summary_table([result]).splitlines()[2].count(" - ") == 4
+    assert run_sets.summary_table([result]).splitlines()[2].count(" - ") == 5
 
 
 def test_stage_table_has_a_column_for_each_set():

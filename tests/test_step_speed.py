@@ -54,13 +54,14 @@ def test_variants_start_from_what_the_base_learned_and_timing_teaches_them_nothi
     )
     monkeypatch.setattr(step_speed, "LEARNING_STEPS", 2)
     monkeypatch.setattr(step_speed, "STEPS_PER_TURN", 1)
-    trainers = step_speed.variant_trainers(["base", "all", "scale-learned"])
-    base = trainers["base"].fields.state_dict()
-    assert (base["sdf.table"] - step_speed.noise_trainer(trainers["base"].params).fields.sdf.table).abs().max() > 1e-3
+    trainers = step_speed.variant_trainers(["terms-off", "all", "scale-learned"])
+    first = trainers["terms-off"]
+    base = first.fields.state_dict()
+    assert (base["sdf.table"] - step_speed.noise_trainer(first.params).fields.sdf.table).abs().max() > 1e-3
     for trainer in trainers.values():
         state = trainer.fields.state_dict()
         assert all(torch.equal(state[name], value) for name, value in base.items())
-        assert torch.equal(trainer.cache.values, trainers["base"].cache.values)
+        assert torch.equal(trainer.cache.values, first.cache.values)
     widths = [trainer.moment(step_speed.PARTS_PROGRESS).width for trainer in trainers.values()]
     assert widths == pytest.approx(widths[:1] * 3, rel=0.1)
     before = {name: {k: v.clone() for k, v in t.fields.state_dict().items()} for name, t in trainers.items()}
@@ -71,9 +72,9 @@ def test_variants_start_from_what_the_base_learned_and_timing_teaches_them_nothi
 
 
 def test_the_table_compares_with_the_base_and_the_share_is_of_the_whole_step():
-    seconds = {"base": (0.1, 0.18), "all": (0.16, 0.24)}
+    seconds = {"terms-off": (0.1, 0.18), "all": (0.16, 0.24)}
     assert step_speed.parts_table(seconds).splitlines()[2:] == [
-        "| base | 100 | 180 | 1.00 | 1.00 |",
+        "| terms-off | 100 | 180 | 1.00 | 1.00 |",
         "| all | 160 | 240 | 1.60 | 1.33 |",
     ]
     assert step_speed.share_of_terms(seconds) == (
@@ -84,5 +85,5 @@ def test_the_table_compares_with_the_base_and_the_share_is_of_the_whole_step():
 def test_variants_must_exist(capsys):
     assert set(step_speed.PARTS) < set(VARIANTS)
     with pytest.raises(SystemExit):
-        step_speed.main(["parts", "--variants", "base,nonsense"])
+        step_speed.main(["parts", "--variants", "terms-off,nonsense"])
     assert "no variant nonsense" in capsys.readouterr().err

@@ -9,8 +9,9 @@ mesh's COLMAP model: a similarity, no ICP.
   the table it may contain is not judged.
 - accuracy: mean distance from points sampled uniformly on the predicted surface to the known surface.
 - completeness: mean distance from the seen known surface to those points.
+- normals: mean angle between the seen known surface and the mesh at the nearest of those points, not oriented.
 
-All distances are in percent of the known object's largest extent.
+All distances are in percent of the known object's largest extent, angles in degrees.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ import numpy as np
 
 from stages.errors import InputError
 from stages.evaluation.reading import read_cameras, read_mesh
-from stages.evaluation.surfaces import Surface, measure_points, sample_faces
+from stages.evaluation.surfaces import Sampling, Surface, Target, draw_points, measure_points
 from stages.evaluation.thinning import one_a_cube
 from stages.geometry.cameras import PinholeCameras
 from stages.geometry.similarity import Similarity, align_points
@@ -43,13 +44,15 @@ SCORE_THRESHOLDS = (0.005, 0.01)  # of the extent
 
 @dataclass(frozen=True)
 class KnownScore:
-    """Distances in percent of the known object's largest extent; F-scores in percent.
+    """Distances in percent of the known object's largest extent; F-scores in percent; angles in degrees.
 
     Attributes:
         accuracy, completeness: means.
         mean: of accuracy and completeness; the number to compare.
         accuracy_median, completeness_median: the same with medians.
         f_half_percent, f_one_percent: harmonic mean of the shares of points nearer than 0.5 % and 1 %.
+        normals_deg: mean angle between the seen known surface and the mesh where it is nearest, 0 to 90: which side a
+            normal points to is ignored.
     """
 
     accuracy: float
@@ -59,6 +62,7 @@ class KnownScore:
     completeness_median: float
     f_half_percent: float
     f_one_percent: float
+    normals_deg: float
 
     def as_dict(self) -> dict[str, float]:
         """Rounded to a thousandth, for JSON and tables."""
@@ -102,20 +106,11 @@ def score_surface(vertices: np.ndarray, faces: np.ndarray, known: KnownObject, s
         ValueError: no predicted surface lies inside the known object's box.
     """
     extent = known.surface.extent
-    low, high = known.vertices.min(0), known.vertices.max(0)
-    points = sample_faces(vertices, faces, samples)[0]
-    points = points[known.counts(points)]
-    if len(points) < samples // 4:
-        # The object is a small part of the mesh: sample it as if it stood alone.
-        in_box = np.all((vertices > low - FACE_MARGIN * extent) & (vertices < high + FACE_MARGIN * extent), 1)
-        near = in_box[faces].all(1)
-        if near.any():
-            points = sample_faces(vertices, faces[near], samples)[0]
-            points = points[known.counts(points)]
-    if len(points) == 0:
-        raise ValueError("no surface of the mesh lies inside the known object's box: is it in the same frame?")
-    predicted, true = Surface(points), Surface(seen_surface(known))
+    predicted = _judged(vertices, faces, known, samples)
+    seen = seen_surface(known)
+    true = Surface(seen, normals=Target(known.surface).nearest(seen).normals)
     found = measure_points(predicted, true, predicted, known.surface, [part * extent for part in SCORE_THRESHOLDS])
+    assert found.completeness_normals is not None
     return KnownScore(
         accuracy=100 * found.accuracy.mean / extent,
         completeness=100 * found.completeness.mean / extent,
@@ -124,7 +119,30 @@ def score_surface(vertices: np.ndarray, faces: np.ndarray, known: KnownObject, s
         completeness_median=100 * found.completeness.median / extent,
         f_half_percent=found.f_scores[0].f_score,
         f_one_percent=found.f_scores[1].f_score,
+        normals_deg=found.completeness_normals.mean_deg,
     )
+
+
+def _judged(vertices: np.ndarray, faces: np.ndarray, known: KnownObject, samples: int) -> Surface:
+    """Points on a predicted mesh that count, with their faces' normals; see `score_surface`."""
+    predicted = _counted(vertices, faces, known, samples)
+    if len(predicted.points) < samples // 4:
+        # The object is a small part of the mesh: sample it as if it stood alone.
+        low, high, margin = known.vertices.min(0), known.vertices.max(0), FACE_MARGIN * known.surface.extent
+        near = np.all((vertices > low - margin) & (vertices < high + margin), 1)[faces].all(1)
+        if near.any():
+            predicted = _counted(vertices, faces[near], known, samples)
+    if len(predicted.points) == 0:
+        raise ValueError("no surface of the mesh lies inside the known object's box: is it in the same frame?")
+    return predicted
+
+
+def _counted(vertices: np.ndarray, faces: np.ndarray, known: KnownObject, samples: int) -> Surface:
+    """Those of points on a mesh, uniform by area, that count."""
+    drawn = draw_points(Surface(vertices, faces), Sampling(samples))
+    assert drawn.normals is not None
+    counts = known.counts(drawn.points)
+    return Surface(drawn.points[counts], normals=drawn.normals[counts])
 
 
 def seen_surface(known: KnownObject) -> np.ndarray:
