@@ -30,6 +30,7 @@ from stages.artifacts import (
     POINT_CLOUD,
     PREVIEWS,
     SCENE,
+    SILHOUETTES,
     Pictures,
 )
 from stages.engine.manifest import load_manifest
@@ -292,6 +293,7 @@ class _Training:
 def _make_trainer(context: StageContext[TrainParams], scene: PosedScene) -> Any:
     from stages.neural.held_out_psnr import left_out
     from stages.neural.sightings import Sightings
+    from stages.neural.silhouettes import Silhouettes
     from stages.neural.trainer import Trainer
     from stages.neural.training_photos import Photos
 
@@ -301,8 +303,11 @@ def _make_trainer(context: StageContext[TrainParams], scene: PosedScene) -> Any:
     photos = Photos(scene.cameras, *images, context.device, ~held_out)
     training = (~held_out).numpy()
     sightings = Sightings.from_scene(scene, context.device, training)
-    dense = Sightings.from_cloud(_cloud(context, scene), scene.cameras.centers, context.device, training)
-    return Trainer(photos, sightings, dense, params, context.device)
+    cloud, outlines = _cloud(context, scene), context.read(SILHOUETTES)
+    dense = Sightings.from_cloud(cloud, scene.cameras.centers, context.device, training)
+    masks = [outlines.mask(name) if use else None for name, use in zip(scene.cameras.names, training, strict=True)]
+    silhouettes = Silhouettes.from_masks(scene.cameras, masks, cloud, context.device)
+    return Trainer(photos, sightings, dense, params, context.device, silhouettes)
 
 
 def _cloud(context: StageContext[TrainParams], scene: PosedScene) -> PointCloud:
@@ -542,10 +547,10 @@ def _last_numbers(metrics: Path) -> dict[str, float]:
 
 TRAIN: Stage[TrainParams] = Stage(
     name="train",
-    version=9,
+    version=10,
     settings=lambda config: config.train,
     run=run,
-    reads=(FIRST_SCENE, PINHOLE_PHOTOS, POINT_CLOUD),
+    reads=(FIRST_SCENE, PINHOLE_PHOTOS, SILHOUETTES, POINT_CLOUD),
     writes=(FIELD, CAMERAS, SCENE, METRICS, PREVIEWS, HELD_OUT),
     continues=True,
     summary="learn a signed distance field and its colours from the posed images",
