@@ -453,28 +453,32 @@ def _start_from_shape(trainer: Any, cameras: PinholeCameras) -> None:
     params = trainer.params.field
     inside = np.linalg.norm(cameras.centers, axis=1) < params.sphere_radius
     if params.init == "hull":
-        error = trainer.start_from(_hull(cameras, trainer.photos))
+        error = trainer.start_from(_hull(cameras, trainer))
         log.info("the SDF starts from the masks' visual hull, met to %.4f on average", error)
     elif params.init == "room" or (params.init == "auto" and inside.mean() > 0.5):
         error = trainer.start_from(room_distances())
         log.info("the SDF starts from a room around the cameras, met to %.4f on average", error)
 
 
-def _hull(cameras: PinholeCameras, photos: Any) -> np.ndarray:
+def _hull(cameras: PinholeCameras, trainer: Any) -> np.ndarray:
     """Signed distances to the visual hull of the masks of the photos that are trained on.
 
     Raises:
         InputError: a photo has no mask, or the masks leave nothing.
     """
-    from stages.geometry.hull import hull_distances
+    from stages.geometry.hull import hull_distances, space_distances
 
     advice = "Give a mask for each photo (`--masks FOLDER`), or start from a sphere: `--set train.field.init=sphere`."
-    if photos.masks is None:
+    photos = trainer.photos
+    if len(trainer.silhouettes):
+        distances = space_distances(trainer.silhouettes.space.cpu().numpy())
+    elif photos.masks is not None:
+        masks = [photos.mask(i) if training else None for i, training in enumerate(photos.training.tolist())]
+        distances = hull_distances(cameras, masks)
+    else:
         raise InputError(
             f"`train.field.init` = hull needs masks for all {len(cameras)} photos, and some have none.", advice
         )
-    masks = [photos.mask(i) if training else None for i, training in enumerate(photos.training.tolist())]
-    distances = hull_distances(cameras, masks)
     if distances is None:
         raise InputError(f"The {len(cameras)} masks have no visual hull within the region of interest.", advice)
     return distances

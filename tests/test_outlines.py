@@ -83,7 +83,7 @@ def test_one_mask_in_five_that_is_shifted_white_or_black_says_less_and_the_other
         masks = [mask if fine else spoil(mask) for mask, fine in zip(balls(views), good, strict=True)]
         found = errors(views, masks)
         assert found.outer[good].max() < 3
-        assert found.inner[good].max() < 3
+        assert found.inner[good].max() < 5
         spoilt = ~good
         if spoil is np.ones_like:
             assert np.isinf(found.inner[spoilt]).all()

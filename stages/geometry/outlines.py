@@ -23,8 +23,10 @@ if TYPE_CHECKING:
 # A point is the object's where it is on the masks of at least this part of the photos that see it, and not where on no
 # more than that part; masks that are too narrow lack a point in all photos that see it from aside. So many must see it.
 OWN, OTHER, MIN_SEEN = 0.5, 0.3, 3
-# Part of a photo's points that may contradict its outline; with fewer points than this all photos' are asked.
+# Part of a photo's points that may contradict its outline; of fewer points than this those of all photos are asked.
 CONTRADICTED, MIN_POINTS = 0.02, 100
+WINDOW = 2.0  # pixels: how far inside an outline is looked for points that are not the object's
+ROUNDS = 2  # masks that say nothing in the first have no vote in the second
 # Pixels: added to each measured error, for pixels have a size; and the error where no points tell of it.
 PIXEL, UNKNOWN = 1.0, 6.0
 # A place is outside the object where more than this part of the photos that see it show it off their outlines.
@@ -70,33 +72,38 @@ def outline_errors(
     Returns:
         Infinite for photos without a mask.
     """
-    errors = OutlineErrors(*np.full((2, len(cameras)), np.inf))
     point = np.repeat(np.arange(len(cloud)), np.diff(cloud.starts))
     deep = _depths_at(cameras, depths, cloud.points, np.stack([cloud.photos, point], 1))
     asked = np.isfinite(deep)
     photo, point, deep = cloud.photos[asked], point[asked], deep[asked]
-    seen = np.bincount(point, minlength=len(cloud))
-    on = np.bincount(point, deep > 0, minlength=len(cloud)) / np.maximum(seen, 1)
-    is_object, is_other = (agreed & (seen >= MIN_SEEN) for agreed in (on >= OWN, on <= OTHER))
-    own, other = is_object[point], is_other[point]
-    together = _errors(deep[own], deep[other])
-    for i in (i for i, depth in enumerate(depths) if depth is not None):
-        here = photo == i
-        few = np.count_nonzero(here & own) < MIN_POINTS
-        errors.outer[i], errors.inner[i] = together if few else _errors(deep[here & own], deep[here & other])
+    believed = np.array([depth is not None for depth in depths])
+    for _ in range(ROUNDS):
+        voting = believed[photo]
+        seen = np.bincount(point[voting], minlength=len(cloud))
+        on = np.bincount(point[voting], deep[voting] > 0, minlength=len(cloud)) / np.maximum(seen, 1)
+        own, other = (which[point] & (seen >= MIN_SEEN)[point] for which in (on >= OWN, on <= OTHER))
+        together = _errors(deep[own & voting], deep[other & voting])
+        errors = OutlineErrors(*np.full((2, len(cameras)), np.inf))
+        for i in (i for i, depth in enumerate(depths) if depth is not None):
+            here = photo == i
+            few = np.count_nonzero(here & (own | other)) < MIN_POINTS
+            errors.outer[i], errors.inner[i] = together if few else _errors(deep[here & own], deep[here & other])
+        believed = (errors.outer < MOST) & (errors.inner < MOST)
     return errors
 
 
 def _errors(own: Float[np.ndarray, " a"], other: Float[np.ndarray, " b"]) -> tuple[float, float]:
     """Outer and inner error by how deep in the masks the object's own points lie, and the other ones."""
-    if len(own) < MIN_POINTS:
+    if not len(own):
         return UNKNOWN, UNKNOWN
     outer = max(0.0, -float(np.quantile(own, CONTRADICTED)))
-    depths = np.arange(0.0, MOST + 1)
-    of_own, of_other = (len(each) - np.searchsorted(np.sort(each), depths) for each in (own, other))
-    right = of_other <= CONTRADICTED * (of_own + of_other)
-    inner = float(depths[right.argmax()]) if right.any() and of_own[right.argmax()] else np.inf
-    return outer + PIXEL, inner + PIXEL
+    tried = np.arange(0.0, MOST + 1)
+    deeper = [len(each) - np.searchsorted(np.sort(each), [tried, tried + WINDOW]) for each in (own, other)]
+    # of all that is deeper in the mask, and of what is so just there
+    right = [of_other <= CONTRADICTED * (of_own + of_other) for of_own, of_other in zip(*deeper, strict=True)]
+    just = [begin - end for begin, end in deeper]
+    right = right[0] & (just[1] <= CONTRADICTED * (just[0] + just[1]))
+    return outer + PIXEL, float(tried[right.argmax()]) + PIXEL if right.any() else np.inf
 
 
 def _depths_at(
