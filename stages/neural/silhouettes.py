@@ -66,7 +66,9 @@ class Silhouettes:
     def none(device: torch.device | str) -> Silhouettes:
         """Of photos without outlines."""
         nothing = torch.zeros(0, 3, device=device)
-        return Silhouettes(nothing, nothing[:, 0].long(), nothing, torch.zeros(1, 1, 1, dtype=torch.bool, device=device))
+        return Silhouettes(
+            nothing, nothing[:, 0].long(), nothing, torch.zeros(1, 1, 1, dtype=torch.bool, device=device)
+        )
 
     @staticmethod
     def from_masks(
@@ -137,7 +139,7 @@ class Silhouettes:
 def _pixels(
     depths: Sequence[Float[np.ndarray, "_ _"] | None], inner: Float[np.ndarray, " i"]
 ) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, "m 2"]]:
-    """Photos and pixels (x, y) that are surely of the object: so many of each photo, a part of them near its outline."""
+    """Photos and pixels (x, y) that are surely of the object: as many of each photo, a part near its outline."""
     generator = np.random.default_rng(0)
     most = MOST_LINES // max(len(depths), 1)
     photos, pixels = [np.zeros(0, np.int64)], [np.zeros((0, 2), np.int64)]

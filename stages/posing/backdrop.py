@@ -48,9 +48,7 @@ def _features(photo: Any) -> tuple[Float[np.ndarray, "f 2"], Bool[np.ndarray, " 
     return places, np.array([feature.has_point3D() for feature in photo.points2D], bool)
 
 
-def _near(
-    mask: Shaped[np.ndarray, "h w"], camera: Any, places: Float[np.ndarray, "f 2"]
-) -> Bool[np.ndarray, " f"]:
+def _near(mask: Shaped[np.ndarray, "h w"], camera: Any, places: Float[np.ndarray, "f 2"]) -> Bool[np.ndarray, " f"]:
     """Which places in a photo lie on its mask or near it."""
     height, width = mask.shape
     reach = max(1, round(NEAR * max(height, width)))
