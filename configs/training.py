@@ -104,7 +104,7 @@ class LossParams(Section):
     silhouette: float = Field(
         1.0, ge=0, description="weight of the outlines' term, where whole photos count beside the masks"
     )
-    silhouette_batch: int = Field(128, ge=0, description="lines of sight on masks per step, for that term")
+    silhouette_batch: int = Field(256, ge=0, description="lines of sight on masks per step, for that term")
     exposure: float = Field(0.1, ge=0, description="weight that holds the photos' gains at 1")
     sparse: float = Field(1.0, ge=0, description="weight of the SfM points' terms, faded out")
     sparse_until: float = Field(0.8, ge=0, le=1, description="progress at which the SfM points' term is gone")

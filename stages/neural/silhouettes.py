@@ -1,12 +1,12 @@
 """What outlines say beside the photos' colours: a line of sight on the mask is free until it comes to where the object
 may be, and meets it there.
 
-Shapes: M lines of sight, S of them drawn for a step, K places on each.
+Shapes: M lines of sight, S of them drawn for a step, K places of the walk along each.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -25,9 +25,7 @@ if TYPE_CHECKING:
 
 # Lines that are kept to be drawn from, and which part of them runs this near inside the outline, pixels.
 MOST_LINES, RIM_SHARE, RIM = 1 << 20, 0.5, 4.0
-# Places on each line where something of the object must be.
-WITHIN = 7
-# Steps of the walk through the grid: two for three of its cells along the sphere's diameter.
+# Steps of the walk along a line: two for three cells of the object's space along the sphere's diameter.
 WALK = 128
 
 
@@ -35,7 +33,7 @@ class Drawn(NamedTuple):
     """Lines of a step.
 
     Attributes:
-        places: for each line one that is free, then `WITHIN` of which one is in the object.
+        places: three on each: two that are free, then one that is in the object.
         known: which lines come to where the object may be, and do not begin there.
     """
 
@@ -97,43 +95,40 @@ class Silhouettes:
         of_photos, ways = (torch.from_numpy(each).to(device) for each in (photos, directions))
         return Silhouettes(origins, of_photos, ways, torch.from_numpy(space).to(device))
 
-    def draw(self, count: int, step: float, generator: torch.Generator) -> Drawn:
+    def draw(self, count: int, step: float, lookup: Callable[[Tensor], Tensor], generator: torch.Generator) -> Drawn:
         """Places along S random lines; S is at most `count`.
 
-        One is free: between the unit sphere and a `step` (scene units) before where the object may begin. The others
-        lie evenly, but for chance, where the object may be.
+        Free are a random place between the unit sphere and a `step` (scene units) before where the object may begin,
+        and that of the smallest f there. In the object is that of the smallest f where it may be: what is there
+        already is found, however thin, and nothing is asked for beside it.
+
+        Args:
+            lookup: places [s, k, 3] -> f [s, k] as it is known, without gradient.
         """
         total, device = len(self.photos), self.directions.device
         count = min(count, total)
         chosen = torch.randint(max(total, 1), (count,), generator=generator, device=device)
-        chance = torch.rand(count, 1 + WITHIN, generator=generator, device=device)
+        chance = torch.rand(count, 2, generator=generator, device=device)
         origins, directions = self.origins[self.photos[chosen]], self.directions[chosen]
         entry, leave, crosses = intersect_unit_sphere(origins, directions)
-        first, last, met = self._walk(origins, directions, entry, leave)
-        free = entry + chance[:, 0] * (first - step - entry).clamp(min=0)
-        part = (torch.arange(WITHIN, device=device) + chance[:, 1:]) / WITHIN
-        within = first[:, None] + part * (last - first)[:, None]
-        along = torch.cat([free[:, None], within], 1).T.reshape(-1, 1)
-        places = origins.repeat(1 + WITHIN, 1) + along * directions.repeat(1 + WITHIN, 1)
-        return Drawn(places, crosses & met & (first - step > entry))
-
-    def _walk(
-        self,
-        origins: Float[Tensor, "s 3"],
-        directions: Float[Tensor, "s 3"],
-        entry: Float[Tensor, " s"],
-        leave: Float[Tensor, " s"],
-    ) -> tuple[Float[Tensor, " s"], Float[Tensor, " s"], Bool[Tensor, " s"]]:
-        """Distances at which lines come to the object's space and leave it for the last time; and whether they do."""
-        step = (leave - entry)[:, None] / WALK
-        along = entry[:, None] + (torch.arange(WALK, device=origins.device) + 0.5) * step
+        width = (leave - entry)[:, None] / WALK
+        along = entry[:, None] + (torch.arange(WALK, device=device) + chance[:, :1]) * width
         places = origins[:, None] + along[..., None] * directions[:, None]
+        inside = self._inside(places)
+        first = torch.gather(along, 1, inside.long().argmax(1, keepdim=True)) - step
+        free = along < first
+        sdf = lookup(places)
+        worst, best = (sdf.masked_fill(~where, torch.inf).argmin(1) for where in (free, inside))
+        anywhere = (chance[:, 1] * free.sum(1)).long()
+        rows = torch.arange(count, device=device)
+        chosen_places = torch.cat([places[rows, column] for column in (anywhere, worst, best)])
+        return Drawn(chosen_places, crosses & inside.any(1) & free.any(1))
+
+    def _inside(self, places: Float[Tensor, "s k 3"]) -> Bool[Tensor, "s k"]:
+        """Whether the object may be there."""
         side = len(self.space)
         x, y, z = ((places + 1) * (0.5 * side)).long().clamp(0, side - 1).unbind(2)
-        inside = self.space[x, y, z]
-        first, last = inside.long().argmax(1), WALK - 1 - inside.flip(1).long().argmax(1)
-        ends = torch.gather(along, 1, torch.stack([first, last], 1))
-        return ends[:, 0] - 0.5 * step[:, 0], ends[:, 1] + 0.5 * step[:, 0], inside.any(1)
+        return self.space[x, y, z]
 
 
 def _pixels(
@@ -159,11 +154,10 @@ def _pixels(
 def outline_loss(sdf: Float[Tensor, " places"], known: Bool[Tensor, " s"], margin: float) -> Float[Tensor, ""]:
     """Mean error of f at the places of `Silhouettes.draw`: free before the object's space, and met within it.
 
-    max(0, margin - f) where the line is free, and max(0, min f + margin) over the places within: zero where any of
-    them is solid.
+    max(0, margin - f) at the free ones, and max(0, f + margin) at the one in the object: zero where it is solid.
     """
     if not len(known):
         return sdf.sum()
-    free, within = sdf[: len(known)], sdf[len(known) :].view(WITHIN, len(known))
-    error = losses.outside_error(free, margin) + losses.inside_error(within.amin(0), margin)
-    return (known * error).mean()
+    anywhere, worst, best = sdf.view(3, len(known))
+    free = losses.outside_error(anywhere, margin) + losses.outside_error(worst, margin)
+    return (known * (free + losses.inside_error(best, margin))).mean()

@@ -163,7 +163,9 @@ class Trainer:
         sparse = self.sightings.draw(weights.sparse_batch, weights.sparse_step, self.generator)
         dense = self.dense.draw(weights.dense_batch, weights.dense_step, self.generator)
         anywhere = torch.rand(sampling.free_points, 3, generator=self.generator, device=self.device) * 2 - 1
-        outlines = self.silhouettes.draw(weights.silhouette_batch, weights.dense_step, self.generator)
+        outlines = self.silhouettes.draw(
+            weights.silhouette_batch, weights.dense_step, self.cache.lookup, self.generator
+        )
         extra = torch.cat([sparse.places, dense.places, outlines.places, anywhere])
         rendered = self.renderer.render(batch, moment, extra, self.generator)
         exposed = rendered.colors * torch.exp(self.fields.log_gains[batch.images])
