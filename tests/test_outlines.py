@@ -6,8 +6,11 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from ball_training import TINY, make_trainer
 from sphere_scene import RADIUS, render, ring_of_cameras, sphere_cloud
+from train_settings import changed
 
+from stages import train
 from stages.geometry.cameras import PinholeCameras
 from stages.geometry.outlines import PIXEL, UNKNOWN, mask_depth, object_space, outline_errors
 from stages.geometry.point_cloud import PointCloud
@@ -159,6 +162,40 @@ def test_what_is_before_the_object_is_pushed_away_and_what_is_missing_pulled_in(
     outline_loss(solid, known, 0.1).backward()
     assert solid.grad is not None
     assert solid.grad.tolist() == [-0.5, 0, -0.5, 0, 0, 0]
+
+
+@pytest.mark.slow
+def test_outlines_shrink_what_is_too_large():
+    """The term reaches the shape: with nothing else to say where the ball ends, f grows before its outlines."""
+    views = ring_of_cameras()
+    silhouettes = Silhouettes.from_masks(views, balls(views), PointCloud.empty(), "cpu")
+
+    def after(weight: float) -> tuple[float, float]:
+        settings = {"losses.silhouette": weight, "losses.dense": 0.0, "losses.sparse": 0.0, "field.sphere_radius": 0.9}
+        trainer = make_trainer(changed(TINY, settings))
+        trainer.silhouettes = silhouettes
+        losses = [float(trainer.step(i / 120)["silhouette"]) for i in range(60)]
+        drawn = silhouettes.draw(256, 0.01, trainer.cache.lookup, torch.Generator().manual_seed(0))
+        with torch.no_grad():
+            return losses[0], float(trainer.fields.sdf.sdf(drawn.places, 4)[:512].mean())
+
+    (first, pushed), (_, left) = after(3.0), after(0.0)
+    assert first > 0.05
+    assert pushed > left + 0.1
+
+
+@pytest.mark.slow
+def test_training_starts_from_the_outlines_where_it_is_told_to():
+    views = ring_of_cameras()
+    trainer = make_trainer(changed(TINY, {"field.sphere_radius": 0.8, "field.init": "hull"}))
+    trainer.silhouettes = Silhouettes.from_masks(views, balls(views), PointCloud.empty(), "cpu")
+    train._start_from_shape(trainer, views)
+    ways = torch.nn.functional.normalize(torch.randn(200, 3, generator=torch.Generator().manual_seed(0)), dim=1)
+    with torch.no_grad():
+        levels = trainer.moment(0.0).levels
+        assert trainer.fields.sdf.sdf((RADIUS - 0.1) * ways, levels).max() < 0
+        # the outlines are believed to 6 pixels, half of the ball's radius
+        assert trainer.fields.sdf.sdf(0.95 * ways, levels).median() > 0.1
 
 
 def test_photos_without_masks_have_no_lines():

@@ -16,7 +16,7 @@ NEAR = 0.01
 # Off the masks a photo has so many features that are points of the model, in the mean; and they are as large a part of
 # the features there: of backgrounds that stood still 41 to 49 % are (three made-up sets), of a black cloth 5 %
 # (dtu_scan24, 2 a photo), of a room that did not turn with the object next to none.
-MIN_POINTS, MIN_SHARE = 20.0, 0.2
+MIN_POINTS, MIN_SHARE = 20.0, 0.25
 
 
 def stands_still(
