@@ -107,14 +107,14 @@ def test_without_points_an_outline_may_be_off_by_a_few_pixels_and_photos_without
 def test_the_object_may_be_where_its_outlines_meet_with_their_error_around_them():
     views = cameras()
     depths = [mask_depth(mask) for mask in balls(views)]
-    space = object_space(views, depths, np.full(len(views), PIXEL), 48)
-    centers = (np.indices(space.shape).reshape(3, -1).T + 0.5) * (2 / 48) - 1
+    space = object_space(views, depths, np.full(len(views), PIXEL), 64)
+    centers = (np.indices(space.shape).reshape(3, -1).T + 0.5) * (2 / 64) - 1
     away = np.linalg.norm(centers, axis=1).reshape(space.shape)
     assert space[away < RADIUS].all()
     assert not space[(away > 1.45 * RADIUS)].any()
     # one mask that shows nothing there does not cut it
     depths[3] = mask_depth(np.zeros_like(balls(views)[3]))
-    assert object_space(views, depths, np.full(len(views), PIXEL), 48)[away < RADIUS].all()
+    assert object_space(views, depths, np.full(len(views), PIXEL), 64)[away < RADIUS].all()
 
 
 def lines_of(masks: list[np.ndarray] | None = None) -> Silhouettes:

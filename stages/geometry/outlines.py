@@ -25,16 +25,17 @@ if TYPE_CHECKING:
 OWN, OTHER, MIN_SEEN = 0.5, 0.3, 3
 # Part of a photo's points that may contradict its outline; of fewer points than this those of all photos are asked.
 CONTRADICTED, MIN_POINTS = 0.02, 100
+THICK = 4.0  # pixels: half of the width from which points beside a part of the object are asked
 WINDOW = 2.0  # pixels: how far inside an outline is looked for points that are not the object's
 ROUNDS = 2  # masks that say nothing in the first have no vote in the second
-# Pixels: added to each measured error, for pixels have a size; and the error where no points tell of it.
+# Pixels: added to a measured outer error, for pixels have a size; and the error where no points tell of it.
 PIXEL, UNKNOWN = 1.0, 6.0
 # A place is outside the object where more than this part of the photos that see it show it off their outlines.
 OUTSIDE = 0.1
 MOST = 24.0  # pixels of an inner error that are tried; masks that are off by more say nothing
-# Side of the grid of places, and of the coarse one that it is refined from: 1 % of the region's radius, two pixels of
-# a photo of 640 x 480 that shows it whole.
-CELLS, COARSE = 192, 48
+# Side of the grid of places, and of the coarse one that it is refined from: 0.8 % of the region's radius, one to two
+# pixels of a photo of 640 x 480 that shows it whole.
+CELLS, COARSE = 256, 32
 
 
 @dataclass(frozen=True)
@@ -73,15 +74,18 @@ def outline_errors(
         Infinite for photos without a mask.
     """
     point = np.repeat(np.arange(len(cloud)), np.diff(cloud.starts))
-    deep = _depths_at(cameras, depths, cloud.points, np.stack([cloud.photos, point], 1))
+    lines = np.stack([cloud.photos, point], 1)
+    deep = _depths_at(cameras, depths, cloud.points, lines)
+    wide = _depths_at(cameras, [None if depth is None else _widest(depth) for depth in depths], cloud.points, lines)
     asked = np.isfinite(deep)
-    photo, point, deep = cloud.photos[asked], point[asked], deep[asked]
+    photo, point, deep, wide = cloud.photos[asked], point[asked], deep[asked], wide[asked]
     believed = np.array([depth is not None for depth in depths])
     for _ in range(ROUNDS):
         voting = believed[photo]
         seen = np.bincount(point[voting], minlength=len(cloud))
         on = np.bincount(point[voting], deep[voting] > 0, minlength=len(cloud)) / np.maximum(seen, 1)
         own, other = (which[point] & (seen >= MIN_SEEN)[point] for which in (on >= OWN, on <= OTHER))
+        other &= wide > THICK
         together = _errors(deep[own & voting], deep[other & voting])
         errors = OutlineErrors(*np.full((2, len(cameras)), np.inf))
         for i in (i for i, depth in enumerate(depths) if depth is not None):
@@ -103,7 +107,16 @@ def _errors(own: Float[np.ndarray, " a"], other: Float[np.ndarray, " b"]) -> tup
     right = [of_other <= CONTRADICTED * (of_own + of_other) for of_own, of_other in zip(*deeper, strict=True)]
     just = [begin - end for begin, end in deeper]
     right = right[0] & (just[1] <= CONTRADICTED * (just[0] + just[1]))
-    return outer + PIXEL, float(tried[right.argmax()]) + PIXEL if right.any() else np.inf
+    return outer + PIXEL, float(tried[right.argmax()]) if right.any() else np.inf
+
+
+def _widest(depth: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
+    """How deep the mask is nearby: what stereo misses beside thin parts is no error of theirs."""
+    import cv2
+
+    reach = 2 * int(THICK) + 1
+    widest: np.ndarray = cv2.dilate(depth, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach)))
+    return widest
 
 
 def _depths_at(
@@ -146,14 +159,16 @@ def object_space(
 ) -> Bool[np.ndarray, "{cells} {cells} {cells}"]:
     """Where the object may be: cells of a grid over [-1, 1]^3 that hardly any photo shows off its outline.
 
-    A cell counts as off where all of it is, further than `outer` pixels. What no photo shows may be the object. None is
+    A cell counts as off where its middle half is, further than `outer` pixels. What no photo shows may be the object. None is
     outside the unit sphere. Axes are x, y, z.
     """
     ratio = cells // COARSE
-    space = _carved(cameras, depths, outer, _centers(np.indices([COARSE] * 3).reshape(3, -1).T, COARSE), COARSE)
+    diagonal = np.sqrt(3.0) / cells  # half of it
+    coarse = _centers(np.indices([COARSE] * 3).reshape(3, -1).T, COARSE)
+    space = _carved(cameras, depths, outer, coarse, np.sqrt(3.0) / COARSE)
     rough = np.argwhere(space.reshape([COARSE] * 3))
     fine = (rough[:, None] * ratio + np.indices([ratio] * 3).reshape(3, -1).T).reshape(-1, 3)
-    kept = fine[_carved(cameras, depths, outer, _centers(fine, cells), cells)]
+    kept = fine[_carved(cameras, depths, outer, _centers(fine, cells), 0.5 * diagonal)]
     found = np.zeros([cells] * 3, bool)
     found[tuple(kept.T)] = True
     return found
@@ -168,11 +183,10 @@ def _carved(
     depths: Sequence[Float32[np.ndarray, "_ _"] | None],
     outer: Float[np.ndarray, " i"],
     centers: Float32[np.ndarray, "c 3"],
-    cells: int,
+    reach: float,
 ) -> Bool[np.ndarray, " c"]:
-    """Which cells at these centres may be of the object."""
-    half = np.sqrt(3.0) / cells  # of a cell's diagonal
-    kept = np.flatnonzero(np.linalg.norm(centers, axis=1) < 1 + half)
+    """Which places may be of the object, by what is off all around them, this far (scene units)."""
+    kept = np.flatnonzero(np.linalg.norm(centers, axis=1) < 1 + reach)
     seen, off = np.zeros((2, len(centers)), np.int16)
     saying = [i for i, depth in enumerate(depths) if depth is not None and np.isfinite(outer[i])]
     for done, i in enumerate(saying, 1):
@@ -180,7 +194,7 @@ def _carved(
         assert depth is not None
         deep, scale = _looked_up(cameras, i, centers[kept], depth)
         seen[kept] += np.isfinite(deep)
-        off[kept] += deep < -outer[i] - half * scale
+        off[kept] += deep < -outer[i] - reach * scale
         most = seen[kept] + len(saying) - done  # photos that show it, if all that are left do
         kept = kept[off[kept] <= OUTSIDE * most]
     inside = np.zeros(len(centers), bool)
