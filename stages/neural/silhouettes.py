@@ -154,10 +154,11 @@ def _pixels(
 def outline_loss(sdf: Float[Tensor, " places"], known: Bool[Tensor, " s"], margin: float) -> Float[Tensor, ""]:
     """Mean error of f at the places of `Silhouettes.draw`: free before the object's space, and met within it.
 
-    max(0, margin - f) at the free ones, and max(0, f + margin) at the one in the object: zero where it is solid.
+    max(0, margin - f) at the free ones, and max(0, f) at the one in the object: zero where the line touches it, for a
+    line near the outline does no more.
     """
     if not len(known):
         return sdf.sum()
     anywhere, worst, best = sdf.view(3, len(known))
     free = losses.outside_error(anywhere, margin) + losses.outside_error(worst, margin)
-    return (known * (free + losses.inside_error(best, margin))).mean()
+    return (known * (free + losses.inside_error(best, 0.0))).mean()
