@@ -159,8 +159,8 @@ def object_space(
 ) -> Bool[np.ndarray, "{cells} {cells} {cells}"]:
     """Where the object may be: cells of a grid over [-1, 1]^3 that hardly any photo shows off its outline.
 
-    A cell counts as off where its middle half is, further than `outer` pixels. What no photo shows may be the object. None is
-    outside the unit sphere. Axes are x, y, z.
+    A cell counts as off where its middle half is, further than `outer` pixels. What no photo shows may be the object.
+    None is outside the unit sphere. Axes are x, y, z.
     """
     ratio = cells // COARSE
     diagonal = np.sqrt(3.0) / cells  # half of it
