@@ -229,7 +229,7 @@ class CleanupParams(Section):
         ge=0,
         le=1,
         description="a face is outside if it lies off the mask in more than this part of the photos; at least 0.3 "
-        "where masks were guessed (`ingest.auto_mask=salient`)",
+        "where whole photos count beside the masks (a background that stood still; `ingest.auto_mask=salient`)",
     )
 
 

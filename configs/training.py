@@ -40,7 +40,7 @@ class FieldParams(Section):
         description="the SDF before training: that sphere, a room around the cameras, or the visual hull of masks (one "
         "for each photo); auto: a room where most cameras stand in that sphere, else it",
     )
-    background: bool = Field(True, description="model what lies outside the region (never where masks exist)")
+    background: bool = Field(True, description="model what lies outside the region (never where the masks alone count)")
     background_log2_rows: int = Field(15, ge=8, le=24, description="rows per level of the background's encoding")
 
 
@@ -105,7 +105,11 @@ class LossParams(Section):
     """What a step lowers besides the colour error, each by its weight."""
 
     eikonal: float = Field(0.1, ge=0, description="weight of the Eikonal term")
-    mask: float = Field(0.1, ge=0, description="weight of the mask term, where masks exist")
+    mask: float = Field(0.1, ge=0, description="weight of the mask term, where the masks alone count")
+    silhouette: float = Field(
+        1.0, ge=0, description="weight of the outlines' term, where whole photos count beside the masks"
+    )
+    silhouette_batch: int = Field(256, ge=0, description="lines of sight on masks per step, for that term")
     exposure: float = Field(0.1, ge=0, description="weight that holds the photos' gains at 1")
     gloss: float = Field(
         0.01, ge=0, description="weight of what is not shaded in the colours; a twentieth where photos deny each other"

@@ -35,11 +35,11 @@ UNDER_TOLERANCES = 2.0
 # Specks below this part of `min_component` go before anything is measured. The rest waits until the unseen is gone:
 # a background shell may be the largest piece.
 SPECK = 0.1
-# Guessed masks, even those that agree, lack a part now and then: of the metal cow 0.15 lost 2 % of the surface and this
-# nothing, with as little of the table left (docs/benchmarks/auto-masks.md).
-GUESSED_OUTSIDE = 0.3
-# What this part of the photos that see it shows on guessed masks stays: see `shown_on_masks`.
-GUESSED_SHOWN = 0.3
+# Masks of whole photos may lack a part now and then: of the metal cow, whose masks were guessed, 0.15 lost 2 % of the
+# surface and this nothing, with as little of the table left (docs/benchmarks/auto-masks.md).
+BESIDE_OUTSIDE = 0.3
+# What this part of the photos that see it shows on such masks stays: see `shown_on_masks`.
+BESIDE_SHOWN = 0.3
 
 
 def _masks(folders: Sequence[Pictures], cameras: PinholeCameras, margin: int) -> Iterator[tuple[int, np.ndarray]]:
@@ -87,8 +87,8 @@ def run(context: StageContext[CleanupParams]) -> dict[str, Any]:
     large, numbers["specks_dropped"] = selection.large_pieces(faces, SPECK * params.min_component)
     keep(large, "speck_faces", "Try `--set cleanup.min_component=0`.")
     if params.mask_hull:
-        given, guessed = context.read(PINHOLE_PHOTOS), context.read(SILHOUETTES)
-        outside = _outside_masks(vertices, faces, cameras, given, guessed, params)
+        alone, beside = context.read(PINHOLE_PHOTOS), context.read(SILHOUETTES)
+        outside = _outside_masks(vertices, faces, cameras, alone, beside, params)
         within = np.count_nonzero(outside[faces], axis=1) < 2
         keep(
             selection.whole_pieces(faces, within) if params.keep_closed else within,
@@ -141,18 +141,18 @@ def _outside_masks(
     vertices: np.ndarray,
     faces: np.ndarray,
     cameras: PinholeCameras,
-    given: Pictures,
-    guessed: Pictures,
+    alone: Pictures,
+    beside: Pictures,
     params: CleanupParams,
 ) -> np.ndarray:
-    """Vertices [V] bool that are off too many masks; guessed ones do not cut what enough photos show on them."""
+    """Vertices [V] bool that are off too many masks; those beside whole photos do not cut what enough show on them."""
     from stages.surface import selection
 
-    masks = partial(_masks, [given, guessed], cameras)
-    most = max(params.mask_outside, GUESSED_OUTSIDE) if guessed.masks.exists() else params.mask_outside
+    masks = partial(_masks, [alone, beside], cameras)
+    most = max(params.mask_outside, BESIDE_OUTSIDE) if beside.masks.exists() else params.mask_outside
     outside = selection.outside_hull(vertices, cameras, masks(params.mask_margin), most)
-    if guessed.masks.exists():  # no margin: the table shows in it
-        outside &= ~selection.shown_on_masks(vertices, faces, cameras, masks(0), outside, GUESSED_SHOWN)
+    if beside.masks.exists():  # no margin: the table shows in it
+        outside &= ~selection.shown_on_masks(vertices, faces, cameras, masks(0), outside, BESIDE_SHOWN)
     return outside
 
 

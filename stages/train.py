@@ -31,6 +31,7 @@ from stages.artifacts import (
     POINT_CLOUD,
     PREVIEWS,
     SCENE,
+    SILHOUETTES,
     Pictures,
 )
 from stages.engine.manifest import load_manifest
@@ -296,6 +297,7 @@ class _Training:
 def _make_trainer(context: StageContext[TrainParams], scene: PosedScene) -> Any:
     from stages.neural.held_out_psnr import left_out
     from stages.neural.sightings import Sightings
+    from stages.neural.silhouettes import Silhouettes
     from stages.neural.trainer import Trainer
     from stages.neural.training_photos import Photos
 
@@ -305,8 +307,11 @@ def _make_trainer(context: StageContext[TrainParams], scene: PosedScene) -> Any:
     photos = Photos(scene.cameras, *images, context.device, ~held_out)
     training = (~held_out).numpy()
     sightings = Sightings.from_scene(scene, context.device, training)
-    dense = Sightings.from_cloud(_cloud(context, scene), scene.cameras.centers, context.device, training)
-    return Trainer(photos, sightings, dense, params, context.device, _doubt(context, scene))
+    cloud, outlines = _cloud(context, scene), context.read(SILHOUETTES)
+    dense = Sightings.from_cloud(cloud, scene.cameras.centers, context.device, training)
+    masks = [outlines.mask(name) if use else None for name, use in zip(scene.cameras.names, training, strict=True)]
+    silhouettes = Silhouettes.from_masks(scene.cameras, masks, cloud, context.device)
+    return Trainer(photos, sightings, dense, params, context.device, silhouettes, _doubt(context, scene))
 
 
 def _doubt(context: StageContext[TrainParams], scene: PosedScene) -> Doubt:
@@ -461,28 +466,32 @@ def _start_from_shape(trainer: Any, cameras: PinholeCameras) -> None:
     params = trainer.params.field
     inside = np.linalg.norm(cameras.centers, axis=1) < params.sphere_radius
     if params.init == "hull":
-        error = trainer.start_from(_hull(cameras, trainer.photos))
+        error = trainer.start_from(_hull(cameras, trainer))
         log.info("the SDF starts from the masks' visual hull, met to %.4f on average", error)
     elif params.init == "room" or (params.init == "auto" and inside.mean() > 0.5):
         error = trainer.start_from(room_distances())
         log.info("the SDF starts from a room around the cameras, met to %.4f on average", error)
 
 
-def _hull(cameras: PinholeCameras, photos: Any) -> np.ndarray:
+def _hull(cameras: PinholeCameras, trainer: Any) -> np.ndarray:
     """Signed distances to the visual hull of the masks of the photos that are trained on.
 
     Raises:
         InputError: a photo has no mask, or the masks leave nothing.
     """
-    from stages.geometry.hull import hull_distances
+    from stages.geometry.hull import hull_distances, space_distances
 
     advice = "Give a mask for each photo (`--masks FOLDER`), or start from a sphere: `--set train.field.init=sphere`."
-    if photos.masks is None:
+    photos = trainer.photos
+    if len(trainer.silhouettes):
+        distances = space_distances(trainer.silhouettes.space.cpu().numpy())
+    elif photos.masks is not None:
+        masks = [photos.mask(i) if training else None for i, training in enumerate(photos.training.tolist())]
+        distances = hull_distances(cameras, masks)
+    else:
         raise InputError(
             f"`train.field.init` = hull needs masks for all {len(cameras)} photos, and some have none.", advice
         )
-    masks = [photos.mask(i) if training else None for i, training in enumerate(photos.training.tolist())]
-    distances = hull_distances(cameras, masks)
     if distances is None:
         raise InputError(f"The {len(cameras)} masks have no visual hull within the region of interest.", advice)
     return distances
@@ -558,7 +567,7 @@ TRAIN: Stage[TrainParams] = Stage(
     version=10,
     settings=lambda config: config.train,
     run=run,
-    reads=(FIRST_SCENE, PINHOLE_PHOTOS, DEPTH_MAPS, POINT_CLOUD),
+    reads=(FIRST_SCENE, PINHOLE_PHOTOS, DEPTH_MAPS, SILHOUETTES, POINT_CLOUD),
     writes=(FIELD, CAMERAS, SCENE, METRICS, PREVIEWS, HELD_OUT),
     continues=True,
     summary="learn a signed distance field and its colours from the posed images",

@@ -41,6 +41,7 @@ from stages.geometry.region import RegionOfInterest
 from stages.geometry.silhouettes import MIN_SHARE, agreeing, silhouette_agreement
 from stages.geometry.similarity import Similarity
 from stages.geometry.subjects import Subject, find_subjects
+from stages.posing.backdrop import stands_still
 from stages.posing.undistortion import (
     plan_warp,
     png_names,
@@ -67,10 +68,12 @@ def run(context: StageContext[UndistortParams]) -> dict[str, Any]:
     names = png_names([photo.name for photo in photos])
     records = {record.name: record for record in context.read(IMAGE_SET).images}
     guessed = [records[photo.name].made_mask == "salient" for photo in photos]
-    masks = _warp_all(context, model, photos, names, warps, guessed)
+    masks = _warp_all(context, model, photos, names, warps)
 
     cameras = posed_cameras(photos, names, warps)
-    masks = _without_doubtful(context, cameras, masks, guessed)
+    masks = _without_doubtful(cameras, masks, guessed)
+    still = stands_still(model, photos, context.read(PHOTOS).mask)
+    _write_masks(context, names, masks, [still or guess for guess in guessed])
     points, errors, observations = sparse_points(model, photos)
     known, given = context.read(GIVEN_POSES), context.read(GIVEN_REGION)
     stated = known.region if known else None
@@ -109,6 +112,7 @@ def run(context: StageContext[UndistortParams]) -> dict[str, Any]:
         "width": int(scene.cameras.sizes[:, 0].max()),
         "height": int(scene.cameras.sizes[:, 1].max()),
         "masks": sum(mask is not None for mask in masks),
+        **({"background_still": still} if any(mask is not None for mask in masks) else {}),
         **({"masks_dropped": sum(guessed) - _count(masks, guessed)} if any(guessed) else {}),
         "kind": scene.kind,
         "region_from": region.source,
@@ -129,9 +133,8 @@ def _warp_all(
     photos: list[Any],
     names: list[str],
     warps: dict[int, Any],
-    guessed: Sequence[bool],
 ) -> list[np.ndarray | None]:
-    """Write all pinhole images, and masks that are not guessed; all masks [H, W] uint8, None where there is none."""
+    """Write all pinhole images; all masks [H, W] uint8, None where there is none."""
     import cv2
 
     taken, written = context.read(PHOTOS), context.to_write(PINHOLE_PHOTOS)
@@ -143,18 +146,16 @@ def _warp_all(
 
     done = 0
 
-    def warp(job: tuple[str, str, int, bool]) -> np.ndarray | None:
-        """Writes one image and its mask; returns the mask."""
+    def warp(job: tuple[str, str, int]) -> np.ndarray | None:
+        """Writes one image; returns its mask."""
         nonlocal done
-        source, name, camera_id, is_guess = job
+        source, name, camera_id = job
         maps = maps_of(camera_id)
         pixels = warp_image(taken.image(source), warps[camera_id], maps, cv2.INTER_CUBIC)
         write_png(written.path(name), pixels, PNG_COMPRESSION)
         mask = taken.mask(source)
         if mask is not None:
             mask = warp_mask(mask, warps[camera_id], maps, context.params.mask_erode)
-            if not is_guess:
-                write_png(written.mask_path(name), mask, PNG_COMPRESSION)
         done += 1
         context.progress(done, len(photos) + 1, source)
         return mask
@@ -164,18 +165,28 @@ def _warp_all(
     try:
         with ThreadPoolExecutor(max_workers=max(1, context.workers)) as pool:
             sources, lenses = [photo.name for photo in photos], [photo.camera_id for photo in photos]
-            return list(pool.map(warp, zip(sources, names, lenses, guessed, strict=True)))
+            return list(pool.map(warp, zip(sources, names, lenses, strict=True)))
     finally:
         cv2.setNumThreads(before)
 
 
-def _without_doubtful(
+def _write_masks(
     context: StageContext[UndistortParams],
-    cameras: PinholeCameras,
-    masks: list[np.ndarray | None],
-    guessed: Sequence[bool],
+    names: list[str],
+    masks: Sequence[np.ndarray | None],
+    beside: Sequence[bool],
+) -> None:
+    """Write the masks [H, W] uint8; those that only say where the object ends, `beside` the whole photo, apart."""
+    alone, also = context.to_write(PINHOLE_PHOTOS), context.to_write(SILHOUETTES)
+    for name, mask, is_beside in zip(names, masks, beside, strict=True):
+        if mask is not None:
+            write_png((also if is_beside else alone).mask_path(name), mask, PNG_COMPRESSION)
+
+
+def _without_doubtful(
+    cameras: PinholeCameras, masks: list[np.ndarray | None], guessed: Sequence[bool]
 ) -> list[np.ndarray | None]:
-    """The masks [H, W] uint8 less the guesses that do not fit the others'; the guesses that do are written."""
+    """The masks [H, W] uint8 less the guesses that do not fit the others'."""
     if not any(guessed):
         return masks
     believed = agreeing(silhouette_agreement(cameras, masks))
@@ -189,10 +200,6 @@ def _without_doubtful(
         )  # fmt: skip
     elif count < total:
         log.warning("%d of %d masks that were made do not fit the others and are not used", total - count, total)
-    written = context.to_write(SILHOUETTES)
-    for name, mask, guess in zip(cameras.names, kept, guessed, strict=True):
-        if guess and mask is not None:
-            write_png(written.mask_path(name), mask, PNG_COMPRESSION)
     return kept
 
 
@@ -289,7 +296,7 @@ def _frame(context: StageContext[UndistortParams], lineage: str, found: Similari
 
 UNDISTORT: Stage[UndistortParams] = Stage(
     name="undistort",
-    version=10,
+    version=11,
     settings=lambda config: config.undistort,
     run=run,
     reads=(PHOTOS, IMAGE_SET, MODEL, PHOTO_CONTENTS, GIVEN_POSES, GIVEN_REGION),

@@ -5,7 +5,7 @@ from stages.artifacts.pictures import Pictures, pictures_of
 from stages.artifacts.scene import scene_of
 
 PINHOLE_PHOTOS = pictures_of("undistort")
-# Masks that were guessed and agree with each other. They say where the subject ends, not that nothing is beside it:
-# training sees the whole photos.
+# Masks that say where the object ends, not that nothing beside it counts: those of photos whose background stood still,
+# and those that were guessed and agree with each other. Training sees the whole photos.
 SILHOUETTES = in_folder("undistort", ("silhouettes/*",), lambda folder: Pictures(folder, "silhouettes"), optional=True)
 FIRST_SCENE = scene_of("undistort")

@@ -23,6 +23,7 @@ from stages.neural.replaying import Replay
 from stages.neural.sampling import SdfCache
 from stages.neural.schedules import Moment
 from stages.neural.sightings import Sightings, sighting_loss
+from stages.neural.silhouettes import Silhouettes, outline_loss
 from stages.neural.terms import Terms
 from stages.neural.terms.planar import has_feature_mlp
 from stages.neural.training_photos import Photos, RayBatch
@@ -71,11 +72,13 @@ class Trainer:
         dense: Sightings,
         params: TrainParams,
         device: torch.device | str,
+        silhouettes: Silhouettes | None = None,
         doubt: Doubt | None = None,
     ) -> None:
         """doubt: without it nothing is taken for shiny."""
         self.doubt = doubt
         self.photos, self.sightings, self.dense, self.params = photos, sightings, dense, params
+        self.silhouettes = silhouettes or Silhouettes.none(device)
         self.device = torch.device(device)
         background = params.field.background and photos.masks is None
         self.fields = Fields(field_shape(params, len(photos), background), params.seed).to(device)
@@ -166,7 +169,10 @@ class Trainer:
         sparse = self.sightings.draw(weights.sparse_batch, weights.sparse_step, self.generator)
         dense = self.dense.draw(weights.dense_batch, weights.dense_step, self.generator)
         anywhere = torch.rand(sampling.free_points, 3, generator=self.generator, device=self.device) * 2 - 1
-        extra = torch.cat([sparse.places, dense.places, anywhere])
+        outlines = self.silhouettes.draw(
+            weights.silhouette_batch, weights.dense_step, self.cache.lookup, self.generator
+        )
+        extra = torch.cat([sparse.places, dense.places, outlines.places, anywhere])
         rendered = self.renderer.render(batch, moment, extra, self.generator)
         exposed = rendered.colors * torch.exp(self.fields.log_gains[batch.images])
         nothing = torch.zeros((), device=self.device)
@@ -185,12 +191,14 @@ class Trainer:
         ).mean()
         of_terms = self.terms.losses(rendered, moment)
         first, last = len(sparse.places), len(sparse.places) + len(dense.places)
+        end = last + len(outlines.places)
         sparse_loss = sighting_loss(
             rendered.extra_sdf[:first], sparse.weights, weights.sparse_tolerance, weights.sparse_step
         )
         dense_loss = sighting_loss(
             rendered.extra_sdf[first:last], dense.weights, weights.dense_tolerance, weights.dense_step
         )
+        silhouette_loss = outline_loss(rendered.extra_sdf[last:end], outlines.known, 0.25 * weights.dense_step)
         shiny = rendered.gloss.new_zeros(()) if self.doubt is None else self.doubt.shiny(rendered.surface[0])
         gloss_loss = losses.gloss_error(rendered.gloss, shiny).mean()
         exposure_loss = losses.exposure_error(self.fields.log_gains).mean()
@@ -203,6 +211,7 @@ class Trainer:
             + sparse_weight * sparse_loss
             + weights.dense * dense_loss
             + weights.mask * mask_loss
+            + weights.silhouette * silhouette_loss
             + weights.exposure * exposure_loss
             + weights.gloss * gloss_loss
             + proposal_loss
@@ -225,6 +234,7 @@ class Trainer:
                 "sparse": sparse_loss.detach(),
                 "dense": dense_loss.detach(),
                 "mask": mask_loss.detach(),
+                "silhouette": silhouette_loss.detach(),
                 "proposal": proposal_loss.detach(),
                 "psnr": -10 * torch.log10(mse.clamp(min=1e-10)),
                 "gradient_norm": torch.linalg.vector_norm(rendered.gradients, dim=1).mean(),

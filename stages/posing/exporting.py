@@ -86,8 +86,14 @@ def _images_and_model(undistort: Path, sfm: Path, place: Place, out: Path) -> tu
     """Copy images and masks to `out`; the scene, and the pycolmap model of it."""
     scene = artifacts.FIRST_SCENE.load(undistort)
     ours, theirs = artifacts.Pictures(undistort), artifacts.Pictures(out)
+    outlines = artifacts.SILHOUETTES.load(undistort)
     for name in scene.cameras.names:
-        for source, target in ((ours.path(name), theirs.path(name)), (ours.mask_path(name), theirs.mask_path(name))):
+        mask = theirs.mask_path(name)
+        for source, target in (
+            (ours.path(name), theirs.path(name)),
+            (ours.mask_path(name), mask),
+            (outlines.mask_path(name), mask),
+        ):
             if source.exists():
                 target.parent.mkdir(parents=True, exist_ok=True)
                 shutil.copyfile(source, target)
