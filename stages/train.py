@@ -43,7 +43,7 @@ from stages.geometry.point_cloud import PointCloud
 from stages.geometry.similarity import Similarity
 
 if TYPE_CHECKING:
-    from stages.neural.doubt import Doubt
+    from stages.neural.evidence import Evidence
 
 log = logging.getLogger(__name__)
 
@@ -311,16 +311,16 @@ def _make_trainer(context: StageContext[TrainParams], scene: PosedScene) -> Any:
     dense = Sightings.from_cloud(cloud, scene.cameras.centers, context.device, training)
     masks = [outlines.mask(name) if use else None for name, use in zip(scene.cameras.names, training, strict=True)]
     silhouettes = Silhouettes.from_masks(scene.cameras, masks, cloud, context.device)
-    return Trainer(photos, sightings, dense, params, context.device, silhouettes, _doubt(context, scene))
+    return Trainer(photos, sightings, dense, params, context.device, silhouettes, _evidence(context, scene))
 
 
-def _doubt(context: StageContext[TrainParams], scene: PosedScene) -> Doubt:
-    """Where the depth maps deny each other, in the scene frame."""
-    from stages.neural.doubt import Doubt
+def _evidence(context: StageContext[TrainParams], scene: PosedScene) -> Evidence:
+    """What the depth maps say of places in the scene frame."""
+    from stages.neural.evidence import Evidence
 
     maps, unit = context.read(DEPTH_MAPS), np.float32(scene.poses_from_scene.scale)
     found = (maps.load(name) for name in scene.cameras.names)
-    return Doubt.of((pair and (pair[0] / unit, pair[1]) for pair in found), scene.cameras, context.device)
+    return Evidence.of((pair and (pair[0] / unit, pair[1]) for pair in found), scene.cameras, context.device)
 
 
 def _cloud(context: StageContext[TrainParams], scene: PosedScene) -> PointCloud:

@@ -78,6 +78,6 @@ def exposure_error(log_gains: Float[Tensor, "i 3"]) -> Float[Tensor, "i 3"]:
 def gloss_error(gloss: Float[Tensor, " r"], shiny: Float[Tensor, "*#r"]) -> Float[Tensor, " r"]:
     """Gloss, in [0, 1], of each ray, where nothing says that the place is shiny; a twentieth of it where it surely is.
 
-    Holds colours to be shaded wherever that explains the photos as well. shiny in [0, 1], see `Doubt.shiny`.
+    Holds colours to be shaded wherever that explains the photos as well. shiny in [0, 1], see `Evidence.shiny`.
     """
     return gloss * (1 - (1 - _SHINY_COST) * shiny)

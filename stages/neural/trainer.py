@@ -12,8 +12,8 @@ from torch import Tensor
 from configs.training import TrainParams
 from stages.neural import losses, schedules
 from stages.neural.acceleration import is_mixed, points_at_a_time, short_products
-from stages.neural.doubt import Doubt
 from stages.neural.encoding_shapes import Frequencies, HashGrid
+from stages.neural.evidence import Evidence
 from stages.neural.fields import Fields, FieldShape
 from stages.neural.needed_rays import NeededRays
 from stages.neural.proposal import interlevel_loss, sample_edges, updates_now
@@ -73,12 +73,11 @@ class Trainer:
         params: TrainParams,
         device: torch.device | str,
         silhouettes: Silhouettes | None = None,
-        doubt: Doubt | None = None,
+        evidence: Evidence | None = None,
     ) -> None:
-        """doubt: without it nothing is taken for shiny."""
-        self.doubt = doubt
         self.photos, self.sightings, self.dense, self.params = photos, sightings, dense, params
         self.silhouettes = silhouettes or Silhouettes.none(device)
+        self.evidence = evidence or Evidence.none(device)
         self.device = torch.device(device)
         background = params.field.background and photos.masks is None
         self.fields = Fields(field_shape(params, len(photos), background), params.seed).to(device)
@@ -101,7 +100,7 @@ class Trainer:
         self.cache = SdfCache(params.sampling.cache_resolution, device)
         self.needed = NeededRays(photos, params.sampling.needed_share)
         self.generator = torch.Generator(device=device).manual_seed(params.seed)
-        self.terms = Terms(self.fields, self.cache, params, photos, self.generator)
+        self.terms = Terms(self.fields, self.cache, params, photos, self.generator, self.evidence)
         self.renderer = Renderer(self.fields, self.cache, params, self.terms)
         self.step_index = 0
         self.cache_step = -(10**9)
@@ -184,6 +183,10 @@ class Trainer:
             mask_loss = losses.mask_error(rendered.opacity, batch.masks).mean()
         self.needed.learn(cells, ray_error)
         trust = self.terms.color_weight(rendered, exposed, moment)
+        import os
+
+        if os.environ.get("CWD"):
+            trust = trust * (1 - float(os.environ["CWD"]) * self.evidence.shiny(rendered.surface[0]))
         rgb_loss = (ray_error * trust).mean()
         omega = self.terms.eikonal_weight(rendered, ray_error, trust, moment)
         eikonal_loss = torch.cat(
@@ -199,8 +202,7 @@ class Trainer:
             rendered.extra_sdf[first:last], dense.weights, weights.dense_tolerance, weights.dense_step
         )
         silhouette_loss = outline_loss(rendered.extra_sdf[last:end], outlines.known, 0.25 * weights.dense_step)
-        shiny = rendered.gloss.new_zeros(()) if self.doubt is None else self.doubt.shiny(rendered.surface[0])
-        gloss_loss = losses.gloss_error(rendered.gloss, shiny).mean()
+        gloss_loss = losses.gloss_error(rendered.gloss, self.evidence.shiny(rendered.surface[0])).mean()
         exposure_loss = losses.exposure_error(self.fields.log_gains).mean()
         proposal_loss = self._proposal_loss(rendered)
 

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from configs.training import TrainParams
+from stages.neural.evidence import Evidence
 from stages.neural.fields import Fields
 from stages.neural.rendered import Rendered
 from stages.neural.sampling import SdfCache
@@ -46,11 +47,12 @@ class Terms:
         params: TrainParams,
         photos: Photos | None = None,
         generator: torch.Generator | None = None,
+        evidence: Evidence | None = None,
     ) -> None:
         terms = params.terms
         forms = (terms.ambiguity.form, terms.reflection.form)
         self.waits = set(forms) != {"off"} or terms.eikonal.form != "plain" or terms.planar.form == "paper"
-        self.all = tuple(kind(fields, cache, params, photos, generator) for kind in KINDS)
+        self.all = tuple(kind(fields, cache, params, photos, generator, evidence) for kind in KINDS)
 
     def recolored(self, rendered: Rendered, moment: Moment, generator: torch.Generator | None) -> Rendered:
         """The rays with the colours that they have by all terms."""

@@ -124,8 +124,12 @@ class Planar(Term):
         return self._planar_loss_literal(rendered, chosen, moment)
 
     def _bending(self, rendered: Rendered, chosen: Int[Tensor, " q"], moment: Moment) -> Float[Tensor, ""]:
-        """How much the normals differ from those of places beside them that have the same colour in the ray's photo."""
+        """How much the normals differ from those of places beside them that have the same colour in the ray's photo.
+
+        Where dense stereo knows the surface it needs no such help.
+        """
         assert self.photos is not None
+        assert self.evidence is not None
         surface, normals = (part[chosen] for part in rendered.surface)
         beside = surface + self._beside(normals)
         images = rendered.batch.images[chosen]
@@ -134,7 +138,8 @@ class Planar(Term):
         difference = (colors - rendered.batch.colors[chosen]).abs().mean(1)
         _, _, gradients = self.fields.sdf(torch.cat([surface, beside]), moment.levels)
         here, there = torch.nn.functional.normalize(gradients, dim=1).chunk(2)
-        return (shown * evenness(difference) * bending_error(here, there)).mean()
+        unknown = 1 - self.evidence.known(surface)
+        return (shown * unknown * evenness(difference) * bending_error(here, there)).mean()
 
     def _beside(self, normals: Float[Tensor, "q 3"]) -> Float[Tensor, "q 3"]:
         """Offsets along the surface, as many of each size on a log scale."""

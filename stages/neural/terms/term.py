@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from configs.training import TrainParams
+from stages.neural.evidence import Evidence
 from stages.neural.fields import Fields
 from stages.neural.rendered import Rendered
 from stages.neural.sampling import SdfCache
@@ -25,7 +26,7 @@ class Term:
     """A term overrides what it has a say in, and looks into its settings for whether and from when on it has one.
 
     Attributes:
-        photos, generator: what training has; None where a trained field is only rendered.
+        photos, generator, evidence: what training has; None where a trained field is only rendered.
     """
 
     def __init__(
@@ -35,9 +36,10 @@ class Term:
         params: TrainParams,
         photos: Photos | None = None,
         generator: torch.Generator | None = None,
+        evidence: Evidence | None = None,
     ) -> None:
         self.fields, self.cache, self.params = fields, cache, params
-        self.photos, self.generator = photos, generator
+        self.photos, self.generator, self.evidence = photos, generator, evidence
         self.device = cache.values.device
 
     def recolored(self, rendered: Rendered, moment: Moment, generator: torch.Generator | None) -> Rendered:

@@ -1,7 +1,8 @@
-"""Where photos find depths that other photos deny: on what is polished, or moves.
+"""What dense stereo says of places: depths that photos agree on, depths that other photos deny, or none.
 
-Dense stereo keeps such depths with a low trust. Gathered in a coarse grid, they tell shiny places from plain ones,
-where no depth is found at all (the paper's ambiguity, asked of geometry once, before training).
+Photos agree where there is a pattern to see. What is polished, or moves, gives depths that others deny: dense stereo
+keeps them with a low trust. Where something is plain no depth is found at all. Gathered in a coarse grid, before the
+training, that tells what is to be believed where (the paper's ambiguity, asked of geometry).
 
 Shapes: I photos, P places, G cells along the grid's side.
 """
@@ -27,27 +28,35 @@ SIDE, BOXES = 48, (5, 3)
 _STRIDE = 3
 # Places with fewer depths than this part of what there is on average have none to speak of.
 _FEW = 0.05
+# With as much trust as this part of that, they are known.
+_KNOWN = 0.5
 # Share of doubt from which a place is taken for shiny, and that at which it is for sure: helmet 0.1, plaster 0.36 and
 # polished metal 0.85 on average.
 SHINY = (0.5, 0.8)
 
 
-class Doubt:
-    """How far a place is doubted.
+class Evidence:
+    """What is known of places.
 
     Attributes:
-        values: [1, 1, G, G, G], z, y, x as `grid_sample` wants it: share of the depths there that are not trusted.
+        values: [1, 2, G, G, G], z, y, x as `grid_sample` wants it: share of the depths there that are not trusted; and
+            how known a place is, in [0, 1].
     """
 
-    def __init__(self, values: Float[Tensor, "1 1 g g g"]) -> None:
+    def __init__(self, values: Float[Tensor, "1 2 g g g"]) -> None:
         self.values = values
+
+    @staticmethod
+    def none(device: torch.device | str) -> Evidence:
+        """Nothing is known of any place."""
+        return Evidence(torch.zeros(1, 2, 1, 1, 1, device=device))
 
     @staticmethod
     def of(
         maps: Iterable[tuple[Float32[np.ndarray, "_ _"], Float32[np.ndarray, "_ _"]] | None],
         cameras: PinholeCameras,
         device: torch.device | str,
-    ) -> Doubt:
+    ) -> Evidence:
         """Of each photo's depths along its optical axis, 0 where unknown, and their trust in [0, 1], of one shape.
 
         Args:
@@ -65,16 +74,25 @@ class Doubt:
         found, doubted = sums.reshape(2, SIDE, SIDE, SIDE)
         for box in BOXES:
             found, doubted = uniform_filter(found, box), uniform_filter(doubted, box)
-        few = _FEW * found[found > 0].mean() if found.any() else 1.0
-        return Doubt(torch.from_numpy(doubted / (found + few)).float()[None, None].to(device))
+        usual = found[found > 0].mean() if found.any() else 1.0
+        known = np.minimum((found - doubted) / (_KNOWN * usual), 1)
+        values = np.stack([doubted / (found + _FEW * usual), known]).clip(0)
+        return Evidence(torch.from_numpy(values).float()[None].to(device))
 
     def shiny(self, points: Float[Tensor, "p 3"]) -> Float[Tensor, " p"]:
         """How sure it is that points are on something shiny, in [0, 1], without gradient."""
+        low, high = SHINY
+        return ((self._at(points)[0] - low) / (high - low)).clamp(0, 1)
+
+    def known(self, points: Float[Tensor, "p 3"]) -> Float[Tensor, " p"]:
+        """How far photos agree on where the surface is, in [0, 1], without gradient."""
+        return self._at(points)[1]
+
+    def _at(self, points: Float[Tensor, "p 3"]) -> Float[Tensor, "2 p"]:
         found = torch.nn.functional.grid_sample(
             self.values, points.detach().view(1, 1, 1, -1, 3), align_corners=False, padding_mode="border"
         )
-        low, high = SHINY
-        return ((found.view(-1) - low) / (high - low)).clamp(0, 1)
+        return found.view(2, len(points))
 
 
 def _places(
