@@ -163,14 +163,15 @@ def votes(
         starts, depths, trusted: photo k's depths, row by row, begin at `starts[k]`; whether what is there is known to
             be there, and so excuses photos that do not see what is behind it.
         tolerances: [i], depths in these photos that differ by less than this part agree.
-        counts: [n, 3], written: photos that look at the place, that agree, that see through it.
+        counts: [n, 4], written: photos that look at the place, that agree, that see through it; and the sum of squares
+            of how far those that agree are from it, in parts of the tolerance.
     """
     for k in prange(len(points)):
         px, py, pz = points[k, 0], points[k, 1], points[k, 2]
         nx, ny, nz = normals[k, 0], normals[k, 1], normals[k, 2]
         ox, oy, oz = center[0] - px, center[1] - py, center[2] - pz
         own = np.sqrt(ox * ox + oy * oy + oz * oz)
-        asked, agree, through = 0, 0, 0
+        asked, agree, through, apart = 0, 0, 0, 0.0
         for j in others:
             cx, cy, cz = centers[j, 0] - px, centers[j, 1] - py, centers[j, 2] - pz
             length = np.sqrt(cx * cx + cy * cy + cz * cz)
@@ -195,4 +196,5 @@ def votes(
                 through += 1
             elif found >= z - margin:
                 agree += 1
-        counts[k, 0], counts[k, 1], counts[k, 2] = asked, agree, through
+                apart += ((found - z) / margin) ** 2
+        counts[k, 0], counts[k, 1], counts[k, 2], counts[k, 3] = asked, agree, through, apart
