@@ -14,7 +14,7 @@ from stages.stereo.depths import _along, depth_maps, views_of
 from stages.stereo.matching import evened
 from stages.stereo.pairs import pairs_of, scores
 from stages.stereo.rectification import View, comparable, rectify, tolerance_of
-from stages.stereo.trust import normals_at, places, trust_of
+from stages.stereo.trust import _trust, normals_at, places, trust_of
 
 
 def pair(rng: np.random.Generator) -> tuple[View, View, np.ndarray]:
@@ -212,15 +212,15 @@ def test_votes_against_a_loop():
     normals = np.where(
         rng.uniform(size=(len(points), 1)) < 0.5, points / np.linalg.norm(points, axis=1, keepdims=True), 0
     )
-    trusted = [rng.uniform(size=d.shape) < 0.5 for d in depths]
-    found = np.zeros((len(points), 4), np.float32)
+    known = [rng.choice(np.uint8([0, 0, 1, 2]), d.shape) for d in depths]
+    found = np.zeros((len(points), 5), np.float32)
     flat = np.stack(depths).astype(np.float32).ravel()
     depth_kernels.votes(
         cams.centers[0], np.arange(1, 6), points, normals.astype(np.float32), cams.intrinsics @ cams.extrinsics,
-        cams.centers, cams.sizes, 160 * 120 * np.arange(7), flat, np.stack(trusted).ravel(), np.full(6, 0.01), found,
+        cams.centers, cams.sizes, 160 * 120 * np.arange(7), flat, np.stack(known).ravel(), np.full(6, 0.01), found,
     )  # fmt: skip
     for k, point in enumerate(points):
-        expected = np.zeros(4)
+        expected = np.zeros(5)
         for j in range(1, 6):
             to_j, to_own = cams.centers[j] - point, cams.centers[0] - point
             to_j, to_own = to_j / np.linalg.norm(to_j), to_own / np.linalg.norm(to_own)
@@ -230,13 +230,13 @@ def test_votes_against_a_loop():
             pixel, z = cams.project(j, point[None])
             u, v = np.floor(pixel[0]).astype(int)
             d = depths[j][v, u]
-            if 0 < d < 0.99 * z[0] and trusted[j][v, u]:
+            if 0 < d < 0.99 * z[0] and known[j][v, u]:
                 continue
             apart = (d / z[0] - 1) / 0.01
-            expected += [1, abs(apart) <= 1, apart > 1, apart**2 if abs(apart) <= 1 else 0]
-        np.testing.assert_array_equal(found[k, :3], expected[:3])
-        assert found[k, 3] == pytest.approx(expected[3], abs=1e-3)
-    assert (found.sum(0) > 10).all()
+            near = abs(apart) <= 1
+            expected += [1, near, apart > 1, near * apart**2, near and known[j][v, u] == 2]
+        np.testing.assert_allclose(found[k], expected, atol=1e-3)
+    assert (found.sum(0) > 5).all()
 
 
 # ---------------------------------------------------------------- depths and trust
@@ -361,6 +361,19 @@ def test_what_all_find_but_less_exactly_than_the_rest_is_not_trusted(monkeypatch
     assert min(trusts(everywhere)) > 0.85 * on_mirror_alone
 
 
+def test_what_most_that_agree_find_inexactly_is_not_trusted():
+    def trust(doubted: int, apart: float = 0.04) -> float:
+        counts = np.zeros((20, 20, 5), np.float32)
+        counts[:] = 10, 8, 0, 8 * apart, doubted
+        return float(_trust(counts, 0.2)[0][10, 10])
+
+    assert trust(0) == 1
+    assert trust(2) == 1
+    assert 0.3 < trust(3) < 0.7
+    assert trust(4) == pytest.approx(0, abs=1e-6)
+    assert trust(0, apart=0.04 * 1.8**2) == pytest.approx(0, abs=1e-3)
+
+
 def _pixels(view: View) -> np.ndarray:
     """Centres [h * w, 2] of a photo's pixels."""
     v, u = np.mgrid[: view.size[1], : view.size[0]]
@@ -376,12 +389,12 @@ def test_what_is_known_in_front_excuses_and_what_is_not_does_not():
 
     def votes(in_front: float, known: bool) -> list[float]:
         depths = [true[0]] + [np.full_like(d, in_front * cams.project(k, point)[1][0]) for k, d in enumerate(true) if k]
-        found = np.zeros((1, 4), np.float32)
+        found = np.zeros((1, 5), np.float32)
         matrices = np.stack([v.matrix @ np.c_[v.rotation, -v.rotation @ v.center] for v in views])
         flat = np.concatenate([d.ravel() for d in depths])
         depth_kernels.votes(
             views[0].center, np.arange(1, 5), point, np.zeros((1, 3), np.float32), matrices, cams.centers, cams.sizes,
-            160 * 120 * np.arange(13), flat, np.full(len(flat), known), np.full(12, 0.01), found,
+            160 * 120 * np.arange(13), flat, np.full(len(flat), known, np.uint8), np.full(12, 0.01), found,
         )  # fmt: skip
         return found[0, :3].tolist()
 
