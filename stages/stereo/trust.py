@@ -31,9 +31,9 @@ UNCONTRADICTED = (0.4, 0.8)
 SCATTER = (1.6, 1.8)
 # What is usual is at least this part of the tolerance: with perfect poses and pixels, a little more is no sign.
 LEAST_SCATTER = 0.15
-# The share of the photos that agree on a place whose own depths there scatter too much, for it to count in full, and not
-# at all: a half on what is left of the cap; more than 0.15 on one in twenty places of the plaster part, 0.06 of the
-# helmet.
+# Of the photos that agree on a place, the share whose own depths there scatter too much: up to the first it counts in
+# full, from the second on not at all. It is a half on what is left of the cap; one in twenty places of the plaster part
+# has more than 0.15, of the helmet 0.06.
 DOUBTED = (0.3, 0.5)
 # Trust from which a place hides what is behind it.
 KNOWN = 0.5
