@@ -16,6 +16,8 @@ _SAME_SURFACE = 1.0
 _WIDE, _FACING = 0.5, 0.2
 # Neighbouring depths that differ by more than this part of them are two surfaces: no normal spans both.
 _NEAR = 0.05
+# In `known` of `votes`.
+_DOUBTED = 2
 
 
 @njit(nogil=True, cache=True)
@@ -152,7 +154,7 @@ def normals_at(depth, rows, columns, pixels_from_rays, reach, normals):  # pragm
 
 @njit(nogil=True, parallel=True, cache=True)
 def votes(
-    center, others, points, normals, matrices, centers, sizes, starts, depths, trusted, tolerances, counts
+    center, others, points, normals, matrices, centers, sizes, starts, depths, known, tolerances, counts
 ):  # pragma: no cover - compiled
     """What other photos say of a photo's points.
 
@@ -160,17 +162,18 @@ def votes(
         center, others: of the photo whose points these are; the photos that are asked.
         points, normals: [n, 3]; a normal of zero is unknown.
         matrices, centers, sizes: [i, 3, 4] pixels from the frame, [i, 3], [i, 2] width and height.
-        starts, depths, trusted: photo k's depths, row by row, begin at `starts[k]`; whether what is there is known to
-            be there, and so excuses photos that do not see what is behind it.
+        starts, depths, known: photo k's depths, row by row, begin at `starts[k]`; where known is not 0, what is there
+            excuses photos that do not see what is behind it; 2 where it is found less exactly than is usual.
         tolerances: [i], depths in these photos that differ by less than this part agree.
-        counts: [n, 3], written: photos that look at the place, that agree, that see through it.
+        counts: [n, 5], written: photos that look at the place, that agree, that see through it; the sum of squares of
+            how far those that agree are from it, in parts of the tolerance; and those that agree by a depth of known 2.
     """
     for k in prange(len(points)):
         px, py, pz = points[k, 0], points[k, 1], points[k, 2]
         nx, ny, nz = normals[k, 0], normals[k, 1], normals[k, 2]
         ox, oy, oz = center[0] - px, center[1] - py, center[2] - pz
         own = np.sqrt(ox * ox + oy * oy + oz * oz)
-        asked, agree, through = 0, 0, 0
+        asked, agree, through, apart, doubted = 0, 0, 0, 0.0, 0
         for j in others:
             cx, cy, cz = centers[j, 0] - px, centers[j, 1] - py, centers[j, 2] - pz
             length = np.sqrt(cx * cx + cy * cy + cz * cz)
@@ -188,11 +191,13 @@ def votes(
                 continue
             at = starts[j] + int(v) * sizes[j, 0] + int(u)
             found, margin = depths[at], tolerances[j] * z
-            if found > 0 and found < z - margin and trusted[at]:
+            if found > 0 and found < z - margin and known[at]:
                 continue
             asked += 1
             if found > z + margin:
                 through += 1
             elif found >= z - margin:
                 agree += 1
-        counts[k, 0], counts[k, 1], counts[k, 2] = asked, agree, through
+                apart += ((found - z) / margin) ** 2
+                doubted += known[at] == _DOUBTED
+        counts[k, 0], counts[k, 1], counts[k, 2], counts[k, 3], counts[k, 4] = asked, agree, through, apart, doubted
