@@ -74,6 +74,7 @@ def _term(name: str, off: str = "off", **paper: str) -> Part:
 
 # A new part is a line here, all else follows from it; its only form of ours is called as the others' first is.
 PARTS: dict[str, Part] = {
+    "colors": Part({"train.field.colors": "network"}, {"stable": {"train.field.colors": "shaded"}}),
     "ambiguity": _term("ambiguity", visibility="paper"),
     "reflection": _term("reflection"),
     "planar": _term("planar"),
@@ -126,7 +127,7 @@ GROUPS: dict[str, dict[str, dict[str, str]]] = {
         },
         "visibility-paper": {**PARTS["ambiguity"].forms["stable"], "train.terms.ambiguity.visibility": "paper"},
         "visibility-mesh": {**PARTS["ambiguity"].forms["stable"], "train.terms.ambiguity.visibility": "mesh"},
-        "planar-mlp": {**PARTS["planar"].forms["stable"], "train.terms.planar.features": "mlp"},
+        "planar-mlp": {**PARTS["planar"].forms["paper"], "train.terms.planar.features": "mlp"},
     },
     "paper": {name: changes for form in FORMS for name, changes in _all_of_paper(form).items()},
     # what is in the base, taken out or otherwise
