@@ -183,10 +183,6 @@ class Trainer:
             mask_loss = losses.mask_error(rendered.opacity, batch.masks).mean()
         self.needed.learn(cells, ray_error)
         trust = self.terms.color_weight(rendered, exposed, moment)
-        import os
-
-        if os.environ.get("CWD"):
-            trust = trust * (1 - float(os.environ["CWD"]) * self.evidence.shiny(rendered.surface[0]))
         rgb_loss = (ray_error * trust).mean()
         omega = self.terms.eikonal_weight(rendered, ray_error, trust, moment)
         eikonal_loss = torch.cat(

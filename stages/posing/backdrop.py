@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
-import cv2
 import numpy as np
 
 if TYPE_CHECKING:
@@ -50,6 +49,8 @@ def _features(photo: Any) -> tuple[Float[np.ndarray, "f 2"], Bool[np.ndarray, " 
 
 def _near(mask: Shaped[np.ndarray, "h w"], camera: Any, places: Float[np.ndarray, "f 2"]) -> Bool[np.ndarray, " f"]:
     """Which places in a photo lie on its mask or near it."""
+    import cv2
+
     height, width = mask.shape
     reach = max(1, round(NEAR * max(height, width)))
     wide = cv2.dilate((mask != 0).astype(np.uint8), np.ones((2 * reach + 1, 2 * reach + 1), np.uint8))
