@@ -27,7 +27,7 @@ class FieldParams(Section):
         description="what the radiance MLP knows of the view: its direction, or the reflected one and n.v too",
     )
     colors: Literal["shaded", "network"] = Field(
-        "shaded",
+        "network",
         description="shaded: albedo times the light that normal and surroundings let in, and the radiance MLP where "
         "that does not explain the photos; network: the radiance MLP alone",
     )

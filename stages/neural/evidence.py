@@ -28,8 +28,8 @@ SIDE, BOXES = 48, (5, 3)
 _STRIDE = 3
 # Places with fewer depths than this part of what there is on average have none to speak of.
 _FEW = 0.05
-# With as much trust as this part of that, they are known.
-_KNOWN = 0.5
+# Trusted depths speak of places in a box of so many cells a side.
+_NEAR = 3
 # Share of doubt from which a place is taken for shiny, and that at which it is for sure: helmet 0.1, plaster 0.36 and
 # polished metal 0.85 on average.
 SHINY = (0.5, 0.8)
@@ -72,10 +72,10 @@ class Evidence:
                 cells = _cells(places)
                 sums += np.stack([np.bincount(cells, weights, SIDE**3) for weights in (np.ones(len(trust)), 1 - trust)])
         found, doubted = sums.reshape(2, SIDE, SIDE, SIDE)
+        known = _known(uniform_filter(found - doubted, _NEAR), uniform_filter(found, _NEAR))
         for box in BOXES:
             found, doubted = uniform_filter(found, box), uniform_filter(doubted, box)
         usual = found[found > 0].mean() if found.any() else 1.0
-        known = np.minimum((found - doubted) / (_KNOWN * usual), 1)
         values = np.stack([doubted / (found + _FEW * usual), known]).clip(0)
         return Evidence(torch.from_numpy(values).float()[None].to(device))
 
@@ -112,3 +112,10 @@ def _cells(places: Float[np.ndarray, "p 3"]) -> np.ndarray:
     """Flat index of the cell of each place in the cube, z slowest."""
     x, y, z = ((places + 1) * (SIDE / 2)).astype(int).clip(0, SIDE - 1).T
     return np.ravel_multi_index((z, y, x), 3 * (SIDE,))
+
+
+def _known(trusted: Float[np.ndarray, "g g g"], found: Float[np.ndarray, "g g g"]) -> Float[np.ndarray, "g g g"]:
+    """How known places are, in [0, 1]: in full where there is as much trust as depths are in the middle cell of those
+    that have a fifth of the mean or more."""
+    many = found[found > 0.2 * found[found > 0].mean()] if found.any() else np.ones(1)
+    return np.clip(trusted / np.median(many), 0, 1)
