@@ -28,6 +28,8 @@ SIDE, BOXES = 48, (5, 3)
 _STRIDE = 3
 # Places with fewer depths than this part of what there is on average have none to speak of.
 _FEW = 0.05
+# Less than one depth leaves in the largest box.
+_TRACE = 1e-4
 # Trusted depths speak of places in a box of so many cells a side.
 _NEAR = 3
 # Share of doubt from which a place is taken for shiny, and that at which it is for sure: helmet 0.1, plaster 0.36 and
@@ -72,11 +74,12 @@ class Evidence:
                 cells = _cells(places)
                 sums += np.stack([np.bincount(cells, weights, SIDE**3) for weights in (np.ones(len(trust)), 1 - trust)])
         found, doubted = sums.reshape(2, SIDE, SIDE, SIDE)
-        known = _known(uniform_filter(found - doubted, _NEAR), uniform_filter(found, _NEAR))
+        near, trusted = uniform_filter(found, _NEAR), uniform_filter(found - doubted, _NEAR)
+        known = trusted / _usual(near)
         for box in BOXES:
             found, doubted = uniform_filter(found, box), uniform_filter(doubted, box)
-        usual = found[found > 0].mean() if found.any() else 1.0
-        values = np.stack([doubted / (found + _FEW * usual), known]).clip(0)
+        usual = _usual(found)
+        values = np.stack([doubted / (found + _FEW * usual), known]).clip(0, 1)
         return Evidence(torch.from_numpy(values).float()[None].to(device))
 
     def shiny(self, points: Float[Tensor, "p 3"]) -> Float[Tensor, " p"]:
@@ -114,8 +117,10 @@ def _cells(places: Float[np.ndarray, "p 3"]) -> np.ndarray:
     return np.ravel_multi_index((z, y, x), 3 * (SIDE,))
 
 
-def _known(trusted: Float[np.ndarray, "g g g"], found: Float[np.ndarray, "g g g"]) -> Float[np.ndarray, "g g g"]:
-    """How known places are, in [0, 1]: in full where there is as much trust as depths are in the middle cell of those
-    that have a fifth of the mean or more."""
-    many = found[found > 0.2 * found[found > 0].mean()] if found.any() else np.ones(1)
-    return np.clip(trusted / np.median(many), 0, 1)
+def _usual(found: Float[np.ndarray, "g g g"]) -> float:
+    """How many depths a cell has, in the middle of those that have a fifth of the mean or more; 1 where there are none.
+
+    Rounding leaves traces in empty cells.
+    """
+    some = found[found > _TRACE]
+    return float(np.median(some[some >= 0.2 * some.mean()])) if len(some) else 1.0

@@ -121,6 +121,8 @@ class Photos:
         place = (in_pixels[:, :2] / depth.clamp(min=1e-6).unsqueeze(1)).floor().long()
         inside = (depth > 0) & ((place >= 0) & (place < size)).all(1)
         rows = (self.first[images] + place[:, 1] * size[:, 0] + place[:, 0]).masked_fill(~inside, 0)
+        if self.masks is not None:
+            inside &= self.masks[rows] > 127
         return self.pixels[rows].float() / 255, inside
 
     def directions(self, images: Int[Tensor, " r"], pixels: Float[Tensor, "r 2"]) -> Float[Tensor, "r 3"]:

@@ -42,7 +42,7 @@ def planar_error_literal(
     return (sdf / length - torch.einsum("qc,qkc->qk", normals, offsets) / length).abs()
 
 
-def evenness(difference: Float[Tensor, " q"], least: float = _NOISE) -> Float[Tensor, " q"]:
+def evenness(difference: Float[Tensor, " q"], tau: float = _NOISE) -> Float[Tensor, " q"]:
     """lambda_pla = exp(-|C(p) - C(p_0)| / tau) per pair of pixels of a photo, tau = 0.02 (paper lambda_pla^k).
 
     Args:
@@ -51,11 +51,11 @@ def evenness(difference: Float[Tensor, " q"], least: float = _NOISE) -> Float[Te
     Near 1 where the photo shows one even colour, so that nothing but the light can differ: there the surface is flat,
     as far as anybody can tell. The paper compares features that training may choose, with tau = 1e-3.
     """
-    return torch.exp(-difference / least)
+    return torch.exp(-difference / tau)
 
 
 def bending_error(normals: Float[Tensor, "q 3"], others: Float[Tensor, "q 3"]) -> Float[Tensor, " q"]:
-    """|n_k - n_0| of unit normals per pair, smoothed below a degree (paper L_planar, of which it is the derivative).
+    """|n_k - n_0| of unit normals per pair, smoothed below half a degree (in place of the paper's L_planar).
 
     Zero on a plane, wherever f's zero is; on an edge every pair across it counts alike, so that edges stay sharp. The
     paper asks f(x_k) to be linear along the ray, and divides by the distance: an x_0 that is off by 1e-3 then outweighs
