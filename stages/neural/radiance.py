@@ -26,15 +26,15 @@ REACHES = (0.02, 0.05, 0.1, 0.2, 0.4)
 _WIDTH = 32
 # Part of the colour that is the network's at the start: a polished thing takes harm from less, as its shape begins.
 _GLOSS_LOGIT = 2.0
-# What sRGB's curve comes to, and what keeps its slope finite in the dark: an eighth of a grey level.
-_GAMMA, _DARK = 2.2, 5e-4
+# Linear values up to here are straight in sRGB (IEC 61966-2-1).
+_STRAIGHT = 0.0031308
 
 
 class Colored(NamedTuple):
     """What a surface looks like.
 
     Attributes:
-        colors: sRGB in [0, 1]; a little more where the light is glaring.
+        colors: sRGB in [0, 1]; more where the light is glaring.
         gloss: part of the colour that is not shaded, in [0, 1].
     """
 
@@ -56,6 +56,12 @@ def openness(
     with torch.no_grad():
         places = points[:, None] + reaches[:, None] * normals[:, None]
         return (sdf(places.view(-1, 3)).view(-1, len(reaches)) / reaches).clamp(0, 1)
+
+
+def encoded_srgb(linear: Float[Tensor, "*any"]) -> Float[Tensor, "*any"]:
+    """sRGB of linear values that are not negative, with a finite slope everywhere (IEC 61966-2-1)."""
+    curved = 1.055 * linear.clamp(min=_STRAIGHT) ** (1 / 2.4) - 0.055
+    return torch.where(linear > _STRAIGHT, curved, 12.92 * linear)
 
 
 class RadianceNetwork(nn.Module):
@@ -144,5 +150,5 @@ class Radiance(nn.Module):
             return Colored(colors, torch.ones(len(points), device=points.device))
         albedo, gloss = self.shading.albedo_and_gloss(features)
         light = self.shading.irradiance(points, normals, openness(sdf, points, normals, self.shading.reaches))
-        matte = (albedo * light + _DARK) ** (1 / _GAMMA)
+        matte = encoded_srgb(albedo * light)
         return Colored(torch.lerp(matte, colors, gloss), gloss.squeeze(1))
