@@ -1,9 +1,6 @@
-import math
-
 import pytest
 import torch
 
-from stages.neural.losses import gloss_error
 from stages.neural.radiance import REACHES, Radiance, encoded_srgb, openness
 from stages.neural.sampling import SdfCache, beyond_too
 
@@ -114,11 +111,11 @@ def test_colours_give_finite_gradients_in_the_dark():
     assert features.grad.isfinite().all()
 
 
-# ---------------------------------------------------------------- what gloss costs
-def test_gloss_costs_where_nothing_is_known_to_shine():
-    gloss = torch.tensor([0.0, 0.5, 0.5, 0.5], requires_grad=True)
-    error = gloss_error(gloss, torch.tensor([0.0, 0.0, 1.0, 0.5]))
-    assert error.tolist() == pytest.approx([0, 0.5, 0.025, 0.2625])
-    error.sum().backward()
-    assert gloss.grad.min() > 0
-    assert math.isclose(gloss.grad[0], 1.0)
+def test_what_is_known_to_be_shiny_is_painted_by_the_network_alone():
+    radiance, normals, views, features = made(), directions(6), directions(6, 1), torch.rand(6, 4)
+    with torch.no_grad():
+        radiance.shading.surface[-1].bias[3] = -30
+    radiance.shiny.fill_(1)
+    colors, gloss = sees(radiance, normals, views, features)
+    torch.testing.assert_close(colors, radiance.network(torch.zeros(6, 3), normals, views, features))
+    assert gloss.tolist() == [1] * 6

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor, nn
 
+from stages.neural.evidence import SIDE, at_places
 from stages.neural.mlp import mlp, spherical_harmonics
 
 if TYPE_CHECKING:
@@ -126,8 +127,14 @@ class Shading(nn.Module):
 class Radiance(nn.Module):
     """(1 - g) sRGB(albedo x irradiance) + g c, with gloss g and the colour c of a `RadianceNetwork`.
 
-    Without `shaded` the network's colour alone, as in the paper: gloss is 1 everywhere.
+    Without `shaded` the network's colour alone, as in the paper: gloss is 1 everywhere. So it is where something is
+    known to be shiny: to explain reflections by shading would dent it.
+
+    Attributes:
+        shiny: `stages.neural.evidence.Evidence.shiny`; nothing at first.
     """
+
+    shiny: Tensor
 
     def __init__(
         self, features: int, layers: int, width: int, reflected: bool, shaded: bool, generator: torch.Generator
@@ -135,6 +142,7 @@ class Radiance(nn.Module):
         super().__init__()
         self.network = RadianceNetwork(features, layers, width, reflected, generator)
         self.shading = Shading(features, generator) if shaded else None
+        self.register_buffer("shiny", torch.zeros(1, 1, *3 * [SIDE]))
 
     def forward(
         self,
@@ -150,5 +158,6 @@ class Radiance(nn.Module):
             return Colored(colors, torch.ones(len(points), device=points.device))
         albedo, gloss = self.shading.albedo_and_gloss(features)
         light = self.shading.irradiance(points, normals, openness(sdf, points, normals, self.shading.reaches))
+        gloss = torch.maximum(gloss, at_places(self.shiny, points).unsqueeze(1))
         matte = encoded_srgb(albedo * light)
         return Colored(torch.lerp(matte, colors, gloss), gloss.squeeze(1))

@@ -13,6 +13,7 @@ from torch import Tensor
 from configs.training import PlanarParams, TermParams
 from stages.neural import losses, schedules
 from stages.neural.acceleration import first_rows, fixed_shapes
+from stages.neural.evidence import at_places
 from stages.neural.rendered import OPAQUE, Rendered
 from stages.neural.schedules import Moment
 from stages.neural.terms.term import Term
@@ -138,7 +139,7 @@ class Planar(Term):
         difference = (colors - rendered.batch.colors[chosen]).abs().mean(1)
         _, _, gradients = self.fields.sdf(torch.cat([surface, beside]), moment.levels)
         here, there = torch.nn.functional.normalize(gradients, dim=1).chunk(2)
-        unknown = 1 - self.evidence.known(surface)
+        unknown = 1 - at_places(self.evidence.known, surface)
         return (shown * unknown * evenness(difference) * bending_error(here, there)).mean()
 
     def _beside(self, normals: Float[Tensor, "q 3"]) -> Float[Tensor, "q 3"]:
