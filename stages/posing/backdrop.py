@@ -13,9 +13,10 @@ if TYPE_CHECKING:
 
 # Features this near to a mask, as a part of the photo's longer side, may be of the object: masks are not exact.
 NEAR = 0.01
-# Off the masks a photo has so many features that are points of the model, and they are so large a part of the features
-# there, in terms of that part on the masks: of backgrounds that stood still 41 to 49 % are (three made-up sets), of a
-# black cloth 5 % (dtu_scan24, 2 a photo), of a room that did not turn with the object next to none.
+# Off the masks a photo has at least so many features that are points of the model, and the part of the features there
+# that are is at least so large in terms of that part on the masks. Of backgrounds that stood still 41 to 49 % are
+# (three made-up sets), of a black cloth 5 % (dtu_scan24, 2 a photo), of a room that did not turn with the object next
+# to none.
 MIN_POINTS, MIN_RATIO = 20, 0.5
 # With fewer features on its mask a photo says nothing of the part there.
 MIN_FEATURES = 5
