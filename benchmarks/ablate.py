@@ -42,7 +42,6 @@ from benchmarks.run_sets import OUT, RESULTS, ROOT, find_sets, known_cameras, ma
 from configs.load import load_config
 from configs.params import Config
 from configs.renames import RENAMED
-from configs.training import TrainParams
 from stages.engine.stage import Stage, StageContext
 from stages.errors import HineusError
 from stages.evaluation.suites.paper import PaperRow, paper_tables
@@ -66,7 +65,8 @@ class Part:
 
 
 def _term(name: str, off: str = "off", **paper: str) -> Part:
-    """One of the paper's terms; `paper`: what its published form sets besides, of the same term."""
+    """One of the paper's terms; `paper`: what its published form sets besides, of the same term, as `paper.yaml` has
+    it."""
     form = f"train.terms.{name}.form"
     literal = {f"train.terms.{name}.{key}": value for key, value in paper.items()}
     return Part({form: off}, {"stable": {form: "stable"}, "paper": {form: "paper", **literal}})
@@ -76,8 +76,8 @@ def _term(name: str, off: str = "off", **paper: str) -> Part:
 PARTS: dict[str, Part] = {
     "colors": Part({"train.field.colors": "network"}, {"stable": {"train.field.colors": "shaded"}}),
     "ambiguity": _term("ambiguity", visibility="paper"),
-    "reflection": _term("reflection"),
-    "planar": _term("planar"),
+    "reflection": _term("reflection", samples="64"),
+    "planar": _term("planar", weight="1.0", features="mlp", scale_until="0.2", rays="1024"),
     "eikonal": _term("eikonal", off="plain"),
 }
 # What every variant starts from but the defaults: colours, the plain Eikonal term and points. Written out, so that it
@@ -127,7 +127,6 @@ GROUPS: dict[str, dict[str, dict[str, str]]] = {
         },
         "visibility-paper": {**PARTS["ambiguity"].forms["stable"], "train.terms.ambiguity.visibility": "paper"},
         "visibility-mesh": {**PARTS["ambiguity"].forms["stable"], "train.terms.ambiguity.visibility": "mesh"},
-        "planar-mlp": {**PARTS["planar"].forms["paper"], "train.terms.planar.features": "mlp"},
     },
     "paper": {name: changes for form in FORMS for name, changes in _all_of_paper(form).items()},
     # what is in the base, taken out or otherwise
@@ -178,6 +177,8 @@ STAND_INS = {
 RUNS = RESULTS / "ablation"
 FOLDERS = OUT / "ablation"
 POSED, SHARED = ("undistort", "densify"), "densify"  # what trainings start from, and up to where all runs share it
+# Of `stages`, what the stages measured are made of.
+SOURCES = ("train.py", "extract.py", "cleanup.py", "compiling.py", "neural", "surface", "geometry")
 HOLDOUT = 8  # every so many photos one is left out, on sets whose score is the PSNR
 # Two runs with a thread each do more on two cores than one run with two.
 ONE_THREAD = {
@@ -228,7 +229,7 @@ class Run:
         command: that ran it, with DATA for the folder of sets.
         machine: CPU, cores, versions, device, how many runs went side by side.
         poses: hash of the undistorted photos, poses and dense points it started from.
-        code: hash of the sources in `stages/neural`.
+        code: hash of the sources of the stages measured, see `code_hash`.
         score: distances of the clean mesh, see `protocols.known_object`; None without a known surface.
         psnr: of the training's rays at its end, dB.
         held_out_psnr: of photos left out of the training, dB; None where none were.
@@ -368,9 +369,15 @@ def config_hash(plan: Plan) -> str:
     return digest(load_config(plan.preset, None, plan.sets).model_dump(mode="json"))[:12]
 
 
+def default_steps(preset: str) -> int:
+    """Steps of a default run, the most where points that cover the surface shorten it."""
+    return load_config(preset, None, []).train.steps
+
+
 def code_hash() -> str:
-    """Hash of the sources that decide what a training comes to."""
-    sources = sorted((ROOT / "stages" / "neural").rglob("*.py"))
+    """Hash of the sources that decide what a training, and the mesh of it, come to."""
+    chosen = [ROOT / "stages" / name for name in SOURCES]
+    sources = sorted(source for path in chosen for source in ([path] if path.is_file() else path.rglob("*.py")))
     return hashlib.sha256(b"".join(source.read_bytes() for source in sources)).hexdigest()[:8]
 
 
@@ -440,7 +447,7 @@ def measure(plan: Plan, data: Path, jobs: int = 1, keep: bool = False) -> Run:
 
 def command(plan: Plan) -> str:
     """The call that makes this run (and those of lower seeds)."""
-    budget = f"--budget {plan.steps / TrainParams().steps:g}" if plan.covered else f"--steps {plan.steps}"
+    budget = f"--budget {plan.steps / default_steps(plan.preset):g}" if plan.covered else f"--steps {plan.steps}"
     words = ["python -m benchmarks.ablate DATA", plan.set, f"{budget} --preset {plan.preset}"]
     if plan.variant in VARIANTS:
         words.append(f"--variants {plan.variant}")
@@ -728,7 +735,7 @@ def _code_note(runs: Sequence[Run]) -> str:
     if len(variants) < 2:
         return ""
     listed = "; ".join(f"`{code}` {', '.join(names)}" for code, names in variants.items())
-    return f"\\* The code of the training changed between this run and its base. Versions: {listed}."
+    return f"\\* The code changed between this run and its base. Versions: {listed}."
 
 
 def _spread(values: Sequence[float]) -> float:
@@ -740,13 +747,27 @@ def _mean(values: Sequence[float], digits: int) -> str:
 
 
 def tables() -> dict[str, str]:
-    """The tables, from the result files."""
-    runs = load_runs()
+    """The tables, from the result files of the settings of now: those of others would be averaged with them."""
+    every = load_runs()
+    runs = [run for run in every if _is_of_now(run)]
+    older = len(every) - len(runs)
+    note = f"\n\nLeft out: {older} runs from before variants, presets or defaults changed." if older else ""
     return {
         "ablation terms": terms_table(runs),
-        "ablation": ablation_table(runs) if runs else NOT_MEASURED,
+        "ablation": (ablation_table(runs) if runs else NOT_MEASURED) + note,
         "ablation paper": paper_table(runs),
     }
+
+
+def _is_of_now(run: Run) -> bool:
+    """Whether its variant sets the same today, on presets and defaults that are the same."""
+    variant = run.plan.variant
+    if variant in VARIANTS and run.plan.settings != settings_of(variant, VARIANTS[variant]):
+        return False
+    try:
+        return run.config == config_hash(run.plan)
+    except HineusError:  # a setting that is no more
+        return False
 
 
 # ---------------------------------------------------------------- command
@@ -789,7 +810,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         if not arguments.sets:
             names = [name for name in names if has_truth(data / name) or known_cameras(data / name)]
         sets = {name: 0 if has_truth(data / name) else HOLDOUT for name in names}
-        steps = arguments.steps or round(arguments.budget * TrainParams().steps)
+        steps = arguments.steps or round(arguments.budget * default_steps(preset))
         plans = make_plans(sets, variants, arguments.seeds, steps, preset, covered=arguments.steps is None)
         poses: dict[str, str] = {}
         for name in sets:

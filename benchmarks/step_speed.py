@@ -46,7 +46,7 @@ PARTS = (
     "defaults", "ambiguity", "reflection", "planar", "eikonal", "all",
     "ambiguity-paper", "visibility-paper", "visibility-mesh", "reflection-paper", "planar-paper", "eikonal-paper",
     "all-paper",
-    "density-neus", "scale-learned", "gradients-numerical", "planar-mlp",
+    "density-neus", "scale-learned", "gradients-numerical",
     "rays-even", "colors-16", "samples-16", "background-16",
 )  # fmt: skip
 PARTS_PROGRESS = 0.5  # all parts at work

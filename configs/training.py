@@ -27,7 +27,7 @@ class FieldParams(Section):
         description="what the radiance MLP knows of the view: its direction, or the reflected one and n.v too",
     )
     colors: Literal["shaded", "network"] = Field(
-        "network",
+        "shaded",
         description="shaded: albedo times the light that normal and surroundings let in, and the radiance MLP where "
         "that does not explain the photos; network: the radiance MLP alone",
     )
@@ -107,9 +107,7 @@ class LossParams(Section):
     eikonal: float = Field(0.1, ge=0, description="weight of the Eikonal term")
     mask: float = Field(0.1, ge=0, description="weight of the mask term, where the masks alone count")
     exposure: float = Field(0.1, ge=0, description="weight that holds the photos' gains at 1")
-    gloss: float = Field(
-        0.01, ge=0, description="weight of what is not shaded in the colours; a twentieth where photos deny each other"
-    )
+    gloss: float = Field(0.01, ge=0, description="weight of what is not shaded in the colours, which holds them to be")
     sparse: float = Field(1.0, ge=0, description="weight of the SfM points' terms, faded out")
     sparse_until: float = Field(0.8, ge=0, le=1, description="progress at which the SfM points' term is gone")
     sparse_tolerance: float = Field(0.005, gt=0, description="SfM points off by this count linearly, scene units")

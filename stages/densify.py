@@ -222,7 +222,7 @@ def _explained(trust: np.ndarray, asked: np.ndarray | None) -> float:
 
 DENSIFY: Stage[HeldOutDensifyParams] = Stage(
     name="densify",
-    version=4,
+    version=5,
     settings=lambda config: HeldOutDensifyParams(**config.densify.model_dump(), hold_out=config.train.hold_out),
     run=run,
     reads=(FIRST_SCENE, PINHOLE_PHOTOS, OUTLINES),

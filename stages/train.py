@@ -425,7 +425,7 @@ def _take_over(trainer: Any, context: StageContext[TrainParams], now: Sequence[s
     for i, contents in enumerate(now):
         if contents in row:
             gains[i] = weights["log_gains"][row[contents]]
-    fields.load_state_dict({**weights, "log_gains": gains})
+    fields.load_state_dict({**weights, "log_gains": gains, "radiance.shiny": fields.radiance.shiny})
     return True
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import itertools
 import json
 from dataclasses import asdict, replace
@@ -95,6 +96,14 @@ def test_every_part_can_be_left_out_and_all_but_one_left():
             assert len(rest) < len(VARIANTS[ablate.ALL[form]])
 
 
+@pytest.mark.parametrize("term", ["ambiguity", "reflection", "planar", "eikonal"])
+def test_a_term_as_published_is_that_of_the_paper_preset(term):
+    published = getattr(load_config("paper", None, []).train.terms, term)
+    for variant in (f"{term}-paper", "all-paper"):
+        plan = replace(_plan(), settings=settings_of(variant, VARIANTS[variant]))
+        assert getattr(load_config("cpu", None, plan.sets).train.terms, term) == published
+
+
 def test_variants_are_named_one_by_one_or_by_group():
     assert list(ablate.named_variants("planar,terms")) == [BASE, DEFAULTS, "planar"]
     assert list(ablate.named_variants("steps")) == list(ablate.GROUPS["steps"])
@@ -124,8 +133,8 @@ def test_an_extra_variant_is_named_settings_on_top_of_the_base_or_of_a_variant()
     assert parse_extra("far:reflection_reach=0.3,cleanup.min_views=2") == (
         "far", {"train.terms.reflection.reach": "0.3", "cleanup.min_views": "2"}
     )  # fmt: skip
-    _, changes = parse_extra("far:planar-mlp,weight_planar=0.3")
-    assert changes == {**VARIANTS["planar-mlp"], "train.terms.planar.weight": "0.3"}
+    _, changes = parse_extra("far:planar-paper,weight_planar=0.3")
+    assert changes == {**VARIANTS["planar-paper"], "train.terms.planar.weight": "0.3"}
     assert load_config("cpu", None, settings_of("far", changes)).train.terms.planar.weight == 0.3
 
 
@@ -236,6 +245,43 @@ def test_every_row_of_the_papers_ablation_is_a_variant():
 
 
 # ---------------------------------------------------------------- running
+def test_runs_of_settings_before_something_changed_are_not_in_the_tables(here):
+    now, before = _plan("planar"), _plan("planar", 1)
+    otherwise = replace(now, seed=2, settings=(*now.settings, "train.terms.planar.weight=0.3"))
+    no_more = replace(now, variant="far", settings=("train.no_such=1",))
+    for plan in (now, otherwise):
+        save_run(_run(mean=1.0 + 8 * plan.seed, plan=plan, config=ablate.config_hash(plan)))
+    for plan in (before, no_more):
+        save_run(_run(mean=9.0, plan=plan, config="s"))
+    table = ablate.tables()["ablation"]
+    assert table.splitlines()[4].replace(" ", "").startswith("|planar|1500|1|1.000|")
+    assert table.splitlines()[5] == ""
+    assert table.endswith("Left out: 3 runs from before variants, presets or defaults changed.")
+    for run in ablate.RUNS.glob("*.json"):
+        if "planar-0" not in run.name:
+            run.unlink()
+    assert "Left out" not in ablate.tables()["ablation"]
+
+
+def test_all_that_the_stages_measured_import_is_in_the_hash_of_their_code():
+    """But what reads, writes and says, and the settings, which have a hash of their own."""
+    stages = ablate.ROOT / "stages"
+    seen, pending = set(), [f"stages.{name}" for name in ("train", "extract", "cleanup")]
+    while pending:
+        module = stages.parent.joinpath(*pending.pop().split("."))
+        source = next((s for s in (module.with_suffix(".py"), module / "__init__.py") if s.is_file()), None)
+        if source is None or source in seen:
+            continue
+        seen.add(source)
+        for node in ast.walk(ast.parse(source.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("stages"):
+                pending += [node.module, *(f"{node.module}.{name.name}" for name in node.names)]
+    parts = {source.relative_to(stages).parts[0] for source in seen}
+    assert {"train.py", "neural", "surface", "geometry"} <= parts
+    elsewhere = {"__init__.py", "artifacts", "caches.py", "engine", "errors.py", "inputs"}
+    assert parts - elsewhere == set(ablate.SOURCES)
+
+
 def test_results_survive_their_files_in_the_order_of_the_variants(here):
     runs = [_run(), _run(seed=1), _run("planar"), _run("all", mean=None)]
     for run in reversed(runs):
@@ -250,7 +296,7 @@ def test_runs_that_have_a_result_are_skipped_and_a_failure_stops_no_other(here, 
         made.append(plan.name)
         if plan.name == "scan-planar-1":
             raise RuntimeError("no")
-        save_run(_run(plan=plan, steps=plan.steps))
+        save_run(_run(plan=plan, steps=plan.steps, config=ablate.config_hash(plan)))
 
     monkeypatch.setattr(ablate, "run_apart", run_apart)
     monkeypatch.setattr(ablate, "poses_hash", lambda folder: "p")
@@ -276,6 +322,7 @@ def test_runs_that_have_a_result_are_skipped_and_a_failure_stops_no_other(here, 
     page = (here / "page.md").read_text()
     assert page.startswith("top\n")
     assert "| planar | 10 |" in page
+    assert "| planar | 9 |" not in page
     for wrong in (["--variants", "plane"], ["--extra", "far"]):
         with pytest.raises(SystemExit):
             ablate.main([*command, *wrong])
@@ -283,11 +330,20 @@ def test_runs_that_have_a_result_are_skipped_and_a_failure_stops_no_other(here, 
 
 def test_all_sets_with_a_truth_are_run_and_those_named(here, monkeypatch):
     made = []
-    monkeypatch.setattr(ablate, "run_plans", lambda plans, *_: made.extend((p.set, p.holdout) for p in plans) or [])
+    monkeypatch.setattr(ablate, "run_plans", lambda plans, *_: made.extend(plans) or [])
     command = [str(here / "data"), "--variants", BASE, "--seeds", "1"]
     ablate.main(command)
     ablate.main([*command[:1], "scan", *command[1:]])
-    assert made == [("helmet", 0), ("scan", ablate.HOLDOUT)]
+    assert [(plan.set, plan.holdout) for plan in made] == [("helmet", 0), ("scan", ablate.HOLDOUT)]
+
+
+def test_a_budget_is_of_the_steps_of_the_preset(here, monkeypatch):
+    made = []
+    monkeypatch.setattr(ablate, "run_plans", lambda plans, *_: made.extend(plan.steps for plan in plans) or [])
+    for preset in ("cpu", "demo"):
+        ablate.main([str(here / "data"), "--variants", BASE, "--seeds", "1", "--budget", "2", "--preset", preset])
+    assert made == [2 * load_config(preset, None, []).train.steps for preset in ("cpu", "demo")]
+    assert made[0] != made[1]
 
 
 def test_a_process_of_its_own_has_one_thread_and_says_what_failed(here, monkeypatch):
@@ -366,6 +422,8 @@ def test_the_command_of_a_run_makes_that_run_again():
     name, changes = parse_extra("far:planar,weight_planar=0.3")
     words = ablate.command(Plan("helmet", name, 0, 9, "cpu", settings_of(name, changes))).split()
     assert parse_extra(words[words.index("--extra") + 1]) == (name, changes)
+    whole = Plan("helmet", DEFAULTS, 0, load_config("demo", None, []).train.steps, "demo", (), covered=True)
+    assert "--budget 1 --preset demo" in ablate.command(whole)
     late = Plan("helmet", "defaults-late", 0, 16000, "cpu", ("train.schedule.coarse_until=0.6",), covered=True)
     assert ablate.command(late) == (
         "python -m benchmarks.ablate DATA helmet --budget 2 --preset cpu --variants defaults "

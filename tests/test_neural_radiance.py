@@ -1,10 +1,8 @@
-import math
-
 import pytest
 import torch
 
-from stages.neural.losses import gloss_error
-from stages.neural.radiance import REACHES, Radiance, openness
+from stages.neural.radiance import REACHES, Radiance, encoded_srgb, openness
+from stages.neural.sampling import SdfCache, beyond_too
 
 
 def directions(count: int, seed: int = 0) -> torch.Tensor:
@@ -85,22 +83,39 @@ def test_a_matte_colour_is_albedo_times_irradiance():
     albedo, _ = radiance.shading.albedo_and_gloss(features)
     light = radiance.shading.irradiance(points, normals, torch.ones(5, len(REACHES)))
     colors = radiance(points, normals, normals, features, lambda p: torch.full((len(p),), 9.0)).colors
-    torch.testing.assert_close(colors**2.2, albedo * light, rtol=1e-3, atol=1e-3)
+    torch.testing.assert_close(colors, encoded_srgb(albedo * light))
+
+
+def test_srgb_is_black_where_there_is_no_light_and_the_curve_of_the_standard():
+    linear = torch.tensor([0.0, 0.001, 0.0031308, 0.2140411, 1.0], requires_grad=True)
+    encoded = encoded_srgb(linear)
+    assert encoded.tolist() == pytest.approx([0, 0.01292, 0.04045, 0.5, 1], abs=1e-5)
+    encoded.sum().backward()
+    assert linear.grad.isfinite().all()
+    assert linear.grad.min() > 0
+
+
+def test_a_ball_that_fills_the_region_is_open():
+    cache = SdfCache(64, "cpu")
+    cache.refresh(lambda p: p.norm(dim=1) - 0.85)
+    normals = directions(20)
+    found = openness(lambda p: beyond_too(cache.lookup, p), 0.85 * normals, normals, torch.tensor(REACHES))
+    assert found[:, 1:].min() > 0.97
 
 
 def test_colours_give_finite_gradients_in_the_dark():
     radiance, features = made(), torch.rand(3, 4, requires_grad=True)
     with torch.no_grad():
-        radiance.shading.surface[-1].bias[:] = -30
+        radiance.shading.surface[-1].bias[:] = -200
     sees(radiance, directions(3), directions(3, 1), features).colors.sum().backward()
     assert features.grad.isfinite().all()
 
 
-# ---------------------------------------------------------------- what gloss costs
-def test_gloss_costs_where_nothing_is_known_to_shine():
-    gloss = torch.tensor([0.0, 0.5, 0.5, 0.5], requires_grad=True)
-    error = gloss_error(gloss, torch.tensor([0.0, 0.0, 1.0, 0.5]))
-    assert error.tolist() == pytest.approx([0, 0.5, 0.025, 0.2625])
-    error.sum().backward()
-    assert gloss.grad.min() > 0
-    assert math.isclose(gloss.grad[0], 1.0)
+def test_what_is_known_to_be_shiny_is_painted_by_the_network_alone():
+    radiance, normals, views, features = made(), directions(6), directions(6, 1), torch.rand(6, 4)
+    with torch.no_grad():
+        radiance.shading.surface[-1].bias[3] = -30
+    radiance.shiny.fill_(1)
+    colors, gloss = sees(radiance, normals, views, features)
+    torch.testing.assert_close(colors, radiance.network(torch.zeros(6, 3), normals, views, features))
+    assert gloss.tolist() == [1] * 6

@@ -235,6 +235,17 @@ def test_the_feature_mlp_is_trained_by_colours_where_a_stable_term_reads_it():
     assert literal.fields.appearance.head.weight.grad is None
 
 
+def test_one_photo_each_shows_what_it_shows_among_all():
+    photos = make_trainer(masks=True).photos
+    points = torch.rand(50, 3, generator=torch.Generator().manual_seed(0)) * 2 - 1
+    images = torch.arange(50) % len(photos)
+    colors, shown = photos.observe(points)
+    found, seen = photos.colors_at(images, points)
+    assert 5 < int(seen.sum()) < 45
+    assert (seen == shown[torch.arange(50), images]).all()
+    torch.testing.assert_close(found[seen], colors[torch.arange(50), images][seen])
+
+
 def planar_of(trainer: Trainer, low: int, high: int, progress: float = 0.5) -> float:
     """The planar term on photos of random colours between two grey levels."""
     generator = torch.Generator().manual_seed(0)
@@ -253,6 +264,12 @@ def test_the_planar_term_waits_and_then_looks_at_even_places_only():
     even = planar_of(trainer, 128, 128)
     assert even > 0.01
     assert planar_of(trainer, 0, 255) < 0.6 * even  # neighbours in the same pixel stay
+
+
+def test_the_planar_term_leaves_known_places_alone():
+    trainer = rough_trainer({"terms.planar.form": "stable"})
+    trainer.evidence.known.fill_(1)
+    assert planar_of(trainer, 128, 128) == pytest.approx(0, abs=1e-6)
 
 
 def test_the_planar_term_is_the_same_where_shapes_are_fixed(monkeypatch):

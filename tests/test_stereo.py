@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 from stereo_scene import around, camera, cameras, draw, first_hit, ring
 
 from stages.geometry.cameras import PinholeCameras
@@ -361,6 +362,27 @@ def test_what_all_find_but_less_exactly_than_the_rest_is_not_trusted(monkeypatch
     assert min(trusts(everywhere)) > 0.85 * on_mirror_alone
 
 
+@pytest.mark.parametrize("count", [2, 3, 12])
+def test_noise_that_is_the_same_everywhere_costs_no_trust_however_few_photos_there_are(count, monkeypatch):
+    """With two photos one is asked, and chance alone makes it twice as far off as usual over a whole window."""
+    cams = cameras([camera(center) for center in around(5.0 * np.arange(count))], [(160, 120)] * count, [190.0] * count)
+    views, rng = views_of(cams, 1000), np.random.default_rng(1)
+    noises = [gaussian_filter(rng.standard_normal((120, 160)), 10) for _ in range(count)]  # over 5 cells of votes
+    spread = 0.15 * 2 * tolerance_of(views[0])
+    depths = [
+        (depth * (1 + spread * noise / noise.std())).astype(np.float32)
+        for depth, noise in zip(draw(cams).depths, noises, strict=True)
+    ]
+
+    def mean_trust() -> float:
+        trust = trust_of(views, [depth.copy() for depth in depths])
+        return float(np.concatenate([t[d > 0] for t, d in zip(trust, depths, strict=True)]).mean())
+
+    noisy = mean_trust()
+    monkeypatch.setattr("stages.stereo.trust.SCATTER", (98.0, 99.0))
+    assert 0.95 * mean_trust() < noisy < mean_trust()
+
+
 def test_what_most_that_agree_find_inexactly_is_not_trusted():
     def trust(doubted: int, apart: float = 0.04) -> float:
         counts = np.zeros((20, 20, 5), np.float32)
@@ -370,8 +392,9 @@ def test_what_most_that_agree_find_inexactly_is_not_trusted():
     assert trust(0) == 1
     assert trust(2) == 1
     assert 0.3 < trust(3) < 0.7
-    assert trust(4) == pytest.approx(0, abs=1e-6)
-    assert trust(0, apart=0.04 * 1.8**2) == pytest.approx(0, abs=1e-3)
+    assert trust(5) == pytest.approx(0, abs=1e-6)
+    assert trust(0, apart=0.04 * 1.59**2) == 1
+    assert trust(0, apart=0.04 * 1.83**2) == pytest.approx(0, abs=1e-3)
 
 
 def _pixels(view: View) -> np.ndarray:

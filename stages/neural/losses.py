@@ -15,8 +15,6 @@ from torch import Tensor
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-# Where something is surely shiny, what is not shaded costs this part of what it costs elsewhere.
-_SHINY_COST = 0.05
 # Keeps the norm's gradient finite where prediction and photo agree; far below one 8-bit grey level (4e-3).
 _NORM_EPSILON = 1e-3
 
@@ -73,11 +71,3 @@ def mask_error(opacity: Float[Tensor, " r"], mask: Float[Tensor, " r"]) -> Float
 def exposure_error(log_gains: Float[Tensor, "i 3"]) -> Float[Tensor, "i 3"]:
     """Squared log gain per photo and channel: holds the photos' mean exposure at 1."""
     return log_gains**2
-
-
-def gloss_error(gloss: Float[Tensor, " r"], shiny: Float[Tensor, "*#r"]) -> Float[Tensor, " r"]:
-    """Gloss, in [0, 1], of each ray, where nothing says that the place is shiny; a twentieth of it where it surely is.
-
-    Holds colours to be shaded wherever that explains the photos as well. shiny in [0, 1], see `Evidence.shiny`.
-    """
-    return gloss * (1 - (1 - _SHINY_COST) * shiny)

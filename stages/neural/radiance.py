@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor, nn
 
+from stages.neural.evidence import SIDE, at_places
 from stages.neural.mlp import mlp, spherical_harmonics
 
 if TYPE_CHECKING:
@@ -26,15 +27,15 @@ REACHES = (0.02, 0.05, 0.1, 0.2, 0.4)
 _WIDTH = 32
 # Part of the colour that is the network's at the start: a polished thing takes harm from less, as its shape begins.
 _GLOSS_LOGIT = 2.0
-# What sRGB's curve comes to, and what keeps its slope finite in the dark: an eighth of a grey level.
-_GAMMA, _DARK = 2.2, 5e-4
+# Linear values up to here are straight in sRGB (IEC 61966-2-1).
+_STRAIGHT = 0.0031308
 
 
 class Colored(NamedTuple):
     """What a surface looks like.
 
     Attributes:
-        colors: sRGB in [0, 1]; a little more where the light is glaring.
+        colors: sRGB in [0, 1]; more where the light is glaring.
         gloss: part of the colour that is not shaded, in [0, 1].
     """
 
@@ -56,6 +57,12 @@ def openness(
     with torch.no_grad():
         places = points[:, None] + reaches[:, None] * normals[:, None]
         return (sdf(places.view(-1, 3)).view(-1, len(reaches)) / reaches).clamp(0, 1)
+
+
+def encoded_srgb(linear: Float[Tensor, "*any"]) -> Float[Tensor, "*any"]:
+    """sRGB of linear values that are not negative, with a finite slope everywhere (IEC 61966-2-1)."""
+    curved = 1.055 * linear.clamp(min=_STRAIGHT) ** (1 / 2.4) - 0.055
+    return torch.where(linear > _STRAIGHT, curved, 12.92 * linear)
 
 
 class RadianceNetwork(nn.Module):
@@ -120,8 +127,14 @@ class Shading(nn.Module):
 class Radiance(nn.Module):
     """(1 - g) sRGB(albedo x irradiance) + g c, with gloss g and the colour c of a `RadianceNetwork`.
 
-    Without `shaded` the network's colour alone, as in the paper: gloss is 1 everywhere.
+    Without `shaded` the network's colour alone, as in the paper: gloss is 1 everywhere. So it is where something is
+    known to be shiny: to explain reflections by shading would dent it.
+
+    Attributes:
+        shiny: `stages.neural.evidence.Evidence.shiny`; nothing at first.
     """
+
+    shiny: Tensor
 
     def __init__(
         self, features: int, layers: int, width: int, reflected: bool, shaded: bool, generator: torch.Generator
@@ -129,6 +142,7 @@ class Radiance(nn.Module):
         super().__init__()
         self.network = RadianceNetwork(features, layers, width, reflected, generator)
         self.shading = Shading(features, generator) if shaded else None
+        self.register_buffer("shiny", torch.zeros(1, 1, *3 * [SIDE]))
 
     def forward(
         self,
@@ -144,5 +158,6 @@ class Radiance(nn.Module):
             return Colored(colors, torch.ones(len(points), device=points.device))
         albedo, gloss = self.shading.albedo_and_gloss(features)
         light = self.shading.irradiance(points, normals, openness(sdf, points, normals, self.shading.reaches))
-        matte = (albedo * light + _DARK) ** (1 / _GAMMA)
+        gloss = torch.maximum(gloss, at_places(self.shiny, points).unsqueeze(1))
+        matte = encoded_srgb(albedo * light)
         return Colored(torch.lerp(matte, colors, gloss), gloss.squeeze(1))

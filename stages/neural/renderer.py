@@ -18,7 +18,7 @@ from stages.neural.proposal import proposal_distances
 from stages.neural.radiance import Colored
 from stages.neural.rendered import Rendered
 from stages.neural.rendering import composite, ray_means, rendering_weights, weights_from_optical_depth
-from stages.neural.sampling import SdfCache, free_outside, importance_distances, stratified
+from stages.neural.sampling import SdfCache, beyond_too, importance_distances, stratified
 from stages.neural.schedules import Moment
 from stages.neural.terms import Terms
 from stages.neural.training_photos import RayBatch
@@ -156,8 +156,8 @@ class Renderer:
         return Colored(opacity * colors, opacity.detach().squeeze(1) * gloss)
 
     def _surroundings(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
-        """The cached SDF; nothing outside the sphere."""
-        return free_outside(self.cache.lookup(points), torch.linalg.vector_norm(points, dim=1))
+        """The cached SDF, also outside the sphere."""
+        return beyond_too(self.cache.lookup, points)
 
     def _background(
         self,

@@ -87,6 +87,12 @@ def free_outside(sdf: Float[Tensor, "*any"], radius: Float[Tensor, "*any"]) -> F
     return torch.maximum(sdf, radius - 1)
 
 
+def beyond_too(sdf: Callable[[Tensor], Tensor], points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
+    """f at points; outside the unit sphere that of the nearest point of the sphere, and how far that is."""
+    radius = torch.linalg.vector_norm(points, dim=1).clamp(min=1)
+    return sdf(points / radius[:, None]) + radius - 1
+
+
 class SdfCache:
     """The SDF on a regular grid over [-1, 1]^3, refreshed now and then; what sampling and visibility read.
 

@@ -13,7 +13,7 @@ from torch import Tensor
 from stages.neural.acceleration import points_at_a_time
 from stages.neural.encoding_shapes import Encoding, Frequencies, HashGrid
 from stages.neural.fields import Fields, FieldShape
-from stages.neural.sampling import free_outside
+from stages.neural.sampling import beyond_too
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Float32
@@ -49,7 +49,7 @@ class TrainedField:
         """sRGB colour in [0, 1] of surface points seen along unit view_dirs (camera to point)."""
 
         def surroundings(p: Tensor) -> Tensor:
-            return free_outside(self.fields.sdf.sdf(p, self.levels), torch.linalg.vector_norm(p, dim=1))
+            return beyond_too(lambda q: self.fields.sdf.sdf(q, self.levels), p)
 
         def evaluate(p: Tensor, n: Tensor, v: Tensor) -> Tensor:
             _, features, _ = self.fields.sdf(p, self.levels)

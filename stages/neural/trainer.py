@@ -78,6 +78,7 @@ class Trainer:
         self.device = torch.device(device)
         background = params.field.background and photos.masks is None
         self.fields = Fields(field_shape(params, len(photos), background), params.seed).to(device)
+        self.fields.radiance.shiny.copy_(self.evidence.shiny)
         self.mixed = is_mixed(params.precision, self.device)
         if self.mixed:
             self.fields.use_mixed_precision()
@@ -190,7 +191,7 @@ class Trainer:
         dense_loss = sighting_loss(
             rendered.extra_sdf[first:last], dense.weights, weights.dense_tolerance, weights.dense_step
         )
-        gloss_loss = losses.gloss_error(rendered.gloss, self.evidence.shiny(rendered.surface[0])).mean()
+        gloss_loss = rendered.gloss.mean()
         exposure_loss = losses.exposure_error(self.fields.log_gains).mean()
         proposal_loss = self._proposal_loss(rendered)
 

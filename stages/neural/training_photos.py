@@ -103,24 +103,25 @@ class Photos:
         masks, off the photo's mask; the colour means nothing then.
         """
         in_pixels = torch.einsum("iab,pib->pia", self.pixel_from_scene, points[:, None] - self.centers)
-        depth = in_pixels[..., 2]
-        x, y = (in_pixels[..., :2] / depth.clamp(min=1e-6).unsqueeze(2)).floor().long().unbind(2)
-        width, height = self.sizes.unbind(1)
-        inside = (depth > 0) & (x >= 0) & (x < width) & (y >= 0) & (y < height)
-        rows = (self.first + y * width + x).masked_fill(~inside, 0)
-        if self.masks is not None:
-            inside &= self.masks[rows] > 127
-        return self.pixels[rows].float() / 255, inside
+        return self._shown(in_pixels, self.first, self.sizes)
 
     def colors_at(
         self, images: Int[Tensor, " r"], points: Float[Tensor, "r 3"]
     ) -> tuple[Float[Tensor, "r 3"], Bool[Tensor, " r"]]:
         """What one photo each shows at scene points, as `observe` does of all."""
         in_pixels = torch.bmm(self.pixel_from_scene[images], (points - self.centers[images]).unsqueeze(2)).squeeze(2)
-        depth, size = in_pixels[:, 2], self.sizes[images]
-        place = (in_pixels[:, :2] / depth.clamp(min=1e-6).unsqueeze(1)).floor().long()
-        inside = (depth > 0) & ((place >= 0) & (place < size)).all(1)
-        rows = (self.first[images] + place[:, 1] * size[:, 0] + place[:, 0]).masked_fill(~inside, 0)
+        return self._shown(in_pixels, self.first[images], self.sizes[images])
+
+    def _shown(
+        self, in_pixels: Float[Tensor, "*any 3"], first: Int[Tensor, "*#any"], sizes: Int[Tensor, "*#any 2"]
+    ) -> tuple[Float[Tensor, "*any 3"], Bool[Tensor, "*any"]]:
+        """Colours at homogeneous pixels of photos with these first rows and sizes, and whether they may show them."""
+        depth = in_pixels[..., 2]
+        place = (in_pixels[..., :2] / depth.clamp(min=1e-6).unsqueeze(-1)).floor().long()
+        inside = (depth > 0) & ((place >= 0) & (place < sizes)).all(-1)
+        rows = (first + place[..., 1] * sizes[..., 0] + place[..., 0]).masked_fill(~inside, 0)
+        if self.masks is not None:
+            inside &= self.masks[rows] > 127
         return self.pixels[rows].float() / 255, inside
 
     def directions(self, images: Int[Tensor, " r"], pixels: Float[Tensor, "r 2"]) -> Float[Tensor, "r 3"]:

@@ -16,8 +16,8 @@ _SAME_SURFACE = 1.0
 _WIDE, _FACING = 0.5, 0.2
 # Neighbouring depths that differ by more than this part of them are two surfaces: no normal spans both.
 _NEAR = 0.05
-# In `known` of `votes`.
-_DOUBTED = 2
+# In `known` of `votes`: found less exactly than is usual.
+INEXACT = 2
 
 
 @njit(nogil=True, cache=True)
@@ -199,5 +199,5 @@ def votes(
             elif found >= z - margin:
                 agree += 1
                 apart += ((found - z) / margin) ** 2
-                doubted += known[at] == _DOUBTED
+                doubted += known[at] == INEXACT
         counts[k, 0], counts[k, 1], counts[k, 2], counts[k, 3], counts[k, 4] = asked, agree, through, apart, doubted

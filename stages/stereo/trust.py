@@ -35,6 +35,10 @@ LEAST_SCATTER = 0.15
 # full, from the second on not at all. It is a half on what is left of the cap; one in twenty places of the plaster part
 # has more than 0.15, of the helmet 0.06.
 DOUBTED = (0.3, 0.5)
+# Both are believed as far as n^2 / (n^2 + FEW), of n photos that are asked: of one or two, many are off by chance. By
+# those asked, not by those that agree: where few of many agree, that these scatter is no chance. Squared, for with n
+# the suite's mirror would get back a third of the trust that it loses.
+FEW = 2
 # Trust from which a place hides what is behind it.
 KNOWN = 0.5
 # So many photos are asked at most of what one shows, and so many of its places choose them: the cost is to grow with
@@ -79,27 +83,49 @@ def trust_of(views: Sequence[View], depths: list[Float32[np.ndarray, "h w"]]) ->
     )
     owned = list(enumerate(zip(views, depths, strict=True)))
     nothing = np.zeros(len(photos.depths), np.uint8)
-    scatters = []
+    first = []
     for k, each in owned:
-        trust, scatter = _judged(k, *each, photos, nothing, np.inf)
-        scatters.append(np.where(trust > KNOWN, scatter, np.inf).astype(np.float16))
-    usual = _usual(scatters)
-    known = np.concatenate([_known(s, usual, depth).ravel() for s, depth in zip(scatters, depths, strict=True)])
+        trust, scatter, asked = _judged(k, *each, photos, nothing, np.inf)
+        first.append((scatter.astype(np.float16), np.where(trust > KNOWN, asked, 0).astype(np.float16)))
+    usual = _usual([scatter[asked > 0] for scatter, asked in first])
+    known = np.concatenate([_known(*each, usual, depth).ravel() for each, depth in zip(first, depths, strict=True)])
     return [_upsampled(_judged(k, *each, photos, known, usual)[0], depths[k]) for k, each in owned]
 
 
-def _usual(scatters: Sequence[Float[np.ndarray, "a b"]]) -> float:
+def _usual(scatters: Sequence[Float[np.ndarray, " n"]]) -> float:
     """Scatter of the set's trusted places, the median of the photos' medians; infinite where nothing is trusted."""
-    medians = [np.median(known) for scatter in scatters if len(known := scatter[np.isfinite(scatter)])]
+    medians = [np.median(known) for known in scatters if len(known)]
     return max(LEAST_SCATTER, float(np.median(medians))) if medians else np.inf
 
 
 def _known(
-    scatter: Float[np.ndarray, "a b"], usual: float, depth: Float32[np.ndarray, "h w"]
+    scatter: Float[np.ndarray, "a b"],
+    asked: Float[np.ndarray, "a b"],
+    usual: float,
+    depth: Float32[np.ndarray, "h w"],
 ) -> UInt8[np.ndarray, "h w"]:
-    """1 where a place is known to be there, 2 where it is found less exactly than is usual, 0 elsewhere."""
-    trusted = np.isfinite(scatter)
-    return _upsampled(trusted * (1.0 + (scatter > SCATTER[0] * usual)), depth).astype(np.uint8)
+    """1 where a place is known to be there, INEXACT where its scatter is more than is usual, 0 elsewhere.
+
+    Args:
+        scatter, asked: see `_trust`; none asked where it is not known.
+    """
+    from stages.stereo.depth_kernels import INEXACT
+
+    inexact = _times_usual(scatter, asked, usual) > SCATTER[0]
+    return _upsampled(np.where(inexact, INEXACT, 1) * (asked > 0), depth).astype(np.uint8)
+
+
+def _times_usual(
+    scatter: Float[np.ndarray, "a b"], asked: Float[np.ndarray, "a b"], usual: float
+) -> Float[np.ndarray, "a b"]:
+    """Scatter as a multiple of what is usual, the nearer to 1 the fewer photos are asked."""
+    believed = _believed(asked)
+    squares: np.ndarray = believed * (scatter / usual) ** 2 + 1 - believed
+    return np.sqrt(squares)
+
+
+def _believed(asked: Float[np.ndarray, "a b"]) -> Float[np.ndarray, "a b"]:
+    return asked**2 / (asked**2 + FEW)
 
 
 def _in_one(maps: list[Float32[np.ndarray, "h w"]]) -> Float32[np.ndarray, " all"]:
@@ -120,9 +146,9 @@ def _judged(
     photos: _Photos,
     known: UInt8[np.ndarray, " all"],
     usual: float,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Trust and scatter [a, b] of every other of one photo's pixels, where places `known` to be there hide what is
-    behind them; see `_known` and `_trust`."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Trust, scatter and photos asked [a, b] of every other of one photo's pixels, where places `known` to be there
+    hide what is behind them; see `_known` and `_trust`."""
     from stages.stereo import depth_kernels
 
     rows, columns = np.nonzero(depth[::_STRIDE, ::_STRIDE] > 0)
@@ -171,8 +197,8 @@ def normals_at(
     return in_frame
 
 
-def _trust(counts: Float32[np.ndarray, "a b 5"], usual: float) -> tuple[np.ndarray, np.ndarray]:
-    """Trust and scatter [a, b] of places, from the votes on them and on the places around.
+def _trust(counts: Float32[np.ndarray, "a b 5"], usual: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Trust, scatter and photos asked [a, b] of places, from the votes on them and on the places around.
 
     The scatter is how far photos that agree are from the place, a root mean square in parts of the tolerance. What is
     seen in a small convex mirror lies at almost the same place for all of them, but only almost.
@@ -193,11 +219,12 @@ def _trust(counts: Float32[np.ndarray, "a b 5"], usual: float) -> tuple[np.ndarr
     uncontradicted = agree / np.maximum(agree + through, 1)
     scatter = np.sqrt(np.maximum(apart, 0) / np.maximum(agree, 1))  # sums over moving windows end a little below 0
     trust = _ramp(support, *SUPPORT) * _ramp(uncontradicted, *UNCONTRADICTED)
-    trust *= 1 - _ramp(scatter / usual, *SCATTER)
-    trust *= 1 - _ramp(doubted / np.maximum(agree, 1), *DOUBTED)
+    asked = asked / np.maximum(around, 1)
+    trust *= 1 - _ramp(_times_usual(scatter, asked, usual), *SCATTER)
+    trust *= 1 - _ramp(_believed(asked) * doubted / np.maximum(agree, 1), *DOUBTED)
     alone = (counts[..., 1] == 0) | (counts[..., 2] > counts[..., 1])
     trust[alone] = 0  # at an outline, what is around does not speak for it
-    return trust, scatter
+    return trust, scatter, asked
 
 
 def _ramp(value: np.ndarray, low: float, high: float) -> np.ndarray:

@@ -13,6 +13,7 @@ from torch import Tensor
 from configs.training import PlanarParams, TermParams
 from stages.neural import losses, schedules
 from stages.neural.acceleration import first_rows, fixed_shapes
+from stages.neural.evidence import at_places
 from stages.neural.rendered import OPAQUE, Rendered
 from stages.neural.schedules import Moment
 from stages.neural.terms.term import Term
@@ -42,7 +43,7 @@ def planar_error_literal(
     return (sdf / length - torch.einsum("qc,qkc->qk", normals, offsets) / length).abs()
 
 
-def evenness(difference: Float[Tensor, " q"], least: float = _NOISE) -> Float[Tensor, " q"]:
+def evenness(difference: Float[Tensor, " q"], tau: float = _NOISE) -> Float[Tensor, " q"]:
     """lambda_pla = exp(-|C(p) - C(p_0)| / tau) per pair of pixels of a photo, tau = 0.02 (paper lambda_pla^k).
 
     Args:
@@ -51,11 +52,11 @@ def evenness(difference: Float[Tensor, " q"], least: float = _NOISE) -> Float[Te
     Near 1 where the photo shows one even colour, so that nothing but the light can differ: there the surface is flat,
     as far as anybody can tell. The paper compares features that training may choose, with tau = 1e-3.
     """
-    return torch.exp(-difference / least)
+    return torch.exp(-difference / tau)
 
 
 def bending_error(normals: Float[Tensor, "q 3"], others: Float[Tensor, "q 3"]) -> Float[Tensor, " q"]:
-    """|n_k - n_0| of unit normals per pair, smoothed below a degree (paper L_planar, of which it is the derivative).
+    """|n_k - n_0| of unit normals per pair, smoothed below half a degree (in place of the paper's L_planar).
 
     Zero on a plane, wherever f's zero is; on an edge every pair across it counts alike, so that edges stay sharp. The
     paper asks f(x_k) to be linear along the ray, and divides by the distance: an x_0 that is off by 1e-3 then outweighs
@@ -138,7 +139,7 @@ class Planar(Term):
         difference = (colors - rendered.batch.colors[chosen]).abs().mean(1)
         _, _, gradients = self.fields.sdf(torch.cat([surface, beside]), moment.levels)
         here, there = torch.nn.functional.normalize(gradients, dim=1).chunk(2)
-        unknown = 1 - self.evidence.known(surface)
+        unknown = 1 - at_places(self.evidence.known, surface)
         return (shown * unknown * evenness(difference) * bending_error(here, there)).mean()
 
     def _beside(self, normals: Float[Tensor, "q 3"]) -> Float[Tensor, "q 3"]:
