@@ -156,6 +156,12 @@ class UndistortParams(Section):
     mask_erode: int = Field(
         0, ge=0, description="masks shrink by this many pixels (at the undistorted size), and the object with them"
     )
+    masks: Literal["auto", "alone", "beside"] = Field(
+        "auto",
+        description="alone: what is off the masks is not looked at; beside: whole photos count, and masks say where "
+        "the object ends; auto: beside where the background stood still, by the points found on it. Masks of "
+        "`ingest.auto_mask=salient` are always beside",
+    )
     roi_scale: float = Field(1.0, gt=0, description="the region of interest found automatically is scaled by this")
     subject: int = Field(
         1, ge=1, description="where photos are about things far apart: which of them; 1 is what most photos are about"

@@ -106,10 +106,6 @@ class LossParams(Section):
 
     eikonal: float = Field(0.1, ge=0, description="weight of the Eikonal term")
     mask: float = Field(0.1, ge=0, description="weight of the mask term, where the masks alone count")
-    silhouette: float = Field(
-        1.0, ge=0, description="weight of the outlines' term, where whole photos count beside the masks"
-    )
-    silhouette_batch: int = Field(256, ge=0, description="lines of sight on masks per step, for that term")
     exposure: float = Field(0.1, ge=0, description="weight that holds the photos' gains at 1")
     gloss: float = Field(0.01, ge=0, description="weight of what is not shaded in the colours, which holds them to be")
     sparse: float = Field(1.0, ge=0, description="weight of the SfM points' terms, faded out")

@@ -171,7 +171,7 @@ MovingObject = Annotated[
     typer.Option(
         "--moving-object",
         help="The object was moved between photos, as turned over for a second pass: only what its masks show counts; "
-        "without --masks, a network makes them. Sets sfm.masks, place.gps and ingest.auto_mask.",
+        "without --masks, a network makes them. Sets sfm.masks, undistort.masks, place.gps and ingest.auto_mask.",
     ),
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout.")]
@@ -199,6 +199,7 @@ def settings(
         "cleanup.keep_closed": watertight or None,
         "sfm.deterministic": deterministic or None,
         "sfm.masks": "always" if moving_object else None,
+        "undistort.masks": "alone" if moving_object else None,
         "place.gps": False if moving_object else None,  # the cameras' places against the object are others
         "ingest.auto_mask": "object" if moving_object and not chosen else None,
         "ingest.own_masks": False if no_masks else None,

@@ -14,6 +14,7 @@ from stages.artifacts import (
     CLEAN_FULL_MESH,
     CLEAN_MESH,
     GIVEN_REGION,
+    OUTLINES,
     PINHOLE_PHOTOS,
     RAW_MESH,
     SCENE,
@@ -87,7 +88,7 @@ def run(context: StageContext[CleanupParams]) -> dict[str, Any]:
     large, numbers["specks_dropped"] = selection.large_pieces(faces, SPECK * params.min_component)
     keep(large, "speck_faces", "Try `--set cleanup.min_component=0`.")
     if params.mask_hull:
-        alone, beside = context.read(PINHOLE_PHOTOS), context.read(SILHOUETTES)
+        alone, beside = context.read(PINHOLE_PHOTOS), [context.read(OUTLINES), context.read(SILHOUETTES)]
         outside = _outside_masks(vertices, faces, cameras, alone, beside, params)
         within = np.count_nonzero(outside[faces], axis=1) < 2
         keep(
@@ -142,16 +143,17 @@ def _outside_masks(
     faces: np.ndarray,
     cameras: PinholeCameras,
     alone: Pictures,
-    beside: Pictures,
+    beside: Sequence[Pictures],
     params: CleanupParams,
 ) -> np.ndarray:
     """Vertices [V] bool that are off too many masks; those beside whole photos do not cut what enough show on them."""
     from stages.surface import selection
 
-    masks = partial(_masks, [alone, beside], cameras)
-    most = max(params.mask_outside, BESIDE_OUTSIDE) if beside.masks.exists() else params.mask_outside
+    masks = partial(_masks, [alone, *beside], cameras)
+    are_beside = any(folder.masks.exists() for folder in beside)
+    most = max(params.mask_outside, BESIDE_OUTSIDE) if are_beside else params.mask_outside
     outside = selection.outside_hull(vertices, cameras, masks(params.mask_margin), most)
-    if beside.masks.exists():  # no margin: the table shows in it
+    if are_beside:  # no margin: the table shows in it
         outside &= ~selection.shown_on_masks(vertices, faces, cameras, masks(0), outside, BESIDE_SHOWN)
     return outside
 
@@ -226,7 +228,7 @@ CLEANUP: Stage[CleanupParams] = Stage(
     version=10,
     settings=lambda config: config.cleanup,
     run=run,
-    reads=(SCENE, PINHOLE_PHOTOS, SILHOUETTES, GIVEN_REGION, RAW_MESH),
+    reads=(SCENE, PINHOLE_PHOTOS, OUTLINES, SILHOUETTES, GIVEN_REGION, RAW_MESH),
     writes=(CLEAN_MESH, CLEAN_FULL_MESH),
     summary="floaters and unseen shells gone, manifold, decimated",
 )

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from configs.params import HeldOutDensifyParams
-from stages.artifacts import DEPTH_MAPS, FIRST_SCENE, PINHOLE_PHOTOS, POINT_CLOUD, Pictures
+from stages.artifacts import DEPTH_MAPS, FIRST_SCENE, OUTLINES, PINHOLE_PHOTOS, POINT_CLOUD, Pictures, given_mask_of
 from stages.engine.stage import Stage, StageContext
 from stages.errors import SystemRequirementError
 from stages.geometry.cameras import PosedScene
@@ -33,6 +33,7 @@ class _Capture:
     Attributes:
         used: index of each among all photos of the capture.
         pairs: two photos each, see `pairs_of`.
+        pictures: with the masks that alone count. outlines: with those beside whole photos.
     """
 
     scene: PosedScene
@@ -40,6 +41,7 @@ class _Capture:
     views: Sequence[View]
     pairs: Sequence[tuple[int, int]]
     pictures: Pictures
+    outlines: Pictures
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -59,10 +61,17 @@ class _Capture:
         return cv2.cvtColor(self.color(photo), cv2.COLOR_RGB2GRAY)
 
     def within(self, photo: int) -> np.ndarray | None:
-        """Whether each pixel [h, w] lies on the photo's mask, where it has one."""
+        """Whether each pixel [h, w] lies on the photo's mask, where it has one that alone counts."""
+        return self._on_mask(photo, self.pictures)
+
+    def on_object(self, photo: int) -> np.ndarray | None:
+        """Whether each pixel [h, w] shows the object, by the photo's given mask, where it has one."""
+        return self._on_mask(photo, given_mask_of(self.names[photo], self.pictures, self.outlines))
+
+    def _on_mask(self, photo: int, pictures: Pictures) -> np.ndarray | None:
         import cv2
 
-        mask = self.pictures.mask(self.names[photo])
+        mask = pictures.mask(self.names[photo])
         return None if mask is None else cv2.resize(mask, self.views[photo].size, interpolation=cv2.INTER_NEAREST) > 127
 
 
@@ -89,7 +98,7 @@ def _capture(context: StageContext[HeldOutDensifyParams]) -> _Capture:
     scene = _of_photos(whole, used)
     views = views_of(scene.cameras, context.params.side)
     pairs = pairs_of(views, scene.points, scene.observations, context.params.neighbors)
-    return _Capture(scene, used, views, pairs, context.read(PINHOLE_PHOTOS))
+    return _Capture(scene, used, views, pairs, context.read(PINHOLE_PHOTOS), context.read(OUTLINES))
 
 
 def _used(count: int, hold_out: int) -> np.ndarray:
@@ -193,7 +202,7 @@ def _publish(context: StageContext[HeldOutDensifyParams], photos: _Capture, dept
     context.write(POINT_CLOUD, replace(cloud, photos=photos.used[cloud.photos].astype(np.int32)))
     maps, known, explained = context.to_write(DEPTH_MAPS), 0, {}
     for k, (name, depth, trust) in enumerate(zip(photos.names, depths, trusts, strict=True)):
-        explained[name] = round(_explained(trust, photos.within(k)), 4)
+        explained[name] = round(_explained(trust, photos.on_object(k)), 4)
         if (depth > 0).any():
             maps.save(name, depth * np.float32(pose_frame.scale), trust)
             known += 1
@@ -205,10 +214,10 @@ def _publish(context: StageContext[HeldOutDensifyParams], photos: _Capture, dept
     }
 
 
-def _explained(trust: np.ndarray, within: np.ndarray | None) -> float:
-    """Share of a photo's pixels [h, w], of those on its mask where it has one, whose depth is trusted."""
-    asked = trust.size if within is None else int(within.sum())
-    return float((trust >= TRUSTED).sum()) / max(asked, 1)
+def _explained(trust: np.ndarray, asked: np.ndarray | None) -> float:
+    """Share of a photo's pixels [h, w], of those that are asked where not all are, whose depth is trusted."""
+    of_asked = trust.ravel() if asked is None else trust[asked]
+    return float((of_asked >= TRUSTED).sum()) / max(of_asked.size, 1)
 
 
 DENSIFY: Stage[HeldOutDensifyParams] = Stage(
@@ -216,7 +225,7 @@ DENSIFY: Stage[HeldOutDensifyParams] = Stage(
     version=5,
     settings=lambda config: HeldOutDensifyParams(**config.densify.model_dump(), hold_out=config.train.hold_out),
     run=run,
-    reads=(FIRST_SCENE, PINHOLE_PHOTOS),
+    reads=(FIRST_SCENE, PINHOLE_PHOTOS, OUTLINES),
     writes=(DEPTH_MAPS, POINT_CLOUD),
     summary="compare neighbouring photos: depth maps and a dense point cloud",
 )

@@ -22,6 +22,7 @@ from stages.artifacts import (
     IMAGE_SET,
     METRICS,
     MODEL,
+    OUTLINES,
     PAGE,
     PHOTOS,
     PINHOLE_PHOTOS,
@@ -35,6 +36,7 @@ from stages.artifacts import (
     Artifact,
     AtlasMesh,
     VertexQuality,
+    given_mask_of,
 )
 from stages.drawing.overview import overview_svg
 from stages.engine.stage import Stage, StageContext
@@ -60,7 +62,7 @@ def run(context: StageContext[ReportParams]) -> dict[str, Any]:
     scene, place, atlas = context.read(SCENE), context.read(WORLD_PLACE), context.read(ATLAS_MESH)
     scene = replace(scene, up=scene.up_in(place))
     texture = pictures.read_rgb(context.read(BASE_COLOR))
-    held_out, pinholes = context.read(HELD_OUT), context.read(PINHOLE_PHOTOS)
+    held_out, pinholes, outlines = context.read(HELD_OUT), context.read(PINHOLE_PHOTOS), context.read(OUTLINES)
     manifests = context.manifests
     steps = 5
     context.progress(0, steps, "drawing the model")
@@ -70,9 +72,12 @@ def run(context: StageContext[ReportParams]) -> dict[str, Any]:
         "provenance": pictures.describe_provenance(context.read(PROVENANCE)),
     }
     context.progress(1, steps, "comparing with held-out photos")
-    page["held_out"] = compare_held_out(
-        atlas, texture, scene.cameras, lambda index: pinholes.masked(scene.cameras.names[index]), held_out
-    )
+
+    def load(index: int) -> tuple[np.ndarray, np.ndarray | None]:
+        name = scene.cameras.names[index]
+        return given_mask_of(name, pinholes, outlines).masked(name)
+
+    page["held_out"] = compare_held_out(atlas, texture, scene.cameras, load, held_out)
     context.progress(2, steps, "collecting the photos")
     image_set, registration = left(context, IMAGE_SET), left(context, REGISTRATION)
     dense = manifests["densify"].numbers if "densify" in manifests else {}
@@ -193,6 +198,7 @@ REPORT: Stage[ReportParams] = Stage(
         GIVEN_REGION,
         SCENE,
         PINHOLE_PHOTOS,
+        OUTLINES,
         POINT_CLOUD,
         METRICS,
         PREVIEWS,

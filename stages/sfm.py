@@ -97,7 +97,7 @@ def run(context: StageContext[SfmParams]) -> dict[str, Any]:
     numbers = _publish(
         context, last, best.registered, unregistered, context.params.mapper, bench.matcher, others, found.steps, relaxed
     )
-    _keep_contents(context, contents, image_set, lineage)
+    _keep_contents(context, contents, image_set, lineage, bench.stands_still)
     warnings = [
         *_place_warnings(from_one_place(found.depth.parallaxes), len(bench.names), last.model),
         *_flat_warnings(found.depth, last, bench),
@@ -328,7 +328,11 @@ def _keep_features(database: Path, folder: Path) -> None:
 
 
 def _keep_contents(
-    context: StageContext[SfmParams], contents: dict[str, str], image_set: ImageSet, lineage: str | None
+    context: StageContext[SfmParams],
+    contents: dict[str, str],
+    image_set: ImageSet,
+    lineage: str | None,
+    background_moved: bool = False,
 ) -> None:
     """Write what the published model was made of; without a lineage to go on, it begins one."""
     before, records = context.read_previous(PHOTO_CONTENTS), image_set.images
@@ -343,7 +347,13 @@ def _keep_contents(
         record.name: PhotoFile(sha256=record.sha256, camera=record.camera, focal_px=record.focal_px)
         for record in records
     }
-    made_of = PhotoContents(lineage=lineage or digest(own), contents=contents, files=files, seen=tuple(sorted(seen)))
+    made_of = PhotoContents(
+        lineage=lineage or digest(own),
+        contents=contents,
+        files=files,
+        seen=tuple(sorted(seen)),
+        background_moved=background_moved or (lineage is not None and before is not None and before.background_moved),
+    )
     context.write(PHOTO_CONTENTS, made_of)
 
 

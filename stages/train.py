@@ -27,6 +27,7 @@ from stages.artifacts import (
     FIRST_SCENE,
     HELD_OUT,
     METRICS,
+    OUTLINES,
     PINHOLE_PHOTOS,
     POINT_CLOUD,
     PREVIEWS,
@@ -173,7 +174,7 @@ class _Training:
         before = _last_scene(context, scene)
         if before is None:
             training = cls(context, scene, _make_trainer(context, scene), looked=not scene.growable)
-            _start_from_shape(training.trainer, scene.cameras)
+            _start_from_shape(training.trainer, scene.cameras, [context.read(OUTLINES), context.read(SILHOUETTES)])
             return training
         region = _kept_region(scene, before)
         kept = region.of(scene) if region else scene
@@ -297,7 +298,6 @@ class _Training:
 def _make_trainer(context: StageContext[TrainParams], scene: PosedScene) -> Any:
     from stages.neural.held_out_psnr import left_out
     from stages.neural.sightings import Sightings
-    from stages.neural.silhouettes import Silhouettes
     from stages.neural.trainer import Trainer
     from stages.neural.training_photos import Photos
 
@@ -307,11 +307,8 @@ def _make_trainer(context: StageContext[TrainParams], scene: PosedScene) -> Any:
     photos = Photos(scene.cameras, *images, context.device, ~held_out)
     training = (~held_out).numpy()
     sightings = Sightings.from_scene(scene, context.device, training)
-    cloud, outlines = _cloud(context, scene), context.read(SILHOUETTES)
-    dense = Sightings.from_cloud(cloud, scene.cameras.centers, context.device, training)
-    masks = [outlines.mask(name) if use else None for name, use in zip(scene.cameras.names, training, strict=True)]
-    silhouettes = Silhouettes.from_masks(scene.cameras, masks, cloud, context.device)
-    return Trainer(photos, sightings, dense, params, context.device, silhouettes, _evidence(context, scene))
+    dense = Sightings.from_cloud(_cloud(context, scene), scene.cameras.centers, context.device, training)
+    return Trainer(photos, sightings, dense, params, context.device, _evidence(context, scene))
 
 
 def _evidence(context: StageContext[TrainParams], scene: PosedScene) -> Evidence:
@@ -459,39 +456,48 @@ def _load_images(
     return images, masks if masked == len(names) else None
 
 
-def _start_from_shape(trainer: Any, cameras: PinholeCameras) -> None:
-    """Where training is not to start from a sphere: bring the SDF to a room, or to the visual hull of the masks."""
+def _start_from_shape(trainer: Any, cameras: PinholeCameras, beside: Sequence[Pictures] = ()) -> None:
+    """Where training is not to start from a sphere: bring the SDF to a room, or to the visual hull of the masks.
+
+    Args:
+        beside: where masks lie beside whole photos.
+    """
     from stages.geometry.hull import room_distances
 
     params = trainer.params.field
     inside = np.linalg.norm(cameras.centers, axis=1) < params.sphere_radius
     if params.init == "hull":
-        error = trainer.start_from(_hull(cameras, trainer))
+        error = trainer.start_from(_hull(cameras, trainer.photos, beside))
         log.info("the SDF starts from the masks' visual hull, met to %.4f on average", error)
     elif params.init == "room" or (params.init == "auto" and inside.mean() > 0.5):
         error = trainer.start_from(room_distances())
         log.info("the SDF starts from a room around the cameras, met to %.4f on average", error)
 
 
-def _hull(cameras: PinholeCameras, trainer: Any) -> np.ndarray:
+def _hull(cameras: PinholeCameras, photos: Any, beside: Sequence[Pictures]) -> np.ndarray:
     """Signed distances to the visual hull of the masks of the photos that are trained on.
 
     Raises:
         InputError: a photo has no mask, or the masks leave nothing.
     """
-    from stages.geometry.hull import hull_distances, space_distances
+    from stages.geometry.hull import hull_distances
 
     advice = "Give a mask for each photo (`--masks FOLDER`), or start from a sphere: `--set train.field.init=sphere`."
-    photos = trainer.photos
-    if len(trainer.silhouettes):
-        distances = space_distances(trainer.silhouettes.space.cpu().numpy())
-    elif photos.masks is not None:
-        masks = [photos.mask(i) if training else None for i, training in enumerate(photos.training.tolist())]
-        distances = hull_distances(cameras, masks)
-    else:
+    training = photos.training.tolist()
+
+    def mask_of(index: int) -> np.ndarray | None:
+        if photos.masks is not None:
+            own: np.ndarray = photos.mask(index)
+            return own
+        found = (pictures.mask(cameras.names[index]) for pictures in beside)
+        return next((mask for mask in found if mask is not None), None)
+
+    masks = [mask_of(i) if is_used else None for i, is_used in enumerate(training)]
+    if sum(mask is not None for mask in masks) < sum(training):
         raise InputError(
             f"`train.field.init` = hull needs masks for all {len(cameras)} photos, and some have none.", advice
         )
+    distances = hull_distances(cameras, masks)
     if distances is None:
         raise InputError(f"The {len(cameras)} masks have no visual hull within the region of interest.", advice)
     return distances
@@ -567,7 +573,7 @@ TRAIN: Stage[TrainParams] = Stage(
     version=10,
     settings=lambda config: config.train,
     run=run,
-    reads=(FIRST_SCENE, PINHOLE_PHOTOS, DEPTH_MAPS, SILHOUETTES, POINT_CLOUD),
+    reads=(FIRST_SCENE, PINHOLE_PHOTOS, OUTLINES, SILHOUETTES, DEPTH_MAPS, POINT_CLOUD),
     writes=(FIELD, CAMERAS, SCENE, METRICS, PREVIEWS, HELD_OUT),
     continues=True,
     summary="learn a signed distance field and its colours from the posed images",

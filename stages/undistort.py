@@ -22,6 +22,7 @@ from stages.artifacts import (
     GIVEN_REGION,
     IMAGE_SET,
     MODEL,
+    OUTLINES,
     PHOTO_CONTENTS,
     PHOTOS,
     PINHOLE_PHOTOS,
@@ -41,7 +42,7 @@ from stages.geometry.region import RegionOfInterest
 from stages.geometry.silhouettes import MIN_SHARE, agreeing, silhouette_agreement
 from stages.geometry.similarity import Similarity
 from stages.geometry.subjects import Subject, find_subjects
-from stages.posing.backdrop import stands_still
+from stages.posing.backdrop import seen_background
 from stages.posing.undistortion import (
     plan_warp,
     png_names,
@@ -72,8 +73,8 @@ def run(context: StageContext[UndistortParams]) -> dict[str, Any]:
 
     cameras = posed_cameras(photos, names, warps)
     masks = _without_doubtful(cameras, masks, guessed)
-    still = stands_still(model, photos, context.read(PHOTOS).mask)
-    _write_masks(context, names, masks, [still or guess for guess in guessed])
+    beside, of_background = _lie_beside(context, model, photos, guessed)
+    _write_masks(context, names, masks, guessed, beside)
     points, errors, observations = sparse_points(model, photos)
     known, given = context.read(GIVEN_POSES), context.read(GIVEN_REGION)
     stated = known.region if known else None
@@ -112,7 +113,7 @@ def run(context: StageContext[UndistortParams]) -> dict[str, Any]:
         "width": int(scene.cameras.sizes[:, 0].max()),
         "height": int(scene.cameras.sizes[:, 1].max()),
         "masks": sum(mask is not None for mask in masks),
-        **({"background_still": still} if any(mask is not None for mask in masks) else {}),
+        **of_background,
         **({"masks_dropped": sum(guessed) - _count(masks, guessed)} if any(guessed) else {}),
         "kind": scene.kind,
         "region_from": region.source,
@@ -174,13 +175,38 @@ def _write_masks(
     context: StageContext[UndistortParams],
     names: list[str],
     masks: Sequence[np.ndarray | None],
-    beside: Sequence[bool],
+    guessed: Sequence[bool],
+    beside: bool,
 ) -> None:
-    """Write the masks [H, W] uint8; those that only say where the object ends, `beside` the whole photo, apart."""
-    alone, also = context.to_write(PINHOLE_PHOTOS), context.to_write(SILHOUETTES)
-    for name, mask, is_beside in zip(names, masks, beside, strict=True):
+    """Write the masks [H, W] uint8: with the photos, or apart, where they are guessed or lie `beside` whole photos."""
+    given, guesses = context.to_write(OUTLINES if beside else PINHOLE_PHOTOS), context.to_write(SILHOUETTES)
+    for name, mask, guess in zip(names, masks, guessed, strict=True):
         if mask is not None:
-            write_png((also if is_beside else alone).mask_path(name), mask, PNG_COMPRESSION)
+            write_png((guesses if guess else given).mask_path(name), mask, PNG_COMPRESSION)
+
+
+def _lie_beside(
+    context: StageContext[UndistortParams], model: Any, photos: list[Any], guessed: Sequence[bool]
+) -> tuple[bool, dict[str, Any]]:
+    """Whether given masks lie beside whole photos, and what the summary says of that."""
+    taken, wanted = context.read(PHOTOS), context.params.masks
+    masked = [
+        photo
+        for photo, guess in zip(photos, guessed, strict=True)
+        if not guess and taken.mask_path(photo.name).exists()
+    ]
+    if wanted != "auto" or not masked:
+        return wanted == "beside", {}
+    if context.read(PHOTO_CONTENTS).background_moved:
+        log.info("the background moved against the object: the masks alone count")
+        return False, {"background_is_seen": False}
+    found = seen_background(model, masked, taken.mask)
+    log.info(
+        "%.0f %% of the features off the masks are points of the model (%.0f a photo), %.0f %% of those on them: %s",
+        100 * found.off, found.points, 100 * found.on,
+        "whole photos count beside the masks" if found.is_seen else "the masks alone count",
+    )  # fmt: skip
+    return found.is_seen, {"background_is_seen": found.is_seen}
 
 
 def _without_doubtful(
@@ -296,11 +322,11 @@ def _frame(context: StageContext[UndistortParams], lineage: str, found: Similari
 
 UNDISTORT: Stage[UndistortParams] = Stage(
     name="undistort",
-    version=11,
+    version=12,
     settings=lambda config: config.undistort,
     run=run,
     reads=(PHOTOS, IMAGE_SET, MODEL, PHOTO_CONTENTS, GIVEN_POSES, GIVEN_REGION),
-    writes=(PINHOLE_PHOTOS, SILHOUETTES, FIRST_SCENE),
+    writes=(PINHOLE_PHOTOS, OUTLINES, SILHOUETTES, FIRST_SCENE),
     continues=True,
     summary="make pinhole images and find the region of interest",
 )

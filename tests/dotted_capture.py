@@ -21,6 +21,8 @@ BALL = 0.6  # radius of the ball the masks show
 DOTS = CENTER + np.array([[0, 0, 0], [0.4, 0, 0], [0, 0.4, 0], [0, 0, -0.4], [-0.3, -0.3, 0], [0.2, -0.4, 0.3]])
 NUM_CAMERAS = 8
 NOT_MOVED = np.zeros(3)
+# What the ball floats above: dots that it hides, or that lie out of the frame, are no features.
+_AROUND = np.random.default_rng(0).uniform(-1, 1, (200, 3)) * [1.0, 0.0, 1.0] + [0.0, 0.7, 0.0]
 
 
 def cam_from_world(index: int, shift: np.ndarray = NOT_MOVED) -> np.ndarray:
@@ -34,11 +36,17 @@ def cam_from_world(index: int, shift: np.ndarray = NOT_MOVED) -> np.ndarray:
 
 
 def write_capture(
-    root: Path, model_name: str, parameters: list[float], masks: bool, shift: np.ndarray = NOT_MOVED
+    root: Path,
+    model_name: str,
+    parameters: list[float],
+    masks: bool,
+    shift: np.ndarray = NOT_MOVED,
+    table: float | None = None,
 ) -> dict[str, Path]:
     """Ingest and sfm folders: black photos with a white dot where each point projects, and masks of the ball.
 
-    The whole world may be moved by a shift.
+    The whole world may be moved by a shift. A table below the ball, which is not drawn, has features, and such a part
+    of them are points of the model; None: no features.
     """
     import pycolmap
 
@@ -54,9 +62,19 @@ def write_capture(
     rays = np.concatenate([np.asarray(camera.cam_from_img(pixels)), np.ones((len(pixels), 1))], 1)
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     records = []
+    around = CENTER + _AROUND[: 0 if table is None else None]
+    seen_around: list[list[tuple[int, int]]] = [[] for _ in around]
     for i in range(NUM_CAMERAS):
         pose, name = cam_from_world(i, shift), f"photo_{i}.jpg"
         at = np.asarray(camera.img_from_cam((DOTS + shift) @ pose[:, :3].T + pose[:, 3]))
+        features = list(at)
+        for k, dot in enumerate(around + shift):
+            local = pose[:, :3] @ dot + pose[:, 3]
+            u, v = np.asarray(camera.img_from_cam(local[None]))[0]
+            ball, way = pose[:, :3] @ (CENTER + shift) + pose[:, 3], local / np.linalg.norm(local)
+            if 0 <= u < WIDTH and 0 <= v < HEIGHT and np.linalg.norm(ball - (way @ ball) * way) > 1.1 * BALL:
+                seen_around[k].append((i + 1, len(features)))
+                features.append(np.array([u, v]))
         photo = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
         for dot in at:
             distance = np.hypot(x - dot[0], y - dot[1])
@@ -71,13 +89,18 @@ def write_capture(
             path.parent.mkdir(parents=True, exist_ok=True)
             assert cv2.imwrite(str(path), (miss < BALL).reshape(HEIGHT, WIDTH).astype(np.uint8) * 255)
         records.append(ImageRecord(name, name, WIDTH, HEIGHT, None, "camera", 1.0, masks, str(i)))
-        image = pycolmap.Image(name, pycolmap.Point2DList([pycolmap.Point2D(p) for p in at]), 1, i + 1)
+        image = pycolmap.Image(name, pycolmap.Point2DList([pycolmap.Point2D(p) for p in features]), 1, i + 1)
         pose3d = pycolmap.Rigid3d(pycolmap.Rotation3d(pose[:, :3]), pose[:, 3])
         model.add_image_with_trivial_frame(image, pose3d)
     for k, dot in enumerate(DOTS):
         track = pycolmap.Track()
         for i in range(NUM_CAMERAS):
             track.add_element(i + 1, k)
+        model.add_point3D(dot + shift, track, np.zeros(3, np.uint8))
+    for dot, seen in list(zip(around, seen_around, strict=True))[: round((table or 0) * len(around))]:
+        track = pycolmap.Track()
+        for element in seen:
+            track.add_element(*element)
         model.add_point3D(dot + shift, track, np.zeros(3, np.uint8))
     artifacts.IMAGE_SET.save(ingest, ImageSet(tuple(records)))
     folder = artifacts.MODEL.load(sfm)

@@ -257,11 +257,12 @@ def test_test_photos_show_the_ball_where_the_scene_has_it(data: Path, suite: str
 @pytest.mark.parametrize("suite", ["dtu", "glossy-synthetic", "known"])
 def test_test_photos_have_the_masks_that_the_scene_is_run_with(data: Path, suite: str):
     write_suite(suite, data)
-    results_of(suite, str(data), "--until", "undistort", "--hold-out", "4", "--masks")
+    (result,) = results_of(suite, str(data), "--until", "undistort", "--hold-out", "4", "--masks")
     scene = find_scenes(SUITES[suite], data, Wanted(masks=True, hold_out=4))[0]
     assert scene.views is not None
     workspace = Workspace.open(Path("bench") / suite / scene.name / "tiny-seed0")
     posed_scene = artifacts.FIRST_SCENE.load(workspace.stage_folder("undistort"))
+    assert result["settings"]["undistort.masks"] == "alone"
     photos = NovelPhotos(scene.views, posed_scene, scene.masks)
     poses_from_scene = posed_scene.poses_from_scene
     for index in range(len(photos.cameras)):

@@ -44,7 +44,7 @@ def stage(tmp_path):
         tmp_path / name for name in ("undistort", "train", "extract", "place", "out")
     )
 
-    def run(vertices, faces, masks=None, scene_extras=None, region=None, beside=False, **params):
+    def run(vertices, faces, masks=None, scene_extras=None, region=None, kind=artifacts.PINHOLE_PHOTOS, **params):
         for folder in (undistort, train, extract, place, out):
             folder.mkdir()
         cameras = three_rings()
@@ -55,7 +55,6 @@ def stage(tmp_path):
             import cv2
 
             for index, mask in masks(cameras):
-                kind = artifacts.SILHOUETTES if beside else artifacts.PINHOLE_PHOTOS
                 path = kind.load(undistort).mask_path(cameras.names[index])
                 path.parent.mkdir(exist_ok=True)
                 cv2.imwrite(str(path), mask.astype(np.uint8) * 255)
@@ -295,12 +294,12 @@ def test_stage_can_keep_the_unseen_underside(stage):
     assert np.linalg.norm(vertices, axis=1).min() > 0.47
 
 
-@pytest.mark.parametrize(("beside", "rim"), [(False, 0.62), (True, 0.64)])
-def test_stage_cuts_to_the_masks(stage, beside, rim):
+@pytest.mark.parametrize(("kind", "rim"), [(artifacts.PINHOLE_PHOTOS, 0.62), (artifacts.OUTLINES, 0.64)])
+def test_stage_cuts_to_the_masks(stage, kind, rim):
     surface = extract_isosurface(
         lambda p: np.minimum(np.linalg.norm(p, axis=1) - 0.5, np.abs(p[:, 2] + 0.3) - 0.03), 64
     )
-    numbers, vertices, _ = stage(surface.vertices, surface.faces, masks=silhouettes, beside=beside)
+    numbers, vertices, _ = stage(surface.vertices, surface.faces, masks=silhouettes, kind=kind)
     assert numbers["outside_masks"] > 1000
     assert np.linalg.norm(vertices[:, :2], axis=1).max() < rim
     assert vertices[:, 2].max() > 0.48
@@ -330,10 +329,10 @@ def test_what_bulges_is_shown_on_masks_and_a_table_is_not():
     assert not selection.shown_on_masks(vertices, surface.faces, cameras, one, off, 0.3).any()
 
 
-@pytest.mark.parametrize(("beside", "top"), [(False, 0.55), (True, 0.68)])
-def test_masks_beside_photos_leave_no_hole_where_the_mesh_bulges(stage, beside, top):
+@pytest.mark.parametrize(("kind", "top"), [(artifacts.PINHOLE_PHOTOS, 0.55), (artifacts.SILHOUETTES, 0.68)])
+def test_masks_beside_photos_leave_no_hole_where_the_mesh_bulges(stage, kind, top):
     surface = bulging_ball_on_a_table()
-    _, vertices, _ = stage(surface.vertices, surface.faces, masks=silhouettes, beside=beside)
+    _, vertices, _ = stage(surface.vertices, surface.faces, masks=silhouettes, kind=kind)
     assert vertices[:, 2].max() == pytest.approx(top, abs=0.03)
     assert np.linalg.norm(vertices[:, :2], axis=1).max() < 0.64
 

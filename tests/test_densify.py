@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numba
@@ -14,7 +15,7 @@ from stereo_scene import POSES_FROM_SCENE, RADIUS, Drawn, around, camera, camera
 
 from configs.params import Config
 from stages import artifacts
-from stages.densify import DENSIFY, _explained
+from stages.densify import DENSIFY, _Capture, _explained
 from stages.engine.stage import StageContext
 from stages.errors import ConfigError
 from stages.geometry.point_cloud import PointCloud
@@ -111,8 +112,23 @@ def test_what_is_explained_is_a_share_of_the_mask():
     within = np.zeros((4, 6), bool)
     within[:2] = True
     assert _explained(trust, None) == 0.25
+    trust[3, 5] = 0.9  # off the object
     assert _explained(trust, within) == 0.5
     assert _explained(0 * trust, np.zeros((4, 6), bool)) == 0
+
+
+def test_masks_beside_whole_photos_show_the_object_and_hide_nothing(tmp_path):
+    mask = np.zeros((4, 6), bool)
+    mask[1:3, 2:5] = True
+    photos, outlines = artifacts.PINHOLE_PHOTOS.load(tmp_path), artifacts.OUTLINES.load(tmp_path)
+    scene = SimpleNamespace(cameras=SimpleNamespace(names=("a.png",)))
+    capture = _Capture(scene, np.arange(1), [SimpleNamespace(size=(6, 4))], [], photos, outlines)
+    for pictures, hides in ((outlines, False), (photos, True)):
+        artifacts.write_png(pictures.mask_path("a.png"), np.uint8(255 * mask))
+        np.testing.assert_array_equal(capture.on_object(0), mask)
+        assert (capture.within(0) is not None) == hides
+        pictures.mask_path("a.png").unlink()
+    assert capture.on_object(0) is None
 
 
 def test_off(drawn, tmp_path):

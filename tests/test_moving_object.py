@@ -39,7 +39,7 @@ def test_two_passes_become_one_model_in_the_objects_frame(tmp_path: Path):
 
 
 def test_the_option_stands_for_settings_that_somebody_may_have_chosen():
-    every = {"sfm.masks=" + json.dumps("always"), "place.gps=false"}
+    every = {"sfm.masks=" + json.dumps("always"), "undistort.masks=" + json.dumps("alone"), "place.gps=false"}
     assert set(settings(None, moving_object=True)) == every | {'ingest.auto_mask="object"'}
     assert set(settings(None, moving_object=True, masks=Path("masks"))) == every
     assert set(settings(["ingest.auto_mask=plain"], moving_object=True)) == every | {"ingest.auto_mask=plain"}

@@ -90,6 +90,14 @@ def test_transforms_export_reads_back(tmp_path: Path):
     assert nearest.min(0).max() < 1e-5
 
 
+@pytest.mark.parametrize(("kind", "exported"), [(artifacts.OUTLINES, NUM_CAMERAS), (artifacts.SILHOUETTES, 0)])
+def test_masks_beside_whole_photos_are_exported_where_they_were_given(tmp_path: Path, kind, exported: int):
+    folder, sfm = captured(tmp_path, masks=True)
+    (folder / "masks").rename(kind.load(folder).masks)
+    write_colmap(folder, sfm, tmp_path / "place", tmp_path / "exported")
+    assert len(list(tmp_path.glob("exported/masks/*"))) == exported
+
+
 def test_masks_of_some_photos_only_are_not_named_for_nerfstudio(tmp_path: Path, caplog: pytest.LogCaptureFixture):
     folder, sfm = captured(tmp_path, masks=True)
     next((folder / "masks").iterdir()).unlink()

@@ -107,9 +107,10 @@ def test_a_background_that_stands_still_behind_a_turntable_does_not_matter(tmp_p
             shown.append(render(pose, i))
         on_floor = np.abs(shown[0].astype(int) - shown[1]) > 128
         photos.append(np.where(on_floor, background, shown[0]))
-    numbers, _ = run_sfm(ingested(tmp_path / "ingest", photos, FOCAL), tmp_path, wanted=0)
+    numbers, out = run_sfm(ingested(tmp_path / "ingest", photos, FOCAL), tmp_path, wanted=0)
     assert numbers["registered"] == len(poses)
     assert abs(numbers["focal_px"][0] / FOCAL - 1) < 0.1
+    assert artifacts.PHOTO_CONTENTS.load(out).background_moved
     assert "--moving-object" in numbers["warnings"][-1]["sentence"]
     assert numbers["matcher"] == "exhaustive"  # likely pairs went by the background
 

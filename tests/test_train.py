@@ -7,6 +7,7 @@ import shutil
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -542,6 +543,20 @@ def test_training_can_start_from_the_hull():
     assert all(len(state) == 0 for state in trainer.optimizer.state.values())
     numbers = trainer.step(0.0)
     assert np.isfinite(float(numbers["loss"]))
+
+
+def test_the_hull_is_that_of_masks_beside_whole_photos_where_they_are(tmp_path):
+    """Of two folders, which share the photos."""
+    cameras, photos = ring_of_cameras(count=16), SimpleNamespace(masks=None, training=torch.arange(16) != 3)
+    masks = [render(cameras, i)[1] for i in range(16)]
+    beside = [artifacts.OUTLINES.load(tmp_path), artifacts.SILHOUETTES.load(tmp_path)]
+    for i in photos.training.nonzero().flatten().tolist():
+        artifacts.write_png(beside[i % 2].mask_path(cameras.names[i]), np.uint8(masks[i]))
+    used = [None if i == 3 else mask for i, mask in enumerate(masks)]
+    np.testing.assert_array_equal(train._hull(cameras, photos, beside), hull_distances(cameras, used))
+    beside[0].mask_path(cameras.names[4]).unlink()
+    with pytest.raises(InputError, match="some have none"):
+        train._hull(cameras, photos, beside)
 
 
 @pytest.mark.parametrize(("distance", "room"), [(0.3, True), (2.5, False)])

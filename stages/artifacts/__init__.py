@@ -41,4 +41,4 @@ from stages.artifacts.sfm import (
     Unregistered,
 )
 from stages.artifacts.train import CAMERAS, FIELD, HELD_OUT, METRICS, PREVIEWS, SCENE, checkpoint_path, preview_path
-from stages.artifacts.undistort import FIRST_SCENE, PINHOLE_PHOTOS, SILHOUETTES
+from stages.artifacts.undistort import FIRST_SCENE, OUTLINES, PINHOLE_PHOTOS, SILHOUETTES, given_mask_of

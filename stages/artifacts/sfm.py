@@ -144,12 +144,14 @@ class PhotoContents(Record):
         contents: name -> digest of the photo and its mask, of all photos, placed or not.
         files: name -> what ingest said of it.
         seen: sha256 of all photos that this model, or one that it goes on from, may have been made of.
+        background_moved: whether the background was found to move against the object, and left out.
     """
 
     lineage: str
     contents: dict[str, str]
     files: dict[str, PhotoFile] = Field(default_factory=dict)
     seen: tuple[str, ...] = ()
+    background_moved: bool = False
 
 
 def _save_given_poses(folder: Path, poses: GivenPoses | None) -> None:

@@ -129,16 +129,11 @@ def hull_distances(
     Returns:
         Axes x, y, z; or None where nothing, or all, is inside.
     """
-    grid = cube(cells).reshape(-1, 3)
-    inside = _inside_silhouettes(cameras, masks, grid) & (np.linalg.norm(grid, axis=1) < 1)
-    return space_distances(inside.reshape([cells] * 3))
-
-
-def space_distances(inside: Bool[np.ndarray, "c c c"]) -> Float32[np.ndarray, "c c c"] | None:
-    """Signed distance to a set of cells of a grid over [-1, 1]^3, negative inside; None where it is none, or all."""
     from scipy.ndimage import distance_transform_edt
 
-    cell = 2.0 / len(inside)
+    cell = 2.0 / cells
+    grid = cube(cells).reshape(-1, 3)
+    inside = (_inside_silhouettes(cameras, masks, grid) & (np.linalg.norm(grid, axis=1) < 1)).reshape([cells] * 3)
     if not inside.any() or inside.all():
         return None
     # The transforms count to the nearest centre on the other side; the surface is half a cell before it.

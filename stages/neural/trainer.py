@@ -23,7 +23,6 @@ from stages.neural.replaying import Replay
 from stages.neural.sampling import SdfCache
 from stages.neural.schedules import Moment
 from stages.neural.sightings import Sightings, sighting_loss
-from stages.neural.silhouettes import Silhouettes, outline_loss
 from stages.neural.terms import Terms
 from stages.neural.terms.planar import has_feature_mlp
 from stages.neural.training_photos import Photos, RayBatch
@@ -72,11 +71,9 @@ class Trainer:
         dense: Sightings,
         params: TrainParams,
         device: torch.device | str,
-        silhouettes: Silhouettes | None = None,
         evidence: Evidence | None = None,
     ) -> None:
         self.photos, self.sightings, self.dense, self.params = photos, sightings, dense, params
-        self.silhouettes = silhouettes or Silhouettes.none(device)
         self.evidence = evidence or Evidence.none(device)
         self.device = torch.device(device)
         background = params.field.background and photos.masks is None
@@ -169,10 +166,7 @@ class Trainer:
         sparse = self.sightings.draw(weights.sparse_batch, weights.sparse_step, self.generator)
         dense = self.dense.draw(weights.dense_batch, weights.dense_step, self.generator)
         anywhere = torch.rand(sampling.free_points, 3, generator=self.generator, device=self.device) * 2 - 1
-        outlines = self.silhouettes.draw(
-            weights.silhouette_batch, weights.dense_step, self.cache.lookup, self.generator
-        )
-        extra = torch.cat([sparse.places, dense.places, outlines.places, anywhere])
+        extra = torch.cat([sparse.places, dense.places, anywhere])
         rendered = self.renderer.render(batch, moment, extra, self.generator)
         exposed = rendered.colors * torch.exp(self.fields.log_gains[batch.images])
         nothing = torch.zeros((), device=self.device)
@@ -191,14 +185,12 @@ class Trainer:
         ).mean()
         of_terms = self.terms.losses(rendered, moment)
         first, last = len(sparse.places), len(sparse.places) + len(dense.places)
-        end = last + len(outlines.places)
         sparse_loss = sighting_loss(
             rendered.extra_sdf[:first], sparse.weights, weights.sparse_tolerance, weights.sparse_step
         )
         dense_loss = sighting_loss(
             rendered.extra_sdf[first:last], dense.weights, weights.dense_tolerance, weights.dense_step
         )
-        silhouette_loss = outline_loss(rendered.extra_sdf[last:end], outlines.known, 0.25 * weights.dense_step)
         gloss_loss = rendered.gloss.mean()
         exposure_loss = losses.exposure_error(self.fields.log_gains).mean()
         proposal_loss = self._proposal_loss(rendered)
@@ -210,7 +202,6 @@ class Trainer:
             + sparse_weight * sparse_loss
             + weights.dense * dense_loss
             + weights.mask * mask_loss
-            + weights.silhouette * silhouette_loss
             + weights.exposure * exposure_loss
             + weights.gloss * gloss_loss
             + proposal_loss
@@ -233,7 +224,6 @@ class Trainer:
                 "sparse": sparse_loss.detach(),
                 "dense": dense_loss.detach(),
                 "mask": mask_loss.detach(),
-                "silhouette": silhouette_loss.detach(),
                 "proposal": proposal_loss.detach(),
                 "psnr": -10 * torch.log10(mse.clamp(min=1e-10)),
                 "gradient_norm": torch.linalg.vector_norm(rendered.gradients, dim=1).mean(),

@@ -1,8 +1,9 @@
-"""Whether what lies off the masks stood still against the object: then it is evidence, too."""
+"""Whether what lies off the masks is in the model, too: then it stood still against the object, and is evidence."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,33 +13,55 @@ if TYPE_CHECKING:
 
 # Features this near to a mask, as a part of the photo's longer side, may be of the object: masks are not exact.
 NEAR = 0.01
-# Off the masks a photo has so many features that are points of the model, in the mean; and they are as large a part of
-# the features there: of backgrounds that stood still 41 to 49 % are (three made-up sets), of a black cloth 5 %
-# (dtu_scan24, 2 a photo), of a room that did not turn with the object next to none.
-MIN_POINTS, MIN_SHARE = 20.0, 0.25
+# Off the masks a photo has at least so many features that are points of the model, and the part of the features there
+# that are is at least so large in terms of that part on the masks. Of backgrounds that stood still 41 to 49 % are
+# (three made-up sets), of a black cloth 5 % (dtu_scan24, 2 a photo), of a room that did not turn with the object next
+# to none.
+MIN_POINTS, MIN_RATIO = 20, 0.5
+# With fewer features on its mask a photo says nothing of the part there.
+MIN_FEATURES = 5
 
 
-def stands_still(
+@dataclass(frozen=True)
+class Background:
+    """How much of what photos show off their masks is in the model: medians over the photos.
+
+    Attributes:
+        points: features off the mask that are points of the model.
+        off, on: part of the features off and on the mask that are.
+    """
+
+    points: float
+    off: float
+    on: float
+
+    @property
+    def is_seen(self) -> bool:
+        """Whether it is as well known as what the masks show: one that moves, or is plain, is not."""
+        return self.points >= MIN_POINTS and self.off >= MIN_RATIO * self.on
+
+
+def seen_background(
     model: Any, photos: Sequence[Any], load_mask: Callable[[str], Shaped[np.ndarray, "_ _"] | None]
-) -> bool:
-    """Whether features off the masks became points of the model: a background that moves, or is plain, gives none.
-
-    Nor does it where poses come from features on the masks alone.
+) -> Background:
+    """What is known of the background of photos that have a mask; nothing is where poses come from masked features.
 
     Args:
         model: pycolmap reconstruction. photos: its registered images.
         load_mask: name -> mask of the photo as it was taken, not zero on the object; None where it has none.
     """
-    masked = [(photo, mask) for photo in photos if (mask := load_mask(photo.name)) is not None]
-    if not masked:
-        return False
-    features = points = 0
-    for photo, mask in masked:
+    points, off, on = list[int](), list[float](), list[float]()
+    for photo in photos:
+        mask = load_mask(photo.name)
+        if mask is None:
+            continue
         places, known = _features(photo)
-        off = ~_near(mask, model.cameras[photo.camera_id], places)
-        features += int(off.sum())
-        points += int((off & known).sum())
-    return points >= max(MIN_POINTS * len(masked), MIN_SHARE * features)
+        near = _near(mask, model.cameras[photo.camera_id], places)
+        points.append(int(known[~near].sum()))
+        off.append(float(known[~near].mean()) if not near.all() else 0.0)
+        if near.sum() >= MIN_FEATURES:
+            on.append(float(known[near].mean()))
+    return Background(*(float(np.median(each)) if each else 0.0 for each in (points, off, on)))
 
 
 def _features(photo: Any) -> tuple[Float[np.ndarray, "f 2"], Bool[np.ndarray, " f"]]:

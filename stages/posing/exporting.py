@@ -83,17 +83,13 @@ def write_transforms(undistort: Path, sfm: Path, place: Path, out: Path) -> dict
 
 
 def _images_and_model(undistort: Path, sfm: Path, place: Place, out: Path) -> tuple[PosedScene, Any]:
-    """Copy images and masks to `out`; the scene, and the pycolmap model of it."""
+    """Copy images and masks that were given to `out`; the scene, and the pycolmap model of it."""
     scene = artifacts.FIRST_SCENE.load(undistort)
     ours, theirs = artifacts.Pictures(undistort), artifacts.Pictures(out)
-    outlines = artifacts.SILHOUETTES.load(undistort)
+    outlines = artifacts.OUTLINES.load(undistort)
     for name in scene.cameras.names:
-        mask = theirs.mask_path(name)
-        for source, target in (
-            (ours.path(name), theirs.path(name)),
-            (ours.mask_path(name), mask),
-            (outlines.mask_path(name), mask),
-        ):
+        mask = artifacts.given_mask_of(name, ours, outlines).mask_path(name)
+        for source, target in ((ours.path(name), theirs.path(name)), (mask, theirs.mask_path(name))):
             if source.exists():
                 target.parent.mkdir(parents=True, exist_ok=True)
                 shutil.copyfile(source, target)

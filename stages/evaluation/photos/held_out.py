@@ -47,10 +47,16 @@ def evaluate_views(workspace: Path, renders: Path | None = None, device: str = "
         )
     cameras = artifacts.CAMERAS.load(train)
     pinholes = artifacts.PINHOLE_PHOTOS.load(undistort)
-    masked = sum(pinholes.mask_path(name).exists() for name in held_out)
+    outlines = artifacts.OUTLINES.load(undistort)
+
+    def of(name: str) -> artifacts.Pictures:
+        return artifacts.given_mask_of(name, pinholes, outlines)
 
     def load(index: int) -> tuple[np.ndarray, np.ndarray | None]:
-        return pinholes.masked(cameras.names[index])
+        name = cameras.names[index]
+        return of(name).masked(name)
+
+    masked = sum(of(name).mask_path(name).exists() for name in held_out)
 
     lpips, about_lpips = find_lpips()
     indices = [cameras.names.index(name) for name in held_out]

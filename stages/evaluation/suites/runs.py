@@ -129,8 +129,14 @@ def _run(
 
 
 def _ask(request: BenchRequest, scene: SuiteScene, place: Path, seed: int) -> Request:
-    """The run of one scene; test photos are kept from every stage."""
+    """The run of one scene; test photos are kept from every stage, and the protocols see nothing off the masks."""
     left_out = json.dumps([escape(name) for name in scene.left_out])
+    sets = [
+        *(["undistort.masks=alone"] if scene.masks is not None else []),
+        *request.sets,
+        f"train.seed={seed}",
+        *([f"ingest.leave_out={left_out}"] if scene.left_out else []),
+    ]
     return Request(
         photos=scene.photos,
         workspace=place,
@@ -139,7 +145,7 @@ def _ask(request: BenchRequest, scene: SuiteScene, place: Path, seed: int) -> Re
         poses=scene.poses,
         no_poses=scene.poses is None,
         preset=request.preset,
-        sets=[*request.sets, f"train.seed={seed}", *([f"ingest.leave_out={left_out}"] if scene.left_out else [])],
+        sets=sets,
         until=request.until,
         device=request.device,
         workers=request.workers,
