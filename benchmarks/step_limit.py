@@ -25,6 +25,7 @@ import statistics
 import sys
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numba
 import numpy as np
@@ -63,8 +64,8 @@ def settings(log2_rows: int, device: str) -> TrainParams:
 
 
 def shape_of(log2_rows: int, device: str = "cpu") -> FieldShape:
-    """The networks of that preset, without a background."""
-    return field_shape(settings(log2_rows, device), 1, background=False)
+    """The networks of that preset, without a background and without shading, whose products are few."""
+    return replace(field_shape(settings(log2_rows, device), 1, background=False), shaded=False)
 
 
 def points_on_rays(device: str) -> tuple[torch.Tensor, torch.Tensor]:
@@ -92,7 +93,8 @@ def networks_step(shape: FieldShape, encoder: Encoder = CHOSEN, device: str = "c
     def step() -> None:
         encoder.use()
         sdf, features, gradients = networks.sdf(points, shape.sdf_grid.levels)
-        colors = networks.radiance(points, torch.nn.functional.normalize(gradients, dim=1), directions, features)
+        normals = torch.nn.functional.normalize(gradients, dim=1)
+        colors = networks.radiance.network(points, normals, directions, features)
         loss = losses.rgb_error(colors, observed).mean() + losses.eikonal_error(gradients).mean() + sdf.abs().mean()
         kept = table.grad
         optimizer.zero_grad(set_to_none=True)
