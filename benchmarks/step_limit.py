@@ -259,7 +259,7 @@ def limit_rows(device: str) -> list[list[str]]:
             ]  # fmt: skip
             place = "GPU" if device == "cuda" else str(cores)
             reached, parts = f"{100 * limit / networks:.0f} %", f"{1000 * matrix:.1f} + {1000 * table:.1f}"
-            rows.append([f"2^{log2_rows}", place, encoder.name, *(f"{rate:.0f}" for rate in rates), parts, reached])
+            rows.append([f"2^{log2_rows}", place, encoder.name, *(f"{rate:.3g}" for rate in rates), parts, reached])
     return rows
 
 
