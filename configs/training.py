@@ -162,7 +162,8 @@ class PlanarParams(Section):
     neighbors: int = Field(4, ge=1, description="the paper's form: places before each of their surface points")
     features: Literal["radiance", "mlp"] = Field(
         "radiance",
-        description="the paper's form: appearance features that the radiance MLP gets, or those of an MLP of its own",
+        description="appearance features of the paper's form and of the Eikonal term: those that the radiance MLP "
+        "gets, or those of an MLP of its own",
     )
     scale_start: float = Field(
         0.1, gt=0, le=1, description="the paper's form: lambda_pla is scaled by this at the start and by 1 later"
@@ -183,7 +184,7 @@ class EikonalParams(Section):
 
 
 class TermParams(Section):
-    """The paper's terms, each off by default."""
+    """The paper's terms; only the planar one is on by default."""
 
     ambiguity: AmbiguityParams = AmbiguityParams()
     reflection: ReflectionParams = ReflectionParams()

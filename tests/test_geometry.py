@@ -54,6 +54,7 @@ def test_rays_and_projection_undo_each_other(seed: int, u: float, v: float, dist
     np.testing.assert_allclose(pixels, [[u, v]], atol=1e-6)
     assert depth[0] > 0
     assert np.linalg.norm(directions) == pytest.approx(1.0)
+    np.testing.assert_allclose(camera.unproject(0, pixels, depth), origins + distance * directions, atol=1e-6)
 
 
 def test_points_behind_have_negative_depth():

@@ -177,6 +177,19 @@ def test_a_graph_reads_what_changes_from_tensors():
     assert replayed._scale.item() == pytest.approx(plain.moment(0.5).scale)
 
 
+def test_a_graph_is_recorded_anew_where_the_planar_term_begins():
+    trainer, kinds = make_trainer(), []
+
+    def replay(step, kind):
+        kinds.append(kind)
+        return step()
+
+    trainer.replay = replay
+    for progress in (0.48, 0.49, 0.5, 0.51):
+        trainer.step(progress)
+    assert kinds[0] == kinds[1] != kinds[2] == kinds[3]
+
+
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 def test_a_step_on_cuda_is_replayed_and_learns_the_same():

@@ -90,12 +90,23 @@ class PinholeCameras:
         self, index: int, pixels: Float[np.ndarray, "p 2"]
     ) -> tuple[Float[np.ndarray, "p 3"], Float[np.ndarray, "p 3"]]:
         """Origins and unit directions of rays through pixel positions."""
+        directions = self._directions(index, pixels)
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        return np.broadcast_to(self.centers[index], directions.shape).copy(), directions
+
+    def unproject(
+        self, index: int, pixels: Float[np.ndarray, "p 2"], depths: Float[np.ndarray, " p"]
+    ) -> Float[np.ndarray, "p 3"]:
+        """Points at pixel positions and depths along the optical axis: what `project` takes back."""
+        return self.centers[index] + depths[:, None] * self._directions(index, pixels)
+
+    def _directions(self, index: int, pixels: Float[np.ndarray, "p 2"]) -> Float[np.ndarray, "p 3"]:
+        """Directions through pixel positions, of length 1 along the optical axis."""
         K, rotation = self.intrinsics[index], self.extrinsics[index, :, :3]
         y = (pixels[:, 1] - K[1, 2]) / K[1, 1]
         x = (pixels[:, 0] - K[0, 2] - K[0, 1] * y) / K[0, 0]
-        directions = np.stack([x, y, np.ones_like(x)], 1) @ rotation
-        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-        return np.broadcast_to(self.centers[index], directions.shape).copy(), directions
+        directions: np.ndarray = np.stack([x, y, np.ones_like(x)], 1) @ rotation
+        return directions
 
 
 @dataclass(frozen=True)

@@ -102,8 +102,7 @@ def _places(
     kept = slice(_STRIDE // 2, None, _STRIDE)
     v, u = (kept.start + _STRIDE * each for each in np.nonzero(depth[kept, kept] > 0))
     pixels = (np.stack([u, v], 1) + 0.5) * cameras.sizes[index] / depth.shape[::-1]
-    rays = np.c_[pixels, np.ones(len(u))] @ np.linalg.inv(cameras.intrinsics[index]).T
-    places = cameras.centers[index] + (depth[v, u, None] * rays) @ cameras.extrinsics[index, :, :3]
+    places = cameras.unproject(index, pixels, depth[v, u])
     inside = (np.abs(places) < 1).all(axis=1)
     return places[inside], trust[v, u][inside]
 

@@ -153,8 +153,7 @@ class Trainer:
             self._scale.fill_(moment.scale)
             self._sparse_weight.fill_(sparse_weight)
             current = replace(moment, scale=self._scale)
-            planar = moment.progress >= self.params.terms.planar.start
-            kind = moment.levels, moment.samples, moment.deferred, planar
+            kind = moment.levels, moment.samples, moment.deferred, self.terms.begun(moment)
             numbers = self.replay(lambda: self._update(current, self._sparse_weight), kind)
         self.step_index += 1
         return numbers

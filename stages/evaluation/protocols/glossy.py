@@ -53,10 +53,7 @@ def visible_points(cameras: PinholeCameras, depths: Iterable[np.ndarray]) -> np.
     found = []
     for i, depth in enumerate(depths):
         rows, columns = np.nonzero(np.isfinite(depth) & (depth > 0))
-        pixels = np.stack([columns, rows, np.ones(len(rows))], 1)
-        in_cam = depth[rows, columns, None] * (pixels @ np.linalg.inv(cameras.intrinsics[i]).T)
-        rotation, translation = cameras.extrinsics[i, :, :3], cameras.extrinsics[i, :, 3]
-        found.append((in_cam - translation) @ rotation)
+        found.append(cameras.unproject(i, np.stack([columns, rows], 1).astype(float), depth[rows, columns]))
     points = np.concatenate(found)
     return one_a_cube(points, VOXEL)
 

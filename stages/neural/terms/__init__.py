@@ -54,6 +54,10 @@ class Terms:
         self.waits = set(forms) != {"off"} or terms.eikonal.form != "plain" or terms.planar.form == "paper"
         self.all = tuple(kind(fields, cache, params, photos, generator, evidence) for kind in KINDS)
 
+    def begun(self, moment: Moment) -> tuple[bool, ...]:
+        """Which of them count by now."""
+        return tuple(term.has_begun(moment) for term in self.all)
+
     def recolored(self, rendered: Rendered, moment: Moment, generator: torch.Generator | None) -> Rendered:
         """The rays with the colours that they have by all terms."""
         for term in self.all:

@@ -102,6 +102,11 @@ def has_feature_mlp(params: TermParams) -> bool:
 class Planar(Term):
     """The planar loss, and what trains the appearance features where an MLP of its own makes them."""
 
+    def has_begun(self, moment: Moment) -> bool:
+        """Whether the stable form counts by now."""
+        params = self.params.terms.planar
+        return params.form != "stable" or moment.progress >= params.start
+
     def losses(self, rendered: Rendered, moment: Moment) -> dict[str, tuple[float, Float[Tensor, ""]]]:
         return {
             "planar": (self.params.terms.planar.weight, self._planar_loss(rendered, moment)),
@@ -112,7 +117,7 @@ class Planar(Term):
         """Mean planar error around the surface points of some of the rays, adaptively weighted (paper L_planar)."""
         params = self.params.terms.planar
         nothing = torch.zeros((), device=self.device)
-        if params.form == "off" or (params.form == "stable" and moment.progress < params.start):
+        if params.form == "off" or not self.has_begun(moment):
             return nothing
         met = rendered.opacity.detach() > OPAQUE
         if params.form == "stable" and fixed_shapes(self.device):

@@ -42,6 +42,10 @@ class Term:
         self.photos, self.generator, self.evidence = photos, generator, evidence
         self.device = cache.values.device
 
+    def has_begun(self, moment: Moment) -> bool:
+        """Whether it counts by now; a recorded step goes on as it was, so it is recorded anew when one begins."""
+        return True
+
     def recolored(self, rendered: Rendered, moment: Moment, generator: torch.Generator | None) -> Rendered:
         """The rays with the colours that they have by this term."""
         return rendered
