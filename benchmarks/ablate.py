@@ -75,6 +75,7 @@ def _term(name: str, off: str = "off", **paper: str) -> Part:
 # A new part is a line here, all else follows from it; its only form of ours is called as the others' first is.
 PARTS: dict[str, Part] = {
     "colors": Part({"train.field.colors": "network"}, {"stable": {"train.field.colors": "shaded"}}),
+    "evidence": Part({"train.evidence": "false"}, {"stable": {"train.evidence": "true"}}),
     "ambiguity": _term("ambiguity", visibility="paper"),
     "reflection": _term("reflection", samples="64"),
     "planar": _term("planar", weight="1.0", features="mlp", scale_until="0.2", rays="1024"),

@@ -213,6 +213,11 @@ class TrainParams(Section):
         description="hold every n-th photo out of training and texture, and report the PSNR on those; 0: none",
     )
     preview_every: float = Field(0.25, gt=0, le=1, description="progress between preview renders")
+    evidence: bool = Field(
+        True,
+        description="let dense stereo tell what is shiny, so that outlines and not reflections count there, and where "
+        "photos agree on the surface, which needs no help then; false: all counts alike everywhere",
+    )
     precision: Literal["auto", "float32", "mixed"] = Field(
         "auto",
         description="matrix products of the networks: float32, or bfloat16 for colours and, on CUDA, TF32 for the "

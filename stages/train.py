@@ -312,9 +312,11 @@ def _make_trainer(context: StageContext[TrainParams], scene: PosedScene) -> Any:
 
 
 def _evidence(context: StageContext[TrainParams], scene: PosedScene) -> Evidence:
-    """What the depth maps say of places in the scene frame."""
+    """What the depth maps say of places in the scene frame, where that is asked for."""
     from stages.neural.evidence import Evidence
 
+    if not context.params.evidence:
+        return Evidence.none(context.device)
     maps, unit = context.read(DEPTH_MAPS), np.float32(scene.poses_from_scene.scale)
     found = (maps.load(name) for name in scene.cameras.names)
     return Evidence.of((pair and (pair[0] / unit, pair[1]) for pair in found), scene.cameras, context.device)
@@ -570,7 +572,7 @@ def _last_numbers(metrics: Path) -> dict[str, float]:
 
 TRAIN: Stage[TrainParams] = Stage(
     name="train",
-    version=10,
+    version=11,
     settings=lambda config: config.train,
     run=run,
     reads=(FIRST_SCENE, PINHOLE_PHOTOS, OUTLINES, SILHOUETTES, DEPTH_MAPS, POINT_CLOUD),

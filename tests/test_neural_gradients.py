@@ -6,7 +6,12 @@ import pytest
 import torch
 
 from stages.neural.appearance import positional_encoding
-from stages.neural.density import laplace_density, logistic_section_optical_depth, section_optical_depth
+from stages.neural.density import (
+    change_optical_depth,
+    laplace_density,
+    logistic_section_optical_depth,
+    section_optical_depth,
+)
 from stages.neural.fields import contract, smooth_relu_reference
 from stages.neural.losses import (
     eikonal_error,
@@ -58,7 +63,13 @@ RENDERING = {
     ),
     "optical depths": (lambda f, at: sample_optical_depths(f, at, 0.2), draw(3, 6), sorted_distances(3, 6)),
     "optical depths of neus": (
-        lambda f, at: sample_optical_depths(f, at.detach(), 0.2, "neus"), draw(3, 6), sorted_distances(3, 6),
+        lambda f, at: sample_optical_depths(f, at.detach(), 0.2, density="neus"), draw(3, 6), sorted_distances(3, 6),
+    ),
+    "optical depths head on": (
+        lambda f, at: sample_optical_depths(f, at, 0.2, torch.full_like(f, 0.6)), draw(3, 6), sorted_distances(3, 6),
+    ),
+    "section by change": (
+        change_optical_depth, draw(9), draw(9, seed=1), draw(1, low=0.1, high=0.3).squeeze(),
     ),
     "weights": (weights_from_optical_depth, draw(3, 6, low=0.0)),
     "composite": (composite, draw(3, 6, low=0.0), draw(3, 6, 2, seed=1)),

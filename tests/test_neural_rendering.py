@@ -67,16 +67,18 @@ def test_weights_match_a_slow_loop_and_sum_to_one():
 
 
 @pytest.mark.parametrize("scale", [0.1, 0.02, 0.001])
-def test_the_kernel_weighs_samples_and_pulls_on_f_as_the_reference_does(scale):
+@pytest.mark.parametrize("head_on", [0.0, 0.3, 1.0])
+def test_the_kernel_weighs_samples_and_pulls_on_f_as_the_reference_does(scale, head_on):
     generator = torch.Generator().manual_seed(0)
     distances = torch.sort(1.5 * torch.rand(200, 16, generator=generator), 1).values
     sdf = 0.4 - distances + 0.05 * torch.randn(200, 16, generator=generator)
     sdf[:20], sdf[20:30] = 0.01 * torch.randn(20, 16, generator=generator), -0.02  # grazing, and flat inside
     pull = torch.randn(200, 17, generator=generator)
+    facing = head_on * torch.linspace(0, 1, 16).expand(200, 16)
     results = []
     for precision in (torch.float32, torch.float64):  # the kernel takes the first
         f = sdf.to(precision, copy=True).requires_grad_()
-        weights, left = rendering_weights(f, distances.to(precision), scale)
+        weights, left = rendering_weights(f, distances.to(precision), scale, facing.to(precision))
         ((weights * pull[:, :16]).sum() + (left * pull[:, 16]).sum()).backward()
         results.append((weights.float(), left.float(), f.grad.float()))
     (weights, left, gradient), (expected_weights, expected_left, expected_gradient) = results
@@ -100,6 +102,23 @@ def test_a_near_miss_stays_transparent_with_few_samples():
     distances = torch.tensor([[0.0, 0.7, 1.5, 2.0]])
     _, left = weights_from_optical_depth(sample_optical_depths(torch.full((1, 4), 0.1), distances, 0.005))
     assert left.item() > 0.999
+
+
+def test_head_on_the_outline_of_a_ball_is_where_its_surface_is():
+    """Opacity of rays that pass beside the surface of a ball: 3 b from it, it is a half by the density alone."""
+    radius, scale = 0.3, 0.002
+    beside = torch.tensor([-1.0, 1.0, 2.5, 6.0]) * scale
+    along = torch.linspace(-0.5, 0.5, 4001)
+    f = (along**2 + (radius + beside[:, None]) ** 2).sqrt() - radius
+    distances = along.expand(4, -1)
+    through, head_on = (
+        weights_from_optical_depth(sample_optical_depths(f, distances, scale, torch.full_like(f, part)))[1]
+        for part in (0.0, 1.0)
+    )
+    assert (1 - through).tolist() == pytest.approx([1, 1, 0.71, 0.04], abs=0.02)
+    # 1 - exp(-exp(-f / b)) outside: the density's integral over f, to the surface and away from it
+    assert (1 - head_on)[1:].tolist() == pytest.approx([0.31, 0.08, 0.002], abs=0.01)
+    assert 1 - head_on[0] > 0.7
 
 
 def test_composite_is_the_weighted_sum():

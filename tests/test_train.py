@@ -35,6 +35,7 @@ from stages.geometry.point_cloud import PointCloud
 from stages.geometry.similarity import Similarity
 from stages.neural import acceleration, encodings
 from stages.neural import fields as fields_module
+from stages.neural.evidence import SIDE, Evidence
 from stages.neural.fields import contract
 from stages.neural.needed_rays import NeededRays
 from stages.neural.sightings import Sightings, sighting_loss
@@ -112,6 +113,24 @@ def test_a_sighting_costs_where_the_field_contradicts_it():
         costs.append(float(sighting_loss(wrong, weights, 0.01, 0.01)))
     assert costs[0] == pytest.approx(2 * costs[1])
     assert costs[0] > 0
+
+
+def test_sightings_do_not_count_where_it_is_shiny():
+    """Reflections lie there; what is seen beside keeps its weight."""
+    cameras = ring_of_cameras()
+    _, dense = ball_sightings(cameras)
+    shiny = torch.zeros(1, 1, *3 * [SIDE])
+    shiny[..., : SIDE // 2 - 1] = 1  # x < 0
+    weighed = dense.but_where(shiny)
+    left, right = dense.points[:, 0] < -0.1, dense.points[:, 0] > 0.1
+    assert left.any()
+    assert weighed.weights[left].abs().max() < 1e-6
+    assert torch.equal(weighed.weights[right], dense.weights[right])
+    evidence = Evidence(shiny, torch.zeros_like(shiny))
+    photos = Photos(cameras, [render(cameras, i)[0] for i in range(len(cameras))], None, "cpu")
+    trainer = Trainer(photos, *ball_sightings(cameras), TINY, "cpu", evidence)
+    assert torch.equal(trainer.dense.weights, weighed.weights)
+    assert trainer.sightings.weights[trainer.sightings.points[:, 0] < -0.1].abs().max() < 1e-6
 
 
 def test_the_field_is_a_sphere_before_training():

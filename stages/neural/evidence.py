@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 # Cells along the side of the grid over [-1, 1]^3, and the sides of the boxes that their sums are averaged over, one
 # after the other: a mirror's depths lie a few percent behind it.
-SIDE, BOXES = 48, (5, 3)
+SIDE, BOXES = 48, (7, 5)
 # Every so many-th pixel of a depth map is asked, along each axis: a cell is a dozen pixels wide.
 _STRIDE = 3
 # Places with fewer depths than this part of what there is on average have none to speak of.
@@ -34,8 +34,11 @@ _TRACE = 1e-4
 # Trusted depths speak of places in a box of so many cells a side.
 _NEAR = 3
 # Share of doubt from which a place is taken for shiny, and at which it is for sure. In the middle of a helmet it is
-# 0.16, of a plain part 0.3, of a plaster one 0.37, of a mirror 0.6, of two polished ones 0.65 and 0.83.
-SHINY = (0.4, 0.55)
+# 0.17, of a plain part 0.3, of a plaster one 0.37, of a mirror 0.61, of two polished ones 0.7 and 0.83.
+SHINY = (0.53, 0.68)
+# Shiny places smaller than the first box, in cells a side, are holes in what is plain; to larger ones belongs what is
+# beside them, as far as the second box is wider: where they stand on the ground, its trusted depths are near.
+_SMALLEST, _BESIDE = 5, 9
 
 
 @dataclass(frozen=True)
@@ -67,7 +70,7 @@ class Evidence:
             maps: one for each camera, in its order; None where a photo has no depths. In the cameras' units.
             cameras: in the scene frame.
         """
-        from scipy.ndimage import uniform_filter
+        from scipy.ndimage import grey_dilation, grey_erosion, uniform_filter
 
         sums = np.zeros((2, SIDE**3))
         for index, pair in enumerate(maps):
@@ -83,6 +86,7 @@ class Evidence:
         usual = _usual(found)
         low, high = SHINY
         shiny = (doubted / (found + _FEW * usual) - low) / (high - low)
+        shiny = grey_dilation(grey_erosion(shiny, _SMALLEST), _BESIDE)
         grids = (torch.from_numpy(each.clip(0, 1)).float()[None, None].to(device) for each in (shiny, known))
         return Evidence(*grids)
 

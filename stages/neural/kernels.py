@@ -372,28 +372,36 @@ def _laplace_cdf(sdf, scale):
 
 
 @njit(inline="always")
-def _section(start, end, scale, flat):
-    """Mean of Psi_b(-f) over a section on which f runs linearly from start to end."""
+def _section(start, end, length, facing, scale, flat):
+    """Optical depth of a section of this length (in b) on which f runs linearly from start to end.
+
+    `stages.neural.density.section_optical_depth`, by the part `facing` `change_optical_depth`.
+    """
     change = end - start
-    if abs(change) < flat:
-        return _laplace_cdf(np.float32(0.5) * (start + end), scale)
-    return (_density_integral(start, scale) - _density_integral(end, scale)) / change
+    fall = _density_integral(start, scale) - _density_integral(end, scale)
+    mean = _laplace_cdf(np.float32(0.5) * (start + end), scale) if abs(change) < flat else fall / change
+    return length * mean + facing * (abs(fall) / scale - length * mean)
 
 
 @njit(inline="always")
-def _section_slopes(start, end, scale, flat):
+def _section_slopes(start, end, length, facing, scale, flat):
     """The derivatives of `_section` with respect to start and end."""
     change = end - start
+    at_start, at_end = _laplace_cdf(start, scale), _laplace_cdf(end, scale)
+    fall = _density_integral(start, scale) - _density_integral(end, scale)
     if abs(change) < flat:
         middle = _laplace_cdf(np.float32(0.5) * (start + end), scale)
         slope = np.float32(-0.5) * min(middle, np.float32(1) - middle) / scale
-        return slope, slope
-    mean = (_density_integral(start, scale) - _density_integral(end, scale)) / change
-    return (mean - _laplace_cdf(start, scale)) / change, (_laplace_cdf(end, scale) - mean) / change
+        to_start = to_end = length * slope
+    else:
+        mean = fall / change
+        to_start, to_end = length * (mean - at_start) / change, length * (at_end - mean) / change
+    side = np.sign(change) / scale
+    return to_start - facing * (side * at_start + to_start), to_end + facing * (side * at_end - to_end)
 
 
 @njit(parallel=True, **_OPTIONS)
-def ray_weights_forward(sdf, distances, scale, flat, weights, transmittance):
+def ray_weights_forward(sdf, distances, facing, scale, flat, weights, transmittance):
     """Fill weights [R, K] and transmittance [R]: `stages.neural.rendering.rendering_weights`."""
     num_rays, num_samples = sdf.shape
     b, half, flat_change = np.float32(scale), np.float32(0.5), np.float32(flat * scale)
@@ -404,8 +412,8 @@ def ray_weights_forward(sdf, distances, scale, flat, weights, transmittance):
             if k + 1 < num_samples:
                 stretch = half * (distances[r, k + 1] - distances[r, k]) / b
                 middle = half * (sdf[r, k] + sdf[r, k + 1])
-                depth += stretch * _section(sdf[r, k], middle, b, flat_change)
-                far = stretch * _section(middle, sdf[r, k + 1], b, flat_change)
+                depth += _section(sdf[r, k], middle, stretch, facing[r, k], b, flat_change)
+                far = _section(middle, sdf[r, k + 1], stretch, facing[r, k + 1], b, flat_change)
             weight = -left * np.expm1(-depth)
             weights[r, k] = weight
             left -= weight
@@ -414,7 +422,7 @@ def ray_weights_forward(sdf, distances, scale, flat, weights, transmittance):
 
 @njit(parallel=True, **_OPTIONS)
 def ray_weights_backward(
-    sdf, distances, scale, flat, weights, transmittance, grad_weights, grad_transmittance, grad_sdf
+    sdf, distances, facing, scale, flat, weights, transmittance, grad_weights, grad_transmittance, grad_sdf
 ):
     """Fill grad_sdf [R, K] given the gradients of weights [R, K] and transmittance [R].
 
@@ -432,9 +440,9 @@ def ray_weights_backward(
             grad_near = grad_far - left * (grad_weights[r, k + 1] - grad_weights[r, k])  # of sample k's
             stretch = half * (distances[r, k + 1] - distances[r, k]) / b
             middle = half * (sdf[r, k] + sdf[r, k + 1])
-            near_start, near_end = _section_slopes(sdf[r, k], middle, b, flat_change)
-            far_start, far_end = _section_slopes(middle, sdf[r, k + 1], b, flat_change)
+            near_start, near_end = _section_slopes(sdf[r, k], middle, stretch, facing[r, k], b, flat_change)
+            far_start, far_end = _section_slopes(middle, sdf[r, k + 1], stretch, facing[r, k + 1], b, flat_change)
             of_middle = half * (grad_near * near_end + grad_far * far_start)
-            grad_sdf[r, k] = stretch * (grad_near * near_start + of_middle)
-            grad_sdf[r, k + 1] += stretch * (grad_far * far_end + of_middle)
+            grad_sdf[r, k] = grad_near * near_start + of_middle
+            grad_sdf[r, k + 1] += grad_far * far_end + of_middle
             grad_far = grad_near

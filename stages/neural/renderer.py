@@ -13,6 +13,7 @@ from torch import Tensor
 from configs.training import TrainParams
 from stages.neural import schedules
 from stages.neural.acceleration import fixed_shapes
+from stages.neural.evidence import at_places
 from stages.neural.fields import BackgroundNetwork, Fields
 from stages.neural.proposal import proposal_distances
 from stages.neural.radiance import Colored
@@ -79,8 +80,10 @@ class Renderer:
         num_points = len(points)
         places = points if extra is None else torch.cat([points, extra])
         sdf, features, gradients = self.fields.sdf(places, moment.levels)
+        # what is shiny is found by its outlines: they have to be where the surface is
+        facing = at_places(self.fields.radiance.shiny, points).view(num_rays, num_samples)
         weights, transmittance = rendering_weights(
-            sdf[:num_points].view(num_rays, num_samples), distances, moment.scale, self.params.density.form
+            sdf[:num_points].view(num_rays, num_samples), distances, moment.scale, facing, self.params.density.form
         )
 
         shade = self._deferred_colors if moment.deferred else self._colors

@@ -7,7 +7,7 @@ Shapes: P points, I photos, M lines of sight, S of them drawn for a step.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -17,6 +17,7 @@ from torch import Tensor
 from stages.geometry.cameras import PosedScene
 from stages.geometry.point_cloud import PointCloud
 from stages.neural import losses
+from stages.neural.evidence import at_places
 from stages.neural.sampling import intersect_unit_sphere
 
 if TYPE_CHECKING:
@@ -79,6 +80,13 @@ class Sightings:
         point = np.repeat(np.arange(len(cloud)), np.diff(cloud.starts))
         observations = np.stack([cloud.photos, point], 1)
         return _within(cloud.points, cloud.trust, centers, observations, device, training)
+
+    def but_where(self, shiny: Float[Tensor, "1 1 g g g"]) -> Sightings:
+        """These, weighed down where something is shiny (see `Evidence`): reflections are seen there, behind it.
+
+        What is seen past a shiny thing keeps its weight: it tells of the outlines.
+        """
+        return replace(self, weights=self.weights * (1 - at_places(shiny, self.points)))
 
     def draw(self, count: int, step: float, generator: torch.Generator) -> Drawn:
         """Four places along each of S random sightings; S is at most `count`.

@@ -73,8 +73,9 @@ class Trainer:
         device: torch.device | str,
         evidence: Evidence | None = None,
     ) -> None:
-        self.photos, self.sightings, self.dense, self.params = photos, sightings, dense, params
+        self.photos, self.params = photos, params
         self.evidence = evidence or Evidence.none(device)
+        self.sightings, self.dense = (each.but_where(self.evidence.shiny) for each in (sightings, dense))
         self.device = torch.device(device)
         background = params.field.background and photos.masks is None
         self.fields = Fields(field_shape(params, len(photos), background), params.seed).to(device)
