@@ -241,7 +241,7 @@ def test_a_stage_s_old_settings_compare_equal_to_the_same_ones_of_today():
         "train": {
             "steps_if_covered", "losses.dense", "losses.dense_tolerance", "losses.dense_step", "losses.dense_batch",
             "sampling.samples_end", "sampling.needed_share", "schedule.deferred_from", "field.colors", "losses.gloss",
-            "terms.planar.start", "evidence",
+            "terms.planar.start", "evidence", "density.outlines_from", "density.outlines_until",
         },
     }  # fmt: skip
     other_defaults = {"terms.planar.form", "terms.planar.weight"}

@@ -7,9 +7,9 @@ import torch
 
 from stages.neural.appearance import positional_encoding
 from stages.neural.density import (
-    change_optical_depth,
     laplace_density,
     logistic_section_optical_depth,
+    outline_correction,
     section_optical_depth,
 )
 from stages.neural.fields import contract, smooth_relu_reference
@@ -65,11 +65,11 @@ RENDERING = {
     "optical depths of neus": (
         lambda f, at: sample_optical_depths(f, at.detach(), 0.2, density="neus"), draw(3, 6), sorted_distances(3, 6),
     ),
-    "optical depths head on": (
+    "optical depths outlined": (
         lambda f, at: sample_optical_depths(f, at, 0.2, torch.full_like(f, 0.6)), draw(3, 6), sorted_distances(3, 6),
     ),
     "section by change": (
-        change_optical_depth, draw(9), draw(9, seed=1), draw(1, low=0.1, high=0.3).squeeze(),
+        outline_correction, draw(9), draw(9, seed=1), draw(9, seed=2, low=0.1), draw(1, low=0.1, high=0.3).squeeze(),
     ),
     "weights": (weights_from_optical_depth, draw(3, 6, low=0.0)),
     "composite": (composite, draw(3, 6, low=0.0), draw(3, 6, 2, seed=1)),

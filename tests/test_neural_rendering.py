@@ -67,18 +67,18 @@ def test_weights_match_a_slow_loop_and_sum_to_one():
 
 
 @pytest.mark.parametrize("scale", [0.1, 0.02, 0.001])
-@pytest.mark.parametrize("head_on", [0.0, 0.3, 1.0])
-def test_the_kernel_weighs_samples_and_pulls_on_f_as_the_reference_does(scale, head_on):
+@pytest.mark.parametrize("outlined_part", [0.0, 0.3, 1.0])
+def test_the_kernel_weighs_samples_and_pulls_on_f_as_the_reference_does(scale, outlined_part):
     generator = torch.Generator().manual_seed(0)
     distances = torch.sort(1.5 * torch.rand(200, 16, generator=generator), 1).values
     sdf = 0.4 - distances + 0.05 * torch.randn(200, 16, generator=generator)
     sdf[:20], sdf[20:30] = 0.01 * torch.randn(20, 16, generator=generator), -0.02  # grazing, and flat inside
     pull = torch.randn(200, 17, generator=generator)
-    facing = head_on * torch.linspace(0, 1, 16).expand(200, 16)
+    outlined = outlined_part * torch.linspace(0, 1, 16).expand(200, 16)
     results = []
     for precision in (torch.float32, torch.float64):  # the kernel takes the first
         f = sdf.to(precision, copy=True).requires_grad_()
-        weights, left = rendering_weights(f, distances.to(precision), scale, facing.to(precision))
+        weights, left = rendering_weights(f, distances.to(precision), scale, outlined.to(precision))
         ((weights * pull[:, :16]).sum() + (left * pull[:, 16]).sum()).backward()
         results.append((weights.float(), left.float(), f.grad.float()))
     (weights, left, gradient), (expected_weights, expected_left, expected_gradient) = results
@@ -104,21 +104,29 @@ def test_a_near_miss_stays_transparent_with_few_samples():
     assert left.item() > 0.999
 
 
-def test_head_on_the_outline_of_a_ball_is_where_its_surface_is():
+def test_the_outline_of_a_ball_is_where_its_surface_is():
     """Opacity of rays that pass beside the surface of a ball: 3 b from it, it is a half by the density alone."""
     radius, scale = 0.3, 0.002
     beside = torch.tensor([-1.0, 1.0, 2.5, 6.0]) * scale
     along = torch.linspace(-0.5, 0.5, 4001)
     f = (along**2 + (radius + beside[:, None]) ** 2).sqrt() - radius
     distances = along.expand(4, -1)
-    through, head_on = (
-        weights_from_optical_depth(sample_optical_depths(f, distances, scale, torch.full_like(f, part)))[1]
-        for part in (0.0, 1.0)
-    )
-    assert (1 - through).tolist() == pytest.approx([1, 1, 0.71, 0.04], abs=0.02)
+    assert _opacity(f, distances, scale, 0.0) == pytest.approx([1, 1, 0.71, 0.04], abs=0.02)
     # 1 - exp(-exp(-f / b)) outside: the density's integral over f, to the surface and away from it
-    assert (1 - head_on)[1:].tolist() == pytest.approx([0.31, 0.08, 0.002], abs=0.01)
-    assert 1 - head_on[0] > 0.7
+    assert _opacity(f, distances, scale, 1.0) == pytest.approx([1, 0.31, 0.08, 0.002], abs=0.01)
+
+
+def test_what_is_solid_lets_no_light_through_where_f_is_even():
+    distances = torch.linspace(0, 1, 101)[None]
+    for part in (0.0, 1.0):
+        assert _opacity(torch.full_like(distances, -0.001), distances, 0.002, part) == pytest.approx([1])
+    assert _opacity(torch.full_like(distances, 0.001), distances, 0.002, 1.0) == pytest.approx([0])
+
+
+def _opacity(f: torch.Tensor, distances: torch.Tensor, scale: float, outlined: float) -> list[float]:
+    tau = sample_optical_depths(f, distances, scale, torch.full_like(f, outlined))
+    opacity: list[float] = (1 - weights_from_optical_depth(tau)[1]).tolist()
+    return opacity
 
 
 def test_composite_is_the_weighted_sum():

@@ -67,14 +67,29 @@ def section_optical_depth(
     return torch.where(flat, middle, quotient) * delta / scale
 
 
-def change_optical_depth(
-    sdf_start: Float[Tensor, "*any"], sdf_end: Float[Tensor, "*any"], scale: Float[Tensor, ""] | float
+def outline_correction(
+    sdf_start: Float[Tensor, "*any"],
+    sdf_end: Float[Tensor, "*any"],
+    delta: Float[Tensor, "*#any"],
+    scale: Float[Tensor, ""] | float,
 ) -> Float[Tensor, "*any"]:
-    """Optical depth tau of ray sections from how much f changes on them: the exact integral of sigma |df/dt|.
+    """What makes of `section_optical_depth` one by which outlines are where f is 0: the density outside counts by how
+    fast f changes along the ray, sigma |df/dt| for f > 0.
 
-    A ray that passes beside a surface is stopped by `laplace_density` as far as 3 b from it, so that things come out
-    that much smaller than their outlines; here it is not (Zhang et al., Towards unbiased volume rendering of neural
-    implicit surfaces with geometry priors, CVPR 2023). But a place where f is even lets light through, also if it is
-    solid.
+    `laplace_density` stops a ray that passes beside a surface as far as 3 b from it, so that things come out that much
+    smaller than their outlines. Zhang et al. (Towards unbiased volume rendering of neural implicit surfaces with
+    geometry priors, CVPR 2023) scale the density inside, too; then what is solid lets light through where f is even.
     """
-    return (_density_integral(sdf_start, scale) - _density_integral(sdf_end, scale)).abs() / scale
+    change = sdf_end - sdf_start
+    flat = change.abs() < FLAT * scale
+    quotient = (_outside_integral(sdf_start, scale) - _outside_integral(sdf_end, scale)) / torch.where(
+        flat, torch.ones_like(change), change
+    )
+    middle = 0.5 * (sdf_start + sdf_end)
+    mean = torch.where(flat, torch.where(middle >= 0, 0.5 * torch.exp(-middle.abs() / scale), 0.0), quotient)
+    return mean * (change.abs() - delta) / scale
+
+
+def _outside_integral(sdf: Float[Tensor, "*any"], scale: Float[Tensor, ""] | float) -> Float[Tensor, "*any"]:
+    """The part of `_density_integral` that is outside: constant for f < 0."""
+    return 0.5 * scale * torch.exp(-torch.relu(sdf) / scale)

@@ -372,36 +372,57 @@ def _laplace_cdf(sdf, scale):
 
 
 @njit(inline="always")
-def _section(start, end, length, facing, scale, flat):
-    """Optical depth of a section of this length (in b) on which f runs linearly from start to end.
-
-    `stages.neural.density.section_optical_depth`, by the part `facing` `change_optical_depth`.
-    """
-    change = end - start
-    fall = _density_integral(start, scale) - _density_integral(end, scale)
-    mean = _laplace_cdf(np.float32(0.5) * (start + end), scale) if abs(change) < flat else fall / change
-    return length * mean + facing * (abs(fall) / scale - length * mean)
+def _outside_cdf(sdf, scale):
+    """Psi_b(-f) outside, 0 inside."""
+    return _laplace_cdf(sdf, scale) if sdf >= np.float32(0) else np.float32(0)
 
 
 @njit(inline="always")
-def _section_slopes(start, end, length, facing, scale, flat):
+def _outside_integral(sdf, scale):
+    """`stages.neural.density._outside_integral`."""
+    return scale * _laplace_cdf(max(sdf, np.float32(0)), scale)
+
+
+@njit(inline="always")
+def _section(start, end, length, outlined, scale, flat):
+    """Optical depth of a section of this length (in b) on which f runs linearly from start to end.
+
+    `stages.neural.density.section_optical_depth`, and the part `outlined` of its `outline_correction`.
+    """
+    change = end - start
+    if abs(change) < flat:
+        middle = np.float32(0.5) * (start + end)
+        mean, outside = _laplace_cdf(middle, scale), _outside_cdf(middle, scale)
+    else:
+        mean = (_density_integral(start, scale) - _density_integral(end, scale)) / change
+        outside = (_outside_integral(start, scale) - _outside_integral(end, scale)) / change
+    return length * mean + outlined * outside * (abs(change) / scale - length)
+
+
+@njit(inline="always")
+def _section_slopes(start, end, length, outlined, scale, flat):
     """The derivatives of `_section` with respect to start and end."""
     change = end - start
-    at_start, at_end = _laplace_cdf(start, scale), _laplace_cdf(end, scale)
-    fall = _density_integral(start, scale) - _density_integral(end, scale)
     if abs(change) < flat:
-        middle = _laplace_cdf(np.float32(0.5) * (start + end), scale)
-        slope = np.float32(-0.5) * min(middle, np.float32(1) - middle) / scale
-        to_start = to_end = length * slope
+        middle = np.float32(0.5) * (start + end)
+        cdf, outside = _laplace_cdf(middle, scale), _outside_cdf(middle, scale)
+        to_start = to_end = np.float32(-0.5) * min(cdf, np.float32(1) - cdf) / scale
+        outside_to_start = outside_to_end = np.float32(-0.5) * outside / scale
     else:
-        mean = fall / change
-        to_start, to_end = length * (mean - at_start) / change, length * (at_end - mean) / change
-    side = np.sign(change) / scale
-    return to_start - facing * (side * at_start + to_start), to_end + facing * (side * at_end - to_end)
+        mean = (_density_integral(start, scale) - _density_integral(end, scale)) / change
+        to_start, to_end = (mean - _laplace_cdf(start, scale)) / change, (_laplace_cdf(end, scale) - mean) / change
+        outside = (_outside_integral(start, scale) - _outside_integral(end, scale)) / change
+        outside_to_start = (outside - _outside_cdf(start, scale)) / change
+        outside_to_end = (_outside_cdf(end, scale) - outside) / change
+    rest, turn = abs(change) / scale - length, outside * np.sign(change) / scale
+    return (
+        length * to_start + outlined * (outside_to_start * rest - turn),
+        length * to_end + outlined * (outside_to_end * rest + turn),
+    )
 
 
 @njit(parallel=True, **_OPTIONS)
-def ray_weights_forward(sdf, distances, facing, scale, flat, weights, transmittance):
+def ray_weights_forward(sdf, distances, outlined, scale, flat, weights, transmittance):
     """Fill weights [R, K] and transmittance [R]: `stages.neural.rendering.rendering_weights`."""
     num_rays, num_samples = sdf.shape
     b, half, flat_change = np.float32(scale), np.float32(0.5), np.float32(flat * scale)
@@ -412,8 +433,8 @@ def ray_weights_forward(sdf, distances, facing, scale, flat, weights, transmitta
             if k + 1 < num_samples:
                 stretch = half * (distances[r, k + 1] - distances[r, k]) / b
                 middle = half * (sdf[r, k] + sdf[r, k + 1])
-                depth += _section(sdf[r, k], middle, stretch, facing[r, k], b, flat_change)
-                far = _section(middle, sdf[r, k + 1], stretch, facing[r, k + 1], b, flat_change)
+                depth += _section(sdf[r, k], middle, stretch, outlined[r, k], b, flat_change)
+                far = _section(middle, sdf[r, k + 1], stretch, outlined[r, k + 1], b, flat_change)
             weight = -left * np.expm1(-depth)
             weights[r, k] = weight
             left -= weight
@@ -422,7 +443,7 @@ def ray_weights_forward(sdf, distances, facing, scale, flat, weights, transmitta
 
 @njit(parallel=True, **_OPTIONS)
 def ray_weights_backward(
-    sdf, distances, facing, scale, flat, weights, transmittance, grad_weights, grad_transmittance, grad_sdf
+    sdf, distances, outlined, scale, flat, weights, transmittance, grad_weights, grad_transmittance, grad_sdf
 ):
     """Fill grad_sdf [R, K] given the gradients of weights [R, K] and transmittance [R].
 
@@ -440,8 +461,8 @@ def ray_weights_backward(
             grad_near = grad_far - left * (grad_weights[r, k + 1] - grad_weights[r, k])  # of sample k's
             stretch = half * (distances[r, k + 1] - distances[r, k]) / b
             middle = half * (sdf[r, k] + sdf[r, k + 1])
-            near_start, near_end = _section_slopes(sdf[r, k], middle, stretch, facing[r, k], b, flat_change)
-            far_start, far_end = _section_slopes(middle, sdf[r, k + 1], stretch, facing[r, k + 1], b, flat_change)
+            near_start, near_end = _section_slopes(sdf[r, k], middle, stretch, outlined[r, k], b, flat_change)
+            far_start, far_end = _section_slopes(middle, sdf[r, k + 1], stretch, outlined[r, k + 1], b, flat_change)
             of_middle = half * (grad_near * near_end + grad_far * far_start)
             grad_sdf[r, k] = grad_near * near_start + of_middle
             grad_sdf[r, k + 1] += grad_far * far_end + of_middle

@@ -61,7 +61,8 @@ class Renderer:
         last = min(sampling.samples_end, sampling.samples)
         samples = schedules.even_steps(progress, sampling.samples, last, _FEWER_FROM, density.sharpen_until)
         deferred = schedule.deferred_from is not None and progress >= schedule.deferred_from
-        return Moment(progress, scale, levels, grid.voxel_size(levels), samples, deferred)
+        outlined = schedules.fade_in(progress, density.outlines_from, density.outlines_until)
+        return Moment(progress, scale, levels, grid.voxel_size(levels), samples, deferred, outlined)
 
     def render(
         self,
@@ -81,9 +82,13 @@ class Renderer:
         places = points if extra is None else torch.cat([points, extra])
         sdf, features, gradients = self.fields.sdf(places, moment.levels)
         # what is shiny is found by its outlines: they have to be where the surface is
-        facing = at_places(self.fields.radiance.shiny, points).view(num_rays, num_samples)
+        shiny = at_places(self.fields.radiance.shiny, points).view(num_rays, num_samples)
         weights, transmittance = rendering_weights(
-            sdf[:num_points].view(num_rays, num_samples), distances, moment.scale, facing, self.params.density.form
+            sdf[:num_points].view(num_rays, num_samples),
+            distances,
+            moment.scale,
+            moment.outlined * shiny,
+            self.params.density.form,
         )
 
         shade = self._deferred_colors if moment.deferred else self._colors

@@ -13,8 +13,8 @@ from torch import Tensor
 from stages.neural.acceleration import takes_kernel
 from stages.neural.density import (
     FLAT,
-    change_optical_depth,
     logistic_section_optical_depth,
+    outline_correction,
     section_optical_depth,
 )
 
@@ -29,7 +29,7 @@ def rendering_weights(
     sdf: Float[Tensor, "r k"],
     distances: Float[Tensor, "r k"],
     scale: Float[Tensor, ""] | float,
-    facing: Float[Tensor, "r k"],
+    outlined: Float[Tensor, "r k"],
     density: str = "laplace",
 ) -> tuple[Float[Tensor, "r k"], Float[Tensor, " r"]]:
     """Rendering weights of samples with f at distances, and the transmittance behind them.
@@ -38,15 +38,15 @@ def rendering_weights(
     and the density that of "laplace".
     """
     if density == "laplace" and isinstance(scale, float) and takes_kernel(sdf):
-        return _KernelWeights.apply(sdf, distances, facing, scale)
-    return weights_from_optical_depth(sample_optical_depths(sdf, distances, scale, facing, density))
+        return _KernelWeights.apply(sdf, distances, outlined, scale)
+    return weights_from_optical_depth(sample_optical_depths(sdf, distances, scale, outlined, density))
 
 
 def sample_optical_depths(
     sdf: Float[Tensor, "r k"],
     distances: Float[Tensor, "r k"],
     scale: Float[Tensor, ""] | float,
-    facing: Float[Tensor, "r k"] | None = None,
+    outlined: Float[Tensor, "r k"] | None = None,
     density: str = "laplace",
 ) -> Float[Tensor, "r k"]:
     """Optical depth of each sample's own stretch of the ray, half way to its neighbours.
@@ -56,8 +56,8 @@ def sample_optical_depths(
     The density is that of "laplace", or the logistic one of "neus".
 
     Args:
-        facing: part in which the density of "laplace" counts as if the ray met each surface head on, of the stretch of
-            each sample, in [0, 1]; nowhere if not given.
+        outlined: how far the density of "laplace" gets the `outline_correction`, on the stretch of each sample, in
+            [0, 1]; nowhere if not given.
     """
     middle = 0.5 * (sdf[:, 1:] + sdf[:, :-1])
     if density == "neus":
@@ -67,9 +67,9 @@ def sample_optical_depths(
         delta = 0.5 * (distances[:, 1:] - distances[:, :-1])
         near_half = section_optical_depth(sdf[:, :-1], middle, delta, scale)
         far_half = section_optical_depth(middle, sdf[:, 1:], delta, scale)
-        if facing is not None:
-            near_half = torch.lerp(near_half, change_optical_depth(sdf[:, :-1], middle, scale), facing[:, :-1])
-            far_half = torch.lerp(far_half, change_optical_depth(middle, sdf[:, 1:], scale), facing[:, 1:])
+        if outlined is not None:
+            near_half = near_half + outlined[:, :-1] * outline_correction(sdf[:, :-1], middle, delta, scale)
+            far_half = far_half + outlined[:, 1:] * outline_correction(middle, sdf[:, 1:], delta, scale)
     return torch.nn.functional.pad(near_half, (0, 1)) + torch.nn.functional.pad(far_half, (1, 0))
 
 
@@ -112,15 +112,21 @@ class _KernelWeights(torch.autograd.Function):
     """`rendering_weights` in one pass each way; gradients with respect to f only."""
 
     @staticmethod
-    def forward(ctx, sdf, distances, facing, scale):
+    def forward(ctx, sdf, distances, outlined, scale):
         from stages.neural import kernels
 
-        sdf, distances, facing = (each.contiguous() for each in (sdf, distances, facing))
+        sdf, distances, outlined = (each.contiguous() for each in (sdf, distances, outlined))
         weights, transmittance = torch.empty(sdf.shape), torch.empty(len(sdf))
         kernels.ray_weights_forward(
-            sdf.detach().numpy(), distances.numpy(), facing.numpy(), scale, FLAT, weights.numpy(), transmittance.numpy()
+            sdf.detach().numpy(),
+            distances.numpy(),
+            outlined.numpy(),
+            scale,
+            FLAT,
+            weights.numpy(),
+            transmittance.numpy(),
         )
-        ctx.save_for_backward(sdf, distances, facing, weights, transmittance)
+        ctx.save_for_backward(sdf, distances, outlined, weights, transmittance)
         ctx.scale = scale
         return weights, transmittance
 
@@ -129,10 +135,10 @@ class _KernelWeights(torch.autograd.Function):
     def backward(ctx, grad_weights, grad_transmittance):
         from stages.neural import kernels
 
-        sdf, distances, facing, weights, transmittance = ctx.saved_tensors
+        sdf, distances, outlined, weights, transmittance = ctx.saved_tensors
         grad_sdf = torch.empty(sdf.shape)
         kernels.ray_weights_backward(
-            sdf.numpy(), distances.numpy(), facing.numpy(), ctx.scale, FLAT, weights.numpy(), transmittance.numpy(),
+            sdf.numpy(), distances.numpy(), outlined.numpy(), ctx.scale, FLAT, weights.numpy(), transmittance.numpy(),
             grad_weights.contiguous().numpy(), grad_transmittance.contiguous().numpy(), grad_sdf.numpy(),
         )  # fmt: skip
         return grad_sdf, None, None, None

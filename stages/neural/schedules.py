@@ -19,6 +19,7 @@ class Moment:
         voxel: side h of a cell of the finest of them, scene units.
         samples: how many samples a ray has inside the region.
         deferred: whether a ray's colour is that of its mean surface point, not the mean of its samples' colours.
+        outlined: how far outlines are where f is 0 where something is shiny, from 0 to 1.
     """
 
     progress: float
@@ -27,6 +28,7 @@ class Moment:
     voxel: float
     samples: int
     deferred: bool
+    outlined: torch.Tensor | float
 
     @property
     def width(self) -> float:
@@ -42,6 +44,11 @@ def exponential(progress: float, start: float, end: float) -> float:
 def fade_out(progress: float, until: float) -> float:
     """1 at 0, straight down to 0 at `until`."""
     return max(0.0, 1.0 - progress / until) if until > 0 else 0.0
+
+
+def fade_in(progress: float, start: float, until: float) -> float:
+    """0 up to `start`, then straight up to 1 at `until`."""
+    return min(max((progress - start) / (until - start), 0.0), 1.0) if until > start else float(progress >= start)
 
 
 def warm_up_then_decay(progress: float, warm_up: float, final: float) -> float:

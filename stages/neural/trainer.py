@@ -104,8 +104,8 @@ class Trainer:
         self.step_index = 0
         self.cache_step = -(10**9)
         self.replay = Replay(self.device, self.generator) if self._replays() else None
-        # What a graph reads anew at each step: the density's scale, the weight of the sightings.
-        self._scale, self._sparse_weight = torch.zeros(2, device=self.device).unbind()
+        # What a graph reads anew at each step: the density's scale, how far outlines count, the sightings' weight.
+        self._scale, self._outlined, self._sparse_weight = torch.zeros(3, device=self.device).unbind()
         self._prepare_rates()
 
     def start_from(self, distances: Float[np.ndarray, "g g g"]) -> float:
@@ -152,8 +152,9 @@ class Trainer:
             numbers = self._update(moment, sparse_weight)
         else:
             self._scale.fill_(moment.scale)
+            self._outlined.fill_(moment.outlined)
             self._sparse_weight.fill_(sparse_weight)
-            current = replace(moment, scale=self._scale)
+            current = replace(moment, scale=self._scale, outlined=self._outlined)
             kind = moment.levels, moment.samples, moment.deferred, self.terms.begun(moment)
             numbers = self.replay(lambda: self._update(current, self._sparse_weight), kind)
         self.step_index += 1
