@@ -56,13 +56,13 @@ class DensityParams(Section):
         0.002, gt=0, description="scheduled scale b at the end, scene units; never under half a voxel"
     )
     outlines_from: float = Field(
-        0.5,
+        0.3,
         ge=0,
         le=1,
         description="progress from which the density of what is shiny lets rays pass beside it, so that it is as large "
         "as its outlines: holes have to be open by then",
     )
-    outlines_until: float = Field(0.8, ge=0, le=1, description="progress at which it does so in full")
+    outlines_until: float = Field(0.6, ge=0, le=1, description="progress at which it does so in full")
     sharpen_until: float = Field(0.9, gt=0, le=1, description="progress at which the scheduled scale is at its end")
 
 
