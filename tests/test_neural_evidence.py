@@ -3,7 +3,7 @@ import pytest
 import torch
 from sphere_scene import ring_of_cameras
 
-from stages.neural.evidence import Evidence, at_places
+from stages.neural.evidence import Evidence, at_places, large_parts
 
 
 def towards_the_centre(cameras, trust: float):
@@ -37,6 +37,15 @@ def test_depth_maps_may_be_smaller_than_their_photos():
     cameras = ring_of_cameras()
     small = [(depth[::2, ::2], trust[::2, ::2]) for depth, trust in towards_the_centre(cameras, trust=0.05)]
     assert at_places(Evidence.of(small, cameras, "cpu").shiny, CENTRE_AND_ASIDE).tolist() == [1.0, 0.0]
+
+
+def test_a_shiny_hole_is_none_and_what_is_beside_a_shiny_thing_belongs_to_it():
+    grid = np.zeros((30, 30, 30))
+    grid[3:7, 3:7, 3:7] = 1  # four cells a side
+    assert large_parts(grid).max() == 0
+    grid[12:19, 12:19, 12:19] = 0.8
+    assert np.argwhere(large_parts(grid) == 0.8).min(axis=0).tolist() == [10, 10, 10]
+    assert np.argwhere(large_parts(grid) > 0).max(axis=0).tolist() == [20, 20, 20]
 
 
 def test_known_is_where_photos_agree():

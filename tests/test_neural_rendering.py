@@ -26,7 +26,7 @@ from stages.neural.sampling import (
     intersect_unit_sphere,
     stratified,
 )
-from stages.neural.schedules import even_steps
+from stages.neural.schedules import even_steps, fade_in
 
 
 def test_laplace_density_at_known_places():
@@ -127,6 +127,11 @@ def _opacity(f: torch.Tensor, distances: torch.Tensor, scale: float, outlined: f
     tau = sample_optical_depths(f, distances, scale, torch.full_like(f, outlined))
     opacity: list[float] = (1 - weights_from_optical_depth(tau)[1]).tolist()
     return opacity
+
+
+def test_outlines_come_in_evenly():
+    assert [fade_in(progress, 0.3, 0.6) for progress in (0.0, 0.3, 0.45, 0.6, 1.0)] == pytest.approx([0, 0, 0.5, 1, 1])
+    assert [fade_in(progress, 0.3, 0.3) for progress in (0.29, 0.3)] == [0, 1]
 
 
 def test_composite_is_the_weighted_sum():

@@ -12,7 +12,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from ball_training import TINY, assert_finds_the_ball, ball_sightings, make_trainer
+from ball_training import TINY, assert_finds_the_ball, ball_sightings, even_rays, make_trainer
 from sphere_scene import (
     RADIUS,
     render,
@@ -131,6 +131,16 @@ def test_sightings_do_not_count_where_it_is_shiny():
     trainer = Trainer(photos, *ball_sightings(cameras), TINY, "cpu", evidence)
     assert torch.equal(trainer.dense.weights, weighed.weights)
     assert trainer.sightings.weights[trainer.sightings.points[:, 0] < -0.1].abs().max() < 1e-6
+
+
+def test_rays_pass_beside_what_is_shiny_once_its_outlines_count():
+    plain, shiny = make_trainer(), make_trainer()
+    shiny.fields.radiance.shiny.fill_(1)
+    batch = even_rays(plain.photos, 512)
+    for progress, differ in ((0.1, False), (1.0, True)):
+        without, outlined = (each.render(batch, progress).opacity for each in (plain, shiny))
+        assert (outlined <= without + 1e-6).all()
+        assert bool((outlined < without - 0.05).any()) == differ
 
 
 def test_the_field_is_a_sphere_before_training():

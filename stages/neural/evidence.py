@@ -70,7 +70,7 @@ class Evidence:
             maps: one for each camera, in its order; None where a photo has no depths. In the cameras' units.
             cameras: in the scene frame.
         """
-        from scipy.ndimage import grey_dilation, grey_erosion, uniform_filter
+        from scipy.ndimage import uniform_filter
 
         sums = np.zeros((2, SIDE**3))
         for index, pair in enumerate(maps):
@@ -86,7 +86,7 @@ class Evidence:
         usual = _usual(found)
         low, high = SHINY
         shiny = (doubted / (found + _FEW * usual) - low) / (high - low)
-        shiny = grey_dilation(grey_erosion(shiny, _SMALLEST), _BESIDE)
+        shiny = large_parts(shiny)
         grids = (torch.from_numpy(each.clip(0, 1)).float()[None, None].to(device) for each in (shiny, known))
         return Evidence(*grids)
 
@@ -97,6 +97,14 @@ def at_places(values: Float[Tensor, "1 1 g g g"], points: Float[Tensor, "p 3"]) 
         values, points.detach().view(1, 1, 1, -1, 3), align_corners=False, padding_mode="border"
     )
     return found.view(len(points))
+
+
+def large_parts(values: Float[np.ndarray, "g g g"]) -> Float[np.ndarray, "g g g"]:
+    """What is high in boxes of `_SMALLEST` cells a side, and high as far beside them as `_BESIDE` is wider."""
+    from scipy.ndimage import grey_dilation, grey_erosion
+
+    grown: Float[np.ndarray, "g g g"] = grey_dilation(grey_erosion(values, _SMALLEST), _BESIDE)
+    return grown
 
 
 def _places(
