@@ -6,6 +6,7 @@ tau optical depth (dimensionless), delta length of a ray section.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import torch
@@ -47,6 +48,27 @@ def _density_integral(sdf: Float[Tensor, "*any"], scale: Float[Tensor, ""] | flo
     return torch.relu(-sdf) + 0.5 * scale * torch.exp(-sdf.abs() / scale)
 
 
+def _section_mean(
+    integral: Callable[[Tensor, Tensor | float], Tensor],
+    middle: Float[Tensor, "*any"],
+    sdf_start: Float[Tensor, "*any"],
+    sdf_end: Float[Tensor, "*any"],
+    scale: Float[Tensor, ""] | float,
+) -> Float[Tensor, "*any"]:
+    """Mean of a function of f over sections, by its antiderivative in f; where f is flat, what it is in the middle.
+
+    Args:
+        integral: the antiderivative with the sign of `_density_integral`, of f and the scale.
+        middle: the function in the middle of each section.
+    """
+    change = sdf_end - sdf_start
+    flat = change.abs() < FLAT * scale
+    quotient = (integral(sdf_start, scale) - integral(sdf_end, scale)) / torch.where(
+        flat, torch.ones_like(change), change
+    )
+    return torch.where(flat, middle, quotient)
+
+
 def section_optical_depth(
     sdf_start: Float[Tensor, "*any"],
     sdf_end: Float[Tensor, "*any"],
@@ -58,13 +80,8 @@ def section_optical_depth(
     The exact integral of `laplace_density`, so a section may be far longer than b. Zero where f is large on the
     whole section; delta / b deep inside.
     """
-    change = sdf_end - sdf_start
-    flat = change.abs() < FLAT * scale
-    quotient = (_density_integral(sdf_start, scale) - _density_integral(sdf_end, scale)) / torch.where(
-        flat, torch.ones_like(change), change
-    )
     middle = laplace_density(0.5 * (sdf_start + sdf_end), scale) * scale
-    return torch.where(flat, middle, quotient) * delta / scale
+    return _section_mean(_density_integral, middle, sdf_start, sdf_end, scale) * delta / scale
 
 
 def outline_correction(
@@ -80,14 +97,10 @@ def outline_correction(
     smaller than their outlines. Zhang et al. (Towards unbiased volume rendering of neural implicit surfaces with
     geometry priors, CVPR 2023) scale the density inside, too; then what is solid lets light through where f is even.
     """
-    change = sdf_end - sdf_start
-    flat = change.abs() < FLAT * scale
-    quotient = (_outside_integral(sdf_start, scale) - _outside_integral(sdf_end, scale)) / torch.where(
-        flat, torch.ones_like(change), change
-    )
     middle = 0.5 * (sdf_start + sdf_end)
-    mean = torch.where(flat, torch.where(middle >= 0, 0.5 * torch.exp(-middle.abs() / scale), 0.0), quotient)
-    return mean * (change.abs() - delta) / scale
+    outside = torch.where(middle >= 0, laplace_density(middle, scale) * scale, 0.0)
+    mean = _section_mean(_outside_integral, outside, sdf_start, sdf_end, scale)
+    return mean * ((sdf_end - sdf_start).abs() - delta) / scale
 
 
 def _outside_integral(sdf: Float[Tensor, "*any"], scale: Float[Tensor, ""] | float) -> Float[Tensor, "*any"]:

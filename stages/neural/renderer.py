@@ -82,13 +82,9 @@ class Renderer:
         places = points if extra is None else torch.cat([points, extra])
         sdf, features, gradients = self.fields.sdf(places, moment.levels)
         # what is shiny is found by its outlines: they have to be where the surface is
-        shiny = at_places(self.fields.radiance.shiny, points).view(num_rays, num_samples)
+        outlined = moment.outlined * at_places(self.fields.radiance.shiny, points).view(num_rays, num_samples)
         weights, transmittance = rendering_weights(
-            sdf[:num_points].view(num_rays, num_samples),
-            distances,
-            moment.scale,
-            moment.outlined * shiny,
-            self.params.density.form,
+            sdf[:num_points].view(num_rays, num_samples), distances, moment.scale, outlined, self.params.density.form
         )
 
         shade = self._deferred_colors if moment.deferred else self._colors

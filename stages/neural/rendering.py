@@ -118,14 +118,9 @@ class _KernelWeights(torch.autograd.Function):
         sdf, distances, outlined = (each.contiguous() for each in (sdf, distances, outlined))
         weights, transmittance = torch.empty(sdf.shape), torch.empty(len(sdf))
         kernels.ray_weights_forward(
-            sdf.detach().numpy(),
-            distances.numpy(),
-            outlined.numpy(),
-            scale,
-            FLAT,
-            weights.numpy(),
-            transmittance.numpy(),
-        )
+            sdf.detach().numpy(), distances.numpy(), outlined.numpy(), scale, FLAT,
+            weights.numpy(), transmittance.numpy(),
+        )  # fmt: skip
         ctx.save_for_backward(sdf, distances, outlined, weights, transmittance)
         ctx.scale = scale
         return weights, transmittance

@@ -78,5 +78,4 @@ def even_steps(progress: float, first: int, last: int, begin: float, end: float)
     """A count that goes from `first`, until `begin`, to `last`, from `end` on, in even steps of one between."""
     if progress <= begin:
         return first
-    part = min((progress - begin) / (end - begin), 1.0) if end > begin else 1.0
-    return round(first + (last - first) * part)
+    return round(first + (last - first) * fade_in(progress, begin, end))
