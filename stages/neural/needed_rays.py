@@ -109,7 +109,7 @@ class NeededRays:
 
     def _weigh(self, weights: Float[Tensor, " c"]) -> None:
         self.weights.copy_(weights)
-        torch.cumsum(weights.double(), 0, out=self._upto)
+        torch.cumsum(self.weights.double(), 0, out=self._upto)
 
     def state(self) -> dict[str, Any]:
         """Everything that the next draw depends on."""
