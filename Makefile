@@ -1,6 +1,7 @@
 # make demo   photos -> textured model of a made-up object, with its score; result in demo/
 # make check  lint, types, who-may-import-whom, the quick tests: under a minute on two cores
 # make test   all tests, shapes checked
+# make trust  wrong input, kills, a full disk and attacks on the server: all of it, an hour on a core (docs/trust.md)
 # make bench-smoke   a small scene through the whole pipeline, its figures against committed ones
 # make lint   formatting, lint, types, who-may-import-whom
 # make image  the container of the Dockerfile, built and tried out
@@ -11,7 +12,7 @@ PYTHON ?=
 export PYTHON
 BIN := .venv/bin
 
-.PHONY: help venv demo check quick test bench-smoke lint format docs image vendor clean
+.PHONY: help venv demo check quick test trust bench-smoke lint format docs image vendor clean
 
 help:
 	@sed -n 's/^# //p' Makefile
@@ -31,6 +32,9 @@ quick: venv
 
 test: venv
 	$(BIN)/python -m pytest --check-shapes
+
+trust: venv
+	OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(BIN)/python -m pytest --whole tests/trust tests/test_view.py
 
 bench-smoke: venv
 	$(BIN)/python -m benchmarks.smoke

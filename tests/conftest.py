@@ -17,6 +17,7 @@ CASES = DATA.with_name("cases")
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--check-shapes", action="store_true", help="check types and shapes of geometry and neural")
+    parser.addoption("--whole", action="store_true", help="all of tests/trust, not the share of it that CI runs")
 
 
 def pytest_configure(config: pytest.Config) -> None:
