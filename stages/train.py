@@ -277,7 +277,7 @@ class _Training:
     def advance(self, until: float) -> None:
         """Train to this part of the budget; checkpoints, previews and metric lines on the way."""
         context, trainer = self.context, self.trainer
-        saved, previewed = time.monotonic(), self.progress
+        saved, every = time.monotonic(), context.params.preview_every
         # a line at a time, so that `hineus view` can draw them as they come
         with self.metrics.open("a", encoding="utf-8", buffering=1) as lines:
             while (progress := self.progress) < until:
@@ -287,12 +287,12 @@ class _Training:
                     _write_metrics(lines, trainer, progress, numbers_out)
                     context.progress(progress, 1.0, f"PSNR {numbers_out['psnr']:.1f} dB")
                     _check(numbers_out, trainer.step_index)
+                if progress // every < self.progress // every and self.progress < 1:
+                    # before the checkpoint: a run that goes on has it
+                    _preview(trainer, context.scratch, progress)
                 if time.monotonic() - saved > CHECKPOINT_EVERY:
                     self.save()
                     saved = time.monotonic()
-                if progress - previewed >= context.params.preview_every:
-                    _preview(trainer, context.scratch, progress)
-                    previewed = progress
 
 
 def _make_trainer(context: StageContext[TrainParams], scene: PosedScene) -> Any:

@@ -16,7 +16,8 @@ NUMBERS = (
 )  # fmt: skip
 WORDS = (
     "", " ", "..", "/", "../../etc/passwd", "/dev/zero", "\x00", "\x1b]0;pwned\x07", "[/]", "\u202e", "\udcff",
-    "a" * 300, "http://127.0.0.1:9/x", "file:///etc/passwd", "%s%n", "{0}", "!!python/object/apply:os.system", "*a", "[bold]",
+    "a" * 300, "http://127.0.0.1:9/x", "file:///etc/passwd", "%s%n", "{0}", "!!python/object/apply:os.system", "*a",
+    "[bold]",
 )  # fmt: skip
 VALUES: tuple[Any, ...] = (
     None, True, False, [], {}, "", 0, -1, 1, 1e308, -1e308, float("nan"), float("inf"), 10**25, 10**400, "x", "nan",
