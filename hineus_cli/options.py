@@ -45,9 +45,9 @@ def every_nth(text: str) -> int:
     Raises:
         ConfigError: it is neither 0 nor a whole number from 2 on.
     """
-    if not re.fullmatch(r"0|[1-9]\d*", text.strip()) or int(text) == 1:
+    if not re.fullmatch(r"0|[1-9]\d{0,8}", text.strip()) or int(text) == 1:
         raise ConfigError(
-            f"--hold-out {text}: N must be a whole number from 2 on, for every N-th photo, or 0 for none; "
+            f"--hold-out {text[:40]}: N must be a whole number from 2 on, for every N-th photo, or 0 for none; "
             "it is not a percentage.",
             "Try `--hold-out 8`: every 8th photo, 12 % of them.",
         )

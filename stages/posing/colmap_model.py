@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -9,11 +10,16 @@ from typing import Any
 import numpy as np
 
 from stages.geometry.cameras import PinholeCameras
+from stages.inputs.bounded import read_bytes
 from stages.inputs.texts import read_text
 from stages.posing.known import KnownCamera, KnownPoses, reading
 
 # Where models lie in a project of COLMAP, in a data set and in a workspace of ours.
+MOST_BYTES = 1 << 34  # of a model's file; of 100 000 photos with 5000 features each they have 12 GB
 PLACES = ("", "sparse/0", "sparse", "colmap/sparse/0", "sfm/model", "model", "0")
+
+
+_Lens = tuple[str, tuple[int, int], tuple[float, ...]]  # COLMAP's name of its model, size, parameters
 
 
 def find_model(folder: Path) -> Path | None:
@@ -64,30 +70,61 @@ def pinhole_model(cameras: PinholeCameras, pixels: Sequence[np.ndarray]) -> Any:
 
 
 def _read_binary(folder: Path) -> Iterator[KnownCamera]:
+    """COLMAP's own reader takes memory for as many points as a file says that it has, and reads those we do not need."""
     import pycolmap
 
-    model = pycolmap.Reconstruction(str(folder))
-    for image_id in sorted(model.reg_image_ids()):
-        image = model.images[image_id]
-        yield _known(image.name, model.cameras[image.camera_id], image.cam_from_world())
+    cameras: dict[int, _Lens] = {}
+    reader = _Reader(folder / "cameras.bin")
+    for _ in range(reader.take("Q")[0]):
+        number, model, width, height = reader.take("IiQQ")
+        lens = pycolmap.Camera(model=pycolmap.CameraModelId(model), width=1, height=1, params=[])
+        count = len(lens.params_info.split(","))
+        cameras[number] = (lens.model_name, (width, height), reader.take(f"{count}d"))
+    reader, found = _Reader(folder / "images.bin"), []
+    for _ in range(reader.take("Q")[0]):
+        number, *pose, camera = reader.take("I7dI")
+        name = reader.text()
+        reader.skip(24 * reader.take("Q")[0])  # its features
+        found.append((number, _known(name, cameras[camera], pose)))
+    yield from (camera for _, camera in sorted(found, key=lambda each: each[0]))
+
+
+class _Reader:
+    """Takes little-endian numbers and names of a file, one after another, and no more than there are."""
+
+    def __init__(self, file: Path) -> None:
+        self._data = read_bytes(file, MOST_BYTES)
+        self._at = 0
+
+    def take(self, kinds: str) -> tuple[Any, ...]:
+        start = self._at
+        self.skip(struct.calcsize(f"<{kinds}"))
+        return struct.unpack_from(f"<{kinds}", self._data, start)
+
+    def text(self) -> str:
+        """Up to the next zero, which must be there."""
+        start, self._at = self._at, self._data.index(b"\0", self._at) + 1
+        return self._data[start : self._at - 1].decode("utf-8", "surrogateescape")
+
+    def skip(self, count: int) -> None:
+        """
+        Raises:
+            ValueError: the file ends before.
+        """
+        if count > len(self._data) - self._at:
+            raise ValueError(f"it says that {count} bytes follow, there are {len(self._data) - self._at}")
+        self._at += count
 
 
 def _read_text(folder: Path) -> Iterator[KnownCamera]:
     """COLMAP's own reader cuts names at blanks, and knows neither byte-order marks nor encodings."""
-    import pycolmap
-
-    cameras = {}
+    cameras: dict[str, _Lens] = {}
     for line in _lines(folder / "cameras.txt"):
         number, model, width, height, *params = line.split()
-        size = {"width": int(width), "height": int(height)}
-        cameras[number] = pycolmap.Camera(model=model, params=[float(value) for value in params], **size)
-        if not cameras[number].verify_params():
-            raise ValueError(f"camera {number} has {len(params)} parameters")
+        cameras[number] = (model, (int(width), int(height)), tuple(float(value) for value in params))
     for line in _lines(folder / "images.txt", every=2):
         _, *pose, camera, name = line.split(maxsplit=9)
-        w, x, y, z, *translation = (float(value) for value in pose)
-        cam_from_world = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([x, y, z, w])), np.array(translation))
-        yield _known(name.rstrip(), cameras[camera], cam_from_world)
+        yield _known(name.rstrip(), cameras[camera], [float(value) for value in pose])
 
 
 def _lines(file: Path, every: int = 1) -> Iterator[str]:
@@ -103,11 +140,11 @@ def _lines(file: Path, every: int = 1) -> Iterator[str]:
                 next(lines, None)
 
 
-def _known(name: str, camera: Any, cam_from_world: Any) -> KnownCamera:
-    return KnownCamera(
-        name=name,
-        size=(camera.width, camera.height),
-        model=camera.model_name,
-        params=tuple(float(value) for value in camera.params),
-        cam_from_world=cam_from_world.matrix(),
-    )
+def _known(name: str, lens: _Lens, pose: Sequence[float]) -> KnownCamera:
+    """Of a quaternion (w, x, y, z; its length is free, but for zero) and a translation."""
+    from scipy.spatial.transform import Rotation
+
+    w, x, y, z, *translation = pose
+    rotation = Rotation.from_quat([x, y, z, w]).as_matrix()
+    model, size, params = lens
+    return KnownCamera(name, size, model, params, np.column_stack([rotation, translation]))

@@ -7,13 +7,13 @@ names, by what is in them.
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from stages.errors import InputError
+from stages.inputs.bounded import MOST_TEXT, read_bytes, reason
 
 CONTROL = "control points"  # what a run calls this input
 SUFFIXES = frozenset({".csv", ".txt", ".tsv", ".gcp"})
@@ -33,9 +33,11 @@ DEGREES = {"lon", "long", "longitude", "lat", "latitude", "xlongitude", "ylatitu
 CHECK_WORDS = {"check", "checkpoint", "check point", "chk", "1", "true", "yes", "y"}
 CHECK_NAME = re.compile(r"^(check|chk)", re.IGNORECASE)
 PHOTO_NAME = re.compile(r"\.[a-z]\w{2,4}$", re.IGNORECASE)
-NUMBER = re.compile(r"^[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$")
+NUMBER = re.compile(r"^[-+]?(\d+(\.\d*)?|\.\d+)([eE][-+]?\d+)?$")
 DECIMAL_COMMA = re.compile(r"^[-+]?\d+,\d+$")
 GEOGRAPHIC = "EPSG:4326"
+LONGEST_LINE = 10_000  # characters; a coordinate system in words has 3000
+LARGEST = 1e9  # of a coordinate or a pixel; the Earth is 4e7 metres around
 
 
 @dataclass(frozen=True)
@@ -93,8 +95,8 @@ class _Row:
                 f"{self.where}: {text} has a decimal comma, a point is needed.",
                 "Write the table with decimal points and commas, semicolons or tabs between the columns.",
             )
-        if not NUMBER.match(text) or not math.isfinite(float(text)):
-            raise InputError(f"{self.where}: {column} is '{text}', a number is needed.", FORM)
+        if not NUMBER.match(text) or abs(float(text)) > LARGEST:
+            raise InputError(f"{self.where}: {column} is '{text[:40]}', a number is needed.", FORM)
         return float(text)
 
 
@@ -128,9 +130,9 @@ def read_control(path: Path) -> GroundControl:
 def _lines(file: Path) -> list[tuple[int, str]]:
     """Number and text of each line that is not empty."""
     try:
-        data = file.read_bytes()
-    except OSError as error:
-        raise InputError(f"{file} cannot be read: {error.strerror}.", "Check the path with `ls`.") from error
+        data = read_bytes(file, MOST_TEXT)
+    except (OSError, ValueError) as error:
+        raise InputError(f"{file} cannot be read: {reason(error)}.", "Check the path with `ls`.") from error
     encoding = "utf-16" if data.startswith((b"\xff\xfe", b"\xfe\xff")) else "utf-8-sig"
     if data.startswith(b"PK") or (b"\0" in data and encoding != "utf-16"):
         raise InputError(f"{file} is no text.", "Write the table as CSV; spreadsheets do so with 'Save as'.")
@@ -138,7 +140,10 @@ def _lines(file: Path) -> list[tuple[int, str]]:
         text = data.decode(encoding)
     except UnicodeDecodeError:
         text = data.decode("cp1252", errors="replace")
-    return [(number, line.strip(" ")) for number, line in enumerate(text.splitlines(), 1) if line.strip()]
+    lines = [(number, line.strip(" ")) for number, line in enumerate(text.splitlines(), 1) if line.strip()]
+    if long := [number for number, line in lines if len(line) > LONGEST_LINE]:
+        raise InputError(f"{file}, line {long[0]} has more than {LONGEST_LINE} characters.", FORM)
+    return lines
 
 
 def _table(lines: Sequence[tuple[int, str]], file: Path) -> tuple[str, list[_Row], bool]:
@@ -152,7 +157,7 @@ def _table(lines: Sequence[tuple[int, str]], file: Path) -> tuple[str, list[_Row
             continue
         cells = _cells(text)
         if header is None and not rows:
-            plain = [re.sub(r"[\[(].*?[\])]|[^a-z]", "", cell.lower()) for cell in cells]
+            plain = [re.sub(r"[\[(][^\[(\])]*[\])]|[^a-z]", "", cell.lower()) for cell in cells]
             known = [KNOWN.get(cell) for cell in plain]
             if len({column for column in known if column}) >= 3:
                 header, degrees = _pixels_apart(plain, known), any(cell in DEGREES for cell in plain)

@@ -6,6 +6,7 @@ of a capture alike, and its models need not be installed.
 
 from __future__ import annotations
 
+import re
 from textwrap import shorten
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +19,8 @@ if TYPE_CHECKING:
 
 WGS84 = "EPSG:4326"
 MAX_BEYOND_DEG = 3.0  # maps are used beyond their border, but not this far
+# PROJ opens what these name, on the disk or in the current folder.
+NAMES_A_FILE = re.compile(r"\binit=(?!epsg:)|grids=[^ ]*/", re.IGNORECASE)
 EXTRA = "pip install 'hineus[geo]'"
 
 
@@ -116,11 +119,13 @@ def import_pyproj() -> None:
 def _horizontal(crs: str) -> tuple[Any, float]:
     """The part for east and north of a coordinate system, and the metres in its unit of height."""
     from pyproj import CRS
-    from pyproj.exceptions import CRSError
+    from pyproj.exceptions import ProjError
 
     try:
+        if NAMES_A_FILE.search(crs):
+            raise ProjError("it names a file")
         named = CRS.from_user_input(crs)
-    except CRSError as error:
+    except ProjError as error:
         raise ConfigError(
             f"There is no coordinate system {crs[:60]}.",
             "Look its code up at https://epsg.io; UTM zone 32 north is 32632.",

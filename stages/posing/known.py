@@ -14,7 +14,8 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from stages.artifacts import KnownSphere
-from stages.errors import InputError
+from stages.errors import HineusError, InputError
+from stages.inputs.bounded import reason
 from stages.inputs.folders import readable, short_name
 from stages.inputs.formats import open_image
 
@@ -25,6 +26,9 @@ SEPARATORS = re.compile(r"[/\\]")
 MAX_STRETCH = 0.01
 # A rotation written with a few digits only is taken for the nearest true one, within this.
 ROTATION_TOLERANCE = 1e-2
+# Cameras beyond these are no photos' (units: pixels; those of the poses; the longer side of the image).
+MAX_SIDE, MAX_AWAY, MAX_PARAMETER = 100_000, 1e12, 1e4
+LONGEST_NAME = 4096  # characters, as paths may have
 
 
 @dataclass(frozen=True)
@@ -52,7 +56,7 @@ class KnownPoses:
 
     Attributes:
         origin: the file or folder.
-        cameras: in the file's order; names are unique.
+        cameras: in the file's order; names are unique, and the numbers are those of cameras that can be.
         region: where the object is, if the file says so.
         masks: camera's name -> file of its mask, of formats that come with masks.
     """
@@ -65,11 +69,16 @@ class KnownPoses:
     def __post_init__(self) -> None:
         seen: set[str] = set()
         for camera in self.cameras:
+            _check_camera(camera, self.origin)
             if camera.name in seen:
                 raise InputError(f"{self.origin} has two poses for {camera.name}.", "Remove one of them.")
             seen.add(camera.name)
         if not self.cameras:
             raise InputError(f"{self.origin} has no poses.", "Name another file with `--poses`.")
+        if self.region is not None and not (
+            np.isfinite(self.region.center).all() and 0 < self.region.radius <= MAX_AWAY >= np.abs(self.region.center).max()
+        ):
+            raise InputError(f"{self.region.source} in {self.origin} is no sphere.", "Mend or remove it.")
 
     def names_of(self, photos: Iterable[str]) -> dict[str, str]:
         """Name of the camera of each photo that has one; raises as `match_photos`."""
@@ -138,8 +147,8 @@ def best_fits(name: str, photos: Iterable[str]) -> tuple[tuple[int, bool], list[
 
 
 def stem(name: str) -> str:
-    """The last part of a posix path, suffix aside; "frame.0001" has none."""
-    return _parts(name)[-1]
+    """The last part of a posix path, suffix aside; "frame.0001" has none, and "/" has no part."""
+    return next(reversed(_parts(name)), "")
 
 
 def _parts(name: str) -> tuple[str, ...]:
@@ -183,9 +192,12 @@ def reading(what: str, needs: str) -> Iterator[None]:
         InputError: with what the file `needs`.
     """
     try:
-        yield
+        with np.errstate(all="ignore"):  # numbers that overflow are refused by what comes of them
+            yield
+    except HineusError:
+        raise
     except Exception as error:
-        raise InputError(f"{what} cannot be read ({error}).", f"It needs {needs}.") from error
+        raise InputError(f"{what} cannot be read ({reason(error)}).", f"It needs {needs}.") from error
 
 
 def pinhole(name: str, image: Path, intrinsics: np.ndarray, cam_from_world: np.ndarray, origin: Path) -> KnownCamera:
@@ -211,6 +223,8 @@ def nearest_rotation(matrix: np.ndarray, name: str, origin: Path) -> np.ndarray:
     Raises:
         InputError: it is none: mirrored, scaled or skewed.
     """
+    if not np.isfinite(matrix).all():
+        raise InputError(f"The pose of {name} in {origin} has numbers that are not finite.", "Mend the poses.")
     left, _, right = np.linalg.svd(matrix)
     rotation = left @ right
     if not np.allclose(rotation, matrix, atol=ROTATION_TOLERANCE) or np.linalg.det(rotation) < 0:
@@ -229,11 +243,49 @@ def image_size(file: Path, origin: Path) -> tuple[int, int]:
         InputError: it cannot be read.
     """
     try:
+        if not file.is_file():  # pipes and devices are waited for
+            raise FileNotFoundError(file)
         with open_image(file) as image:
             width, height = image.size
-    except OSError as error:
+    except Exception as error:  # Pillow raises nearly anything on a damaged file
         raise InputError(
             f"{origin} does not say how large its images are, and {file} cannot be read.",
             "Keep the file of poses beside its images.",
         ) from error
     return width, height
+
+
+def _check_camera(camera: KnownCamera, origin: Path) -> None:
+    """
+    Raises:
+        InputError: it has no name, or numbers that no camera has.
+    """
+    import pycolmap
+
+    name, size, model, pose = camera.name, camera.size, camera.model, camera.cam_from_world
+    if len(name) > LONGEST_NAME or "\0" in name or not _parts(name):
+        raise InputError(f"An image in {origin} is called {name[:40]!r}.", "Name the photos as their files are called.")
+    if not all(1 <= side <= MAX_SIDE for side in size):
+        raise InputError(
+            f"The image {name} in {origin} is {size[0]} x {size[1]} pixels, each must be from 1 to {MAX_SIDE}.",
+            "Mend the poses.",
+        )
+    known = model in pycolmap.CameraModelId.__members__ and model != "INVALID"
+    lens = pycolmap.Camera(model=model, width=size[0], height=size[1], params=list(camera.params)) if known else None
+    if lens is None or not lens.verify_params() or not lens.focal_length_idxs():
+        raise InputError(
+            f"The camera of {name} in {origin} is of model {model[:40]} with {len(camera.params)} parameters.",
+            "Mend the poses: COLMAP's perspective and fisheye models are known.",
+        )
+    most = MAX_PARAMETER * max(size)
+    focal = [camera.params[i] for i in lens.focal_length_idxs()]
+    if not all(abs(value) <= most for value in camera.params) or min(focal) * most <= 1:
+        params = ", ".join(f"{value:.6g}" for value in camera.params)
+        raise InputError(f"The camera of {name} in {origin} cannot be: {model} with {params}.", "Mend the poses.")
+    nearest_rotation(pose[:, :3], name, origin)
+    if not (np.abs(pose[:, 3]) <= MAX_AWAY).all():
+        raise InputError(
+            f"The pose of {name} in {origin} is {np.abs(pose[:, 3]).max():.3g} away from the origin, at most "
+            f"{MAX_AWAY:g} can be.",
+            "Mend the poses.",
+        )

@@ -6,10 +6,14 @@ A camera's file is torch's: W, H, intrinsics (fx, fy, cx, cy), and c2w [3, 4], w
 
 from __future__ import annotations
 
+import io
+import pickle
+import zipfile
 from pathlib import Path
 
 import numpy as np
 
+from stages.inputs.bounded import MOST_ARRAYS, check_unpacked, read_bytes
 from stages.posing.known import KnownCamera, KnownPoses, nearest_rotation, reading
 from stages.posing.transforms import OPENCV_FROM_OPENGL
 
@@ -47,9 +51,16 @@ def _load(file: Path) -> dict[str, np.ndarray]:
     import torch
 
     with reading(f"The camera {file}", "W, H, intrinsics and c2w, as Mega-NeRF writes them"):
-        data = torch.load(file, map_location="cpu", weights_only=True)  # tensors and plain values only
-        found = {key: np.asarray(data[key], dtype=np.float64) for key in ("W", "H", "intrinsics", "c2w")}
-        shapes = found["c2w"].shape, found["intrinsics"].shape
+        stored = io.BytesIO(read_bytes(file, MOST_ARRAYS))
+        with zipfile.ZipFile(stored) as archive:  # what PyTorch wrote before version 1.6 is not
+            check_unpacked(archive)
+        stored.seek(0)
+        try:
+            data = torch.load(stored, map_location="cpu", weights_only=True)
+        except pickle.UnpicklingError as error:  # whose words advise to load it all the same
+            raise ValueError("it holds more than tensors and plain values") from error
+        shapes = tuple(data["c2w"].shape), tuple(data["intrinsics"].shape)
         if shapes != ((3, 4), (4,)):
             raise ValueError(f"it holds c2w {shapes[0]} and intrinsics {shapes[1]}, expected (3, 4) and (4,)")
-    return found
+        size = {key: np.float64(int(data[key])) for key in ("W", "H")}
+        return size | {key: np.asarray(data[key], dtype=np.float64) for key in ("intrinsics", "c2w")}

@@ -6,25 +6,70 @@ image is (0, 0), as in COLMAP). The object lies in the unit sphere.
 
 from __future__ import annotations
 
+import io
 import pickle
+import pickletools
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from stages.artifacts import KnownSphere
+from stages.inputs.bounded import read_bytes
 from stages.inputs.depth import DEPTH
 from stages.posing.known import KnownPoses, pinhole, reading
 
 CAMERA = "-camera.pkl"
+MOST_PICKLE = 1 << 20  # bytes; a camera has 500
+
+
+class _Kind:
+    """Stands for the dtype of a pickled array."""
+
+    def __init__(self, name: str, *_: Any) -> None:
+        self.name, self.order = name, "="
+
+    def __setstate__(self, state: tuple[Any, ...]) -> None:
+        self.order = state[1]
+
+    def of(self, data: bytes) -> np.ndarray:
+        kind = np.dtype(self.name)
+        if kind.kind not in "biuf":
+            raise pickle.UnpicklingError(f"it holds an array of {self.name}; numbers are needed")
+        return np.frombuffer(data, kind.newbyteorder(self.order if self.order in ("<", ">") else "="))
+
+
+class _Array:
+    """Stands for a pickled array. NumPy's own would take memory for any shape, and believe any dtype."""
+
+    def __init__(self, *_: Any) -> None:
+        self.values = np.zeros(0)
+
+    def __setstate__(self, state: tuple[Any, ...]) -> None:
+        _, shape, kind, by_columns, data = state
+        self.values = kind.of(data).reshape(shape, order="F" if by_columns else "C")
+
+
+def _frombuffer(data: bytes, kind: _Kind, shape: tuple[int, ...], order: str) -> _Array:
+    array = _Array()
+    array.__setstate__((1, shape, kind, order == "F", data))
+    return array
+
+
+def _encode(text: str, encoding: str) -> bytes:
+    """Bytes as Python 2's protocols have them; other codecs make a little into much."""
+    if encoding != "latin1":
+        raise pickle.UnpicklingError(f"it holds a text in {encoding[:20]}")
+    return text.encode(encoding)
+
+
 # All that a pickled array needs.
-ALLOWED = {
-    ("numpy", "ndarray"),
-    ("numpy", "dtype"),
-    ("numpy._core.multiarray", "_reconstruct"),
-    ("numpy._core.multiarray", "scalar"),
-    ("numpy._core.numeric", "_frombuffer"),
-    ("_codecs", "encode"),
+STANDS_FOR: dict[tuple[str, str], Any] = {
+    ("numpy", "ndarray"): _Array,
+    ("numpy", "dtype"): _Kind,
+    ("numpy._core.multiarray", "_reconstruct"): _Array,
+    ("numpy._core.numeric", "_frombuffer"): _frombuffer,
+    ("_codecs", "encode"): _encode,
 }
 
 
@@ -33,9 +78,18 @@ class _ArraysOnly(pickle.Unpickler):
 
     def find_class(self, module: str, name: str) -> Any:
         module = module.replace("numpy.core.", "numpy._core.")  # as NumPy 1 writes it
-        if (module, name) not in ALLOWED:
-            raise pickle.UnpicklingError(f"it holds {module}.{name}; only arrays are taken")
-        return super().find_class(module, name)
+        if (module, name) not in STANDS_FOR:
+            raise pickle.UnpicklingError(f"it holds {module[:40]}.{name[:40]}; only arrays are taken")
+        return STANDS_FOR[module, name]
+
+
+def _unpickled(file: Path) -> Any:
+    """What a pickle holds, with `_Array` for arrays."""
+    data = read_bytes(file, MOST_PICKLE)
+    for code, value, _ in pickletools.genops(data):  # raises where the data end before
+        if "PUT" in code.name and int(value) > len(data):
+            raise pickle.UnpicklingError(f"it numbers {value} values in {len(data)} bytes")
+    return _ArraysOnly(io.BytesIO(data)).load()
 
 
 def has_cameras(folder: Path) -> bool:
@@ -66,14 +120,17 @@ def read_split(file: Path) -> list[str]:
     Raises:
         InputError: it cannot be read.
     """
-    with reading(f"The split {file}", "NeRO's configs/synthetic_split_128.pkl"), file.open("rb") as stream:
-        return [str(stem) for stem in _ArraysOnly(stream).load()[0]]
+    with reading(f"The split {file}", "NeRO's configs/synthetic_split_128.pkl"):
+        stems = list(_unpickled(file)[0])
+        if not all(isinstance(stem, str | int) for stem in stems):
+            raise ValueError("names are needed")
+        return [str(stem) for stem in stems]
 
 
 def _load(file: Path) -> tuple[np.ndarray, np.ndarray]:
     """Pose [3, 4] and intrinsics [3, 3]."""
-    with reading(f"The camera {file}", "a pose and intrinsics"), file.open("rb") as stream:
-        pose, intrinsics = (np.asarray(array, dtype=np.float64) for array in _ArraysOnly(stream).load()[:2])
+    with reading(f"The camera {file}", "a pose and intrinsics"):
+        pose, intrinsics = (array.values.astype(np.float64) for array in _unpickled(file)[:2])
         if pose.shape not in ((3, 4), (4, 4)) or intrinsics.shape != (3, 3):
             raise ValueError(f"it holds arrays {pose.shape} and {intrinsics.shape}, expected (3, 4) and (3, 3)")
     return pose[:3], intrinsics

@@ -12,6 +12,7 @@ import numpy as np
 
 from stages.artifacts import KnownSphere
 from stages.errors import InputError
+from stages.inputs.bounded import read_arrays
 from stages.posing.known import KnownCamera, KnownPoses, image_size, reading
 
 FILES = ("cameras_sphere.npz", "cameras.npz")
@@ -80,8 +81,8 @@ def _files(folder: Path) -> list[str]:
 
 
 def _load(file: Path) -> dict[str, np.ndarray]:
-    with reading(str(file), "world_mat_i and scale_mat_i"), np.load(file) as data:  # arrays only: pickles are refused
-        return {key: np.asarray(data[key], dtype=np.float64) for key in data.files}
+    with reading(str(file), "world_mat_i and scale_mat_i"):
+        return read_arrays(file)
 
 
 def _matrix(matrices: dict[str, np.ndarray], key: str, file: Path) -> np.ndarray:

@@ -7,7 +7,7 @@ from pathlib import Path
 from stages.errors import InputError
 from stages.inputs.depth import DEPTH
 from stages.posing import colmap_model, meganerf, mvsnet, nero, neus, transforms
-from stages.posing.known import KnownPoses
+from stages.posing.known import KnownPoses, reading
 
 FORMATS = (
     "a COLMAP model, transforms.json (nerfstudio, instant-ngp, Blender), cameras_sphere.npz (NeuS, IDR), "
@@ -63,6 +63,11 @@ def read_poses(path: Path) -> KnownPoses:
         InputError: it cannot be read, or it is none of them.
     """
     found = locate_poses(path)
+    with reading(f"The poses in {found}", FORMATS):
+        return _read(found)
+
+
+def _read(found: Path) -> KnownPoses:
     if found.suffix == ".json":
         return transforms.read_transforms(found)
     if found.suffix == ".npz":

@@ -6,7 +6,6 @@ frame or for all of them: fl_x, fl_y, cx, cy, w, h, k1.. p1, p2 and camera_model
 
 from __future__ import annotations
 
-import json
 import math
 import os
 from collections.abc import Iterable, Mapping
@@ -17,7 +16,7 @@ import numpy as np
 
 from stages.artifacts import KnownSphere
 from stages.errors import InputError
-from stages.inputs.texts import read_text
+from stages.inputs.texts import read_json
 from stages.posing.known import SUFFIX, KnownCamera, KnownPoses, check_masks, image_size, nearest_rotation, reading
 
 FILES = ("transforms.json", "transforms_train.json")
@@ -61,7 +60,9 @@ def masks_of(frames: Iterable[Mapping[str, Any]], file: Path) -> dict[str, Path]
     for frame in frames:
         name, said = _name(frame), frame.get("mask_path")
         if said is not None and not isinstance(said, str):
-            raise InputError(f"`mask_path` of {name} in {file} is {said!r}, expected a path.", "Mend or remove it.")
+            raise InputError(
+                f"`mask_path` of {name} in {file} is {_quoted(said)}, expected a path.", "Mend or remove it."
+            )
         if said:
             masks[name] = file.parent / said.replace("\\", "/")
     return masks
@@ -86,12 +87,12 @@ def _name(frame: Mapping[str, Any]) -> str:
 
 def _load(file: Path) -> dict[str, Any]:
     with reading(str(file), "the JSON of nerfstudio or Blender"):
-        data = json.loads(read_text(file))
+        data = read_json(file)
     frames = data.get("frames") if isinstance(data, dict) else None
     if not isinstance(frames, list) or not frames:
         raise InputError(f"{file} has no `frames`.", "It needs the JSON of nerfstudio or Blender.")
     for i, frame in enumerate(frames):
-        if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
+        if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str) or not frame["file_path"]:
             raise InputError(f"Frame {i} of {file} has no `file_path`.", "It names the frame's image.")
     return data
 
@@ -105,8 +106,10 @@ def _original_from_data(data: Mapping[str, Any], file: Path) -> tuple[float, np.
             f"`applied_transform` in {file} is no rotation with a scale and a shift.", "Remove it, if it is wrong."
         )
     rotation = nearest_rotation(applied[:, :3] / scale, "applied_transform", file)
-    scale *= float(data.get("applied_scale", 1.0))
-    shift = applied[:, 3] * float(data.get("applied_scale", 1.0))
+    factor = _array(data.get("applied_scale", 1.0), "applied_scale", file)
+    if factor.shape != () or factor <= 0:
+        raise InputError(f"`applied_scale` in {file} is no number above 0.", "Remove it, if it is wrong.")
+    scale, shift = scale * float(factor), applied[:, 3] * float(factor)
     return 1 / scale, rotation.T, -(rotation.T @ shift) / scale
 
 
@@ -133,14 +136,17 @@ def _intrinsics(frame: Mapping[str, Any], name: str, file: Path) -> tuple[tuple[
         found = frame.get(key)
         if found is None:
             return None
-        if not isinstance(found, (int, float)) or not math.isfinite(found):
-            raise InputError(f"`{key}` of {name} in {file} is {found!r}, expected a number.", "Mend it.")
+        if isinstance(found, bool) or not isinstance(found, (int, float)):
+            raise InputError(f"`{key}` of {name} in {file} is {_quoted(found)}, expected a number.", "Mend it.")
         return float(found)
 
     width, height = value("w"), value("h")
     size = (round(width), round(height)) if width and height else image_size(_image(file.parent / name), file)
     focal_x, focal_y = value("fl_x"), value("fl_y")
     angle_x, angle_y = value("camera_angle_x"), value("camera_angle_y")
+    for angle in (angle_x, angle_y):
+        if angle is not None and not 0 < angle < math.pi:
+            raise InputError(f"An angle of view of {name} in {file} is {angle:g}.", "It lies between 0 and pi.")
     if focal_x is None and angle_x is not None:
         focal_x = 0.5 * size[0] / math.tan(0.5 * angle_x)
         if focal_y is None and angle_y is not None:
@@ -182,11 +188,15 @@ def _image(path: Path) -> Path:
     return next((found for suffix in SUFFIXES if (found := path.with_name(path.name + suffix)).is_file()), path)
 
 
+def _quoted(value: Any) -> str:
+    return f"{str(value)[:40]!r}" if isinstance(value, str) else f"a {type(value).__name__}"
+
+
 def _array(value: Any, what: str, file: Path) -> np.ndarray:
     try:
         array = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError):
         array = np.array(np.nan)
-    if not np.isfinite(array).all():
+    if isinstance(value, str) or not np.isfinite(array).all():
         raise InputError(f"`{what}` in {file} is no matrix of numbers.", "Mend it.")
     return array
