@@ -86,6 +86,11 @@ def test_what_is_no_mesh_is_explained(tmp_path):
         mesh_path(tmp_path)
     assert "hineus export" in caught.value.hint
     (tmp_path / "a.ply").write_text("no mesh")
-    for name in ("a.ply", "absent.ply", "a.docx"):
-        with pytest.raises(InputError, match="cannot be read as a mesh"):
+    (tmp_path / "a.docx").write_text("no mesh")
+    for name, sentence in (
+        ("a.ply", "no header of a PLY"),
+        ("absent.ply", "There is no file"),
+        ("a.docx", "is none of"),
+    ):
+        with pytest.raises(InputError, match=sentence):
             read_mesh(tmp_path / name)

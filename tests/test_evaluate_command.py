@@ -230,7 +230,7 @@ def test_clouds_come_with_their_normals(tmp_path):
     found = reading.read_surface(turned)
     np.testing.assert_allclose(found.normals, points, atol=1e-6)
     (tmp_path / "empty.xyz").write_text("")
-    with pytest.raises(InputError, match="cannot be read as points"):
+    with pytest.raises(InputError, match="it holds no points"):
         reading.read_surface(tmp_path / "empty.xyz")
 
 
@@ -320,4 +320,4 @@ def test_tanks_from_its_published_layout(tmp_path):
     np.testing.assert_allclose(np.array(found["matrix"]) @ MOTION, np.eye(4), atol=1e-9)
     (data / "Block.json").write_text("{}")
     code, refused = _in_main(*arguments)
-    assert "no crop volume" in refused["error"]["message"]
+    assert "has no 'orthogonal_axis'" in refused["error"]["message"]

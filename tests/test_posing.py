@@ -482,7 +482,8 @@ def test_no_poses_there(tmp_path: Path):
 def known(*names: str) -> KnownPoses:
     pose = cam_from_world(0)
     return KnownPoses(
-        Path("poses.json"), tuple(KnownCamera(n, (WIDTH, HEIGHT), "PINHOLE", (90.0, 90.0, 48.0, 36.0), pose) for n in names)
+        Path("poses.json"),
+        tuple(KnownCamera(n, (WIDTH, HEIGHT), "PINHOLE", (90.0, 90.0, 48.0, 36.0), pose) for n in names),
     )
 
 

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
@@ -51,7 +52,7 @@ def evaluate_mesh(
     thresholds: Annotated[
         str, typer.Option(help="Of the F-scores: numbers in the truth's unit, or with % of its largest extent.")
     ] = "0.2%,0.5%,1%,2%",
-    samples: Annotated[int, typer.Option(min=1, help="Points a side, uniform by area.")] = 200_000,
+    samples: Annotated[int, typer.Option(min=1, max=20_000_000, help="Points a side, uniform by area.")] = 200_000,
     spacing: Annotated[
         float | None,
         typer.Option(help="Instead: one point a square of this side, in the truth's unit.", show_default=False),
@@ -74,7 +75,7 @@ def evaluate_mesh(
         Path | None,
         typer.Option(help="Folder of masks: what a photo shows beside its mask does not count.", show_default=False),
     ] = None,
-    grow: Annotated[int, typer.Option(min=0, help="Pixels by which masks are widened first.")] = 0,
+    grow: Annotated[int, typer.Option(min=0, max=1000, help="Pixels by which masks are widened first.")] = 0,
     box: Annotated[
         str | None,
         typer.Option(
@@ -88,6 +89,7 @@ def evaluate_mesh(
     """A surface against a true one: accuracy, completeness, Chamfer, F-scores and normals, both ways."""
     from stages.evaluation.protocols.plain import MOTIONS, MeshOptions, evaluate_mesh
 
+    _check_length("spacing", spacing)
     if icp is not None and icp not in MOTIONS:
         raise ConfigError(f"There is no ICP '{icp}'.", f"Choose {' or '.join(MOTIONS)}.")
     numbers, parts = _thresholds(thresholds)
@@ -178,6 +180,7 @@ def evaluate_tanks(
     """Tanks and Temples' protocol: F-score at tau in the crop volume. DATA is a scene's folder, e.g. Ignatius."""
     from stages.evaluation.protocols.tanks import evaluate_tanks as score
 
+    _check_length("tau", tau)
     _run(context, lambda: score(predicted, data, cameras, tau, refine, matrix, seed), _show_numbers)
 
 
@@ -287,7 +290,7 @@ def _thresholds(text: str) -> tuple[tuple[float, ...], tuple[float, ...]]:
             value = float(word.strip().removesuffix("%"))
         except ValueError:
             value = 0.0
-        if not value > 0:
+        if not 0 < value < math.inf:
             raise ConfigError(
                 f"`--thresholds {text}`: '{word}' is no length.", "Try `--thresholds 0.5%,1%`, or `0.01,0.02`."
             )
@@ -298,19 +301,29 @@ def _thresholds(text: str) -> tuple[tuple[float, ...], tuple[float, ...]]:
     return tuple(numbers), tuple(parts)
 
 
+def _check_length(option: str, value: float | None) -> None:
+    """
+    Raises:
+        ConfigError: the value of an option is no length.
+    """
+    if value is not None and not 0 < value < math.inf:
+        raise ConfigError(f"`--{option} {value:g}` is no length.", "Give a number above 0, in the truth's unit.")
+
+
 def _box(text: str | None) -> tuple[tuple[float, ...] | None, float | None]:
     """Six numbers, or a part of the extent, of "0,0,0,1,1,1" or "4%"."""
     if text is None:
         return None, None
+    part = text.strip().endswith("%")
     try:
-        if text.strip().endswith("%"):
-            return None, float(text.strip().removesuffix("%")) / 100
-        corners = tuple(float(word) for word in text.split(","))
+        numbers = tuple(float(word) for word in text.strip().removesuffix("%").split(","))
     except ValueError:
-        corners = ()
-    if len(corners) != 6 or any(low >= high for low, high in zip(corners[:3], corners[3:], strict=True)):
+        numbers = ()
+    if part and len(numbers) == 1 and math.isfinite(numbers[0]):
+        return None, numbers[0] / 100
+    if part or len(numbers) != 6 or not all(low < high for low, high in zip(numbers[:3], numbers[3:], strict=True)):
         raise ConfigError(
             f"`--box {text}` is no box: six numbers are needed, the lowest corner first.",
             "Try `--box 0,0,0,1,1,1`, or `--box 4%` for the truth's own box and a margin.",
         )
-    return corners, None
+    return numbers, None

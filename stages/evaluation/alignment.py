@@ -50,7 +50,7 @@ def by_icp(predicted: Surface, truth: Surface, scaled: bool = False, keep: Keep 
         assert found.normals is not None  # the target has some
         offsets = found.points - moved
         apart = np.linalg.norm(offsets, axis=1)
-        kept = apart <= np.quantile(apart, ICP_KEPT)
+        kept = (apart <= np.quantile(apart, ICP_KEPT)) & np.isfinite(found.normals).all(1)
         motion = plane_step(moved[kept], offsets[kept], found.normals[kept], scaled).compose(motion)
         before, moved = moved, motion.apply(start)
         if np.abs(moved - before).max() < ICP_STILL * extent:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,23 +15,34 @@ from stages.errors import InputError, WorkspaceError
 from stages.evaluation.surfaces import Surface
 from stages.geometry.cameras import PinholeCameras
 from stages.geometry.normalisation import into_frame
+from stages.inputs.bounded import reason
+from stages.inputs.meshes import read_geometry
+from stages.inputs.texts import read_text
 
-CLOUDS = (".pcd", ".xyz", ".pts")
+NO_SIMILARITY = "It takes points of the first surface to the truth's frame: a turn, a scale, a shift."
+SMALLEST, LARGEST = 1e-9, 1e9  # extent of a surface that distances can be told of; a number in a matrix
 
 
 # ---------------------------------------------------------------- surfaces
 def read_surface(path: Path) -> Surface:
-    """A mesh of any format that trimesh reads, or a cloud of points (PLY without faces, PCD, XYZ, PTS).
+    """A mesh (PLY, OBJ, STL, GLB, glTF, OFF) or a cloud of points (PLY without faces, PCD, XYZ, PTS).
 
     Raises:
-        InputError: it is neither.
+        InputError: it is neither, or no larger than a point.
     """
     if not path.is_file():
         raise InputError(f"There is no file {path}.", "Name a mesh, a cloud of points, or a workspace.")
-    if path.suffix.lower() in CLOUDS or (path.suffix.lower() == ".ply" and not _has_faces(path)):
-        return _read_cloud(path)
-    vertices, faces = read_mesh(path)
-    return Surface(vertices, faces)
+    try:
+        with np.errstate(all="ignore"):  # what overflows is refused by what comes of it
+            surface = Surface(*read_geometry(path))
+    except Exception as error:  # damaged files raise nearly anything
+        raise InputError(
+            f"{path} cannot be read as a mesh or as points: {reason(error)}.",
+            "Name a PLY, OBJ, GLB, glTF, STL, OFF, PCD, XYZ or PTS file, or a workspace.",
+        ) from error
+    if not surface.extent >= SMALLEST:
+        raise InputError(f"{path} has an extent of {surface.extent:g}: it is no surface.", "Name another file.")
+    return surface
 
 
 def mesh_path(place: Path) -> Path:
@@ -47,19 +59,15 @@ def mesh_path(place: Path) -> Path:
 
 
 def read_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices [V, 3] float64 and faces [F, 3] of a mesh file of any format that trimesh reads."""
-    import trimesh
+    """Vertices [V, 3] float64 and faces [F, 3] of a mesh file.
 
-    try:
-        mesh = trimesh.load(path, process=False, force="mesh")
-        vertices, faces = np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces)
-    except (OSError, ValueError, AttributeError) as error:
-        raise InputError(
-            f"{path} cannot be read as a mesh: {error}.", "Name a PLY, OBJ, GLB or STL file, or a workspace."
-        ) from error
-    if not len(faces):
-        raise InputError(f"{path} holds {len(vertices)} points and no faces.", "Name a mesh, not a point cloud.")
-    return vertices, faces
+    Raises:
+        InputError: as `read_surface`, or it is a cloud.
+    """
+    surface = read_surface(path)
+    if surface.faces is None:
+        raise InputError(f"{path} holds {len(surface.points)} points and no faces.", "Name a mesh, not a point cloud.")
+    return surface.points, surface.faces
 
 
 def read_prediction(place: Path) -> tuple[Path, Surface]:
@@ -74,30 +82,6 @@ def read_prediction(place: Path) -> tuple[Path, Surface]:
         return path, surface
     in_world = artifacts.WORLD_PLACE.load(Workspace.open(place).stage_folder("place"))
     return path, surface.moved(in_world.world_from_poses.inverse().matrix())
-
-
-def _has_faces(path: Path) -> bool:
-    """Whether a PLY file's header announces faces."""
-    with path.open("rb") as stream:
-        for line in stream:
-            words = line.split()
-            if words[:2] == [b"element", b"face"]:
-                return int(words[2]) > 0
-            if words == [b"end_header"]:
-                return False
-    return True  # no header: let the reader of meshes say so
-
-
-def _read_cloud(path: Path) -> Surface:
-    import open3d as o3d
-
-    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
-        cloud = o3d.io.read_point_cloud(str(path))
-    points = np.asarray(cloud.points)
-    if not len(points):
-        raise InputError(f"{path} cannot be read as points.", "Name a PLY, PCD, XYZ or PTS file with points.")
-    normals = np.asarray(cloud.normalize_normals().normals) if cloud.has_normals() else None
-    return Surface(points, None, normals)
 
 
 # ---------------------------------------------------------------- cameras
@@ -197,14 +181,21 @@ def read_matrix(path: Path) -> np.ndarray:
         InputError: it is none.
     """
     try:
-        matrix = np.loadtxt(path).reshape(4, 4)
+        words = re.sub("#.*", "", read_text(path)).split()
+        matrix = np.array(words, dtype=np.float64).reshape(4, 4)
     except (OSError, ValueError) as error:
-        raise InputError(f"{path} holds no 4 x 4 numbers ({error}).", "Write four lines of four numbers.") from error
+        raise InputError(
+            f"{path} holds no 4 x 4 numbers ({reason(error)}).", "Write four lines of four numbers."
+        ) from error
+    if not (np.abs(matrix) <= LARGEST).all() or (matrix[3] != (0, 0, 0, 1)).any():
+        raise InputError(
+            f"The matrix in {path} has numbers beyond {LARGEST:g}, or its last line is not 0 0 0 1.", NO_SIMILARITY
+        )
     linear = matrix[:3, :3]
     squared = np.trace(linear @ linear.T) / 3
     if not np.allclose(linear @ linear.T, squared * np.eye(3), atol=1e-3 * squared) or np.linalg.det(linear) <= 0:
         raise InputError(
             f"The matrix in {path} is no similarity: its 3 x 3 part skews, mirrors or shrinks to nothing.",
-            "It takes points of the first surface to the truth's frame: a turn, a scale, a shift.",
+            NO_SIMILARITY,
         )
     return matrix

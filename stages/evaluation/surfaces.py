@@ -16,11 +16,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from stages.evaluation.thinning import check_cubes
 from stages.surface.triangle_mesh import face_normals, raycaster
 
 SAMPLES = 200_000
 # A selection that leaves few of the points is drawn again from this many times the points at most.
 MAX_OVERDRAW = 16
+MOST_DRAWN = 20_000_000  # points on a mesh: they take 3 GB
 # As a part of the truth's largest extent, where nobody asks for others.
 DEFAULT_THRESHOLDS = (0.002, 0.005, 0.01, 0.02)
 
@@ -203,7 +205,7 @@ def draw_points(surface: Surface, sampling: Sampling, keep: Keep | None = None) 
         keep: says which of points [P, 3] count, [P] bool. Where few do, more are drawn.
 
     Raises:
-        ValueError: the mesh has no area, or no point counts.
+        ValueError: the mesh has no area or far too much, or no point counts.
     """
     cloud = _draw(surface, sampling, 1.0)
     if keep is None:
@@ -270,10 +272,14 @@ def score_at(to_truth: np.ndarray, to_predicted: np.ndarray, threshold: float) -
 
 
 def turning(normals: np.ndarray | None, others: np.ndarray | None) -> Turning | None:
-    """Of unit normals [P, 3] against others [P, 3]; None where one side has none."""
+    """Of unit normals [P, 3] against others [P, 3]; None where one side has none. Faces without area have none."""
     if normals is None or others is None:
         return None
-    cosines = np.abs((normals * others).sum(1)).clip(0, 1)
+    with np.errstate(invalid="ignore"):
+        cosines = np.abs((normals * others).sum(1)).clip(0, 1)
+    cosines = cosines[np.isfinite(cosines)]
+    if not len(cosines):
+        return None
     angles = np.degrees(np.arccos(cosines))
     return Turning(float(angles.mean()), float(np.median(angles)), float(cosines.mean()))
 
@@ -309,8 +315,10 @@ def _draw(surface: Surface, sampling: Sampling, times: float) -> Surface:
         return _thin(surface, sampling)
     crosses = face_normals(surface.points, surface.faces)
     lengths = np.linalg.norm(crosses, axis=1)
-    count = sampling.count if sampling.spacing is None else int(np.ceil(0.5 * lengths.sum() / sampling.spacing**2))
-    points, chosen = sample_faces(surface.points, surface.faces, int(count * times), sampling.seed)
+    count = sampling.count if sampling.spacing is None else np.ceil(0.5 * lengths.sum() / sampling.spacing**2)
+    if not count <= MOST_DRAWN:
+        raise ValueError(f"its area asks for {count:.3g} points, at most {MOST_DRAWN} are drawn: widen the spacing")
+    points, chosen = sample_faces(surface.points, surface.faces, int(min(count * times, MOST_DRAWN)), sampling.seed)
     return Surface(points, None, crosses[chosen] / lengths[chosen, None])
 
 
@@ -319,6 +327,7 @@ def _thin(cloud: Surface, sampling: Sampling) -> Surface:
     import open3d as o3d
 
     if sampling.spacing is not None:
+        check_cubes(cloud.points, sampling.spacing)
         whole = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(cloud.points))
         if cloud.normals is not None:
             whole.normals = o3d.utility.Vector3dVector(cloud.normals)

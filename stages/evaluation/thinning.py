@@ -6,6 +6,8 @@ import numpy as np
 
 from stages.compiling import njit
 
+MOST_CUBES = 1 << 30  # in a row
+
 
 def thin(points: np.ndarray, distance: float) -> np.ndarray:
     """Points of [P, 3], in their order, that keep more than `distance` from all those kept before them."""
@@ -16,11 +18,25 @@ def one_a_cube(points: np.ndarray, side: float) -> np.ndarray:
     """The mean of the points [P, 3] in each cube of this side; the grid starts half a cube below the lowest corner.
 
     As Open3D's `voxel_down_sample`, which the benchmarks' own programs use.
+
+    Raises:
+        ValueError: see `check_cubes`.
     """
     import open3d as o3d
 
+    check_cubes(points, side)
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
     return np.asarray(cloud.voxel_down_sample(side).points)
+
+
+def check_cubes(points: np.ndarray, side: float) -> None:
+    """
+    Raises:
+        ValueError: the points [P, 3] spread over more cubes of this side than whole numbers count.
+    """
+    extent = float(np.ptp(points, axis=0).max()) if len(points) else 0.0
+    if not extent < MOST_CUBES * side:
+        raise ValueError(f"points spread over {extent:g} are too wide apart for cubes of {side:g}")
 
 
 @njit(nogil=True, cache=True)

@@ -81,5 +81,5 @@ def reason(error: Exception) -> str:
         return f"it has no {str(error)[:SHORT]}"
     if isinstance(error, OSError) and error.strerror:
         return error.strerror
-    text = " ".join(str(error).split()) or type(error).__name__
+    text = " ".join(str(error).split()).rstrip(".") or type(error).__name__
     return text if len(text) <= SHORT else f"{text[:SHORT]}..."

@@ -70,7 +70,7 @@ def pinhole_model(cameras: PinholeCameras, pixels: Sequence[np.ndarray]) -> Any:
 
 
 def _read_binary(folder: Path) -> Iterator[KnownCamera]:
-    """COLMAP's own reader takes memory for as many points as a file says that it has, and reads those we do not need."""
+    """COLMAP's own reader takes memory for as many points as a file says that it has, and reads all of them."""
     import pycolmap
 
     cameras: dict[int, _Lens] = {}

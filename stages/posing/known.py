@@ -76,7 +76,8 @@ class KnownPoses:
         if not self.cameras:
             raise InputError(f"{self.origin} has no poses.", "Name another file with `--poses`.")
         if self.region is not None and not (
-            np.isfinite(self.region.center).all() and 0 < self.region.radius <= MAX_AWAY >= np.abs(self.region.center).max()
+            np.isfinite(self.region.center).all()
+            and 0 < self.region.radius <= MAX_AWAY >= np.abs(self.region.center).max()
         ):
             raise InputError(f"{self.region.source} in {self.origin} is no sphere.", "Mend or remove it.")
 

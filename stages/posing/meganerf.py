@@ -59,8 +59,10 @@ def _load(file: Path) -> dict[str, np.ndarray]:
             data = torch.load(stored, map_location="cpu", weights_only=True)
         except pickle.UnpicklingError as error:  # whose words advise to load it all the same
             raise ValueError("it holds more than tensors and plain values") from error
-        shapes = tuple(data["c2w"].shape), tuple(data["intrinsics"].shape)
-        if shapes != ((3, 4), (4,)):
-            raise ValueError(f"it holds c2w {shapes[0]} and intrinsics {shapes[1]}, expected (3, 4) and (4,)")
-        size = {key: np.float64(int(data[key])) for key in ("W", "H")}
-        return size | {key: np.asarray(data[key], dtype=np.float64) for key in ("intrinsics", "c2w")}
+        shapes = {key: tuple(data[key].shape) for key in ("c2w", "intrinsics")}
+        if shapes != {"c2w": (3, 4), "intrinsics": (4,)}:
+            raise ValueError(
+                f"it holds c2w {shapes['c2w']} and intrinsics {shapes['intrinsics']}, expected (3, 4) and (4,)"
+            )
+        arrays = {key: data[key] if key in shapes else int(data[key]) for key in ("W", "H", "intrinsics", "c2w")}
+        return {key: np.asarray(value, dtype=np.float64) for key, value in arrays.items()}

@@ -36,7 +36,7 @@ class _Kind:
         kind = np.dtype(self.name)
         if kind.kind not in "biuf":
             raise pickle.UnpicklingError(f"it holds an array of {self.name}; numbers are needed")
-        return np.frombuffer(data, kind.newbyteorder(self.order if self.order in ("<", ">") else "="))
+        return np.frombuffer(data, kind.newbyteorder(">" if self.order == ">" else "<"))
 
 
 class _Array:
@@ -87,7 +87,7 @@ def _unpickled(file: Path) -> Any:
     """What a pickle holds, with `_Array` for arrays."""
     data = read_bytes(file, MOST_PICKLE)
     for code, value, _ in pickletools.genops(data):  # raises where the data end before
-        if "PUT" in code.name and int(value) > len(data):
+        if "PUT" in code.name and int(value or 0) > len(data):
             raise pickle.UnpicklingError(f"it numbers {value} values in {len(data)} bytes")
     return _ArraysOnly(io.BytesIO(data)).load()
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import os
+import reprlib
 from collections.abc import Iterable, Mapping
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -61,7 +62,7 @@ def masks_of(frames: Iterable[Mapping[str, Any]], file: Path) -> dict[str, Path]
         name, said = _name(frame), frame.get("mask_path")
         if said is not None and not isinstance(said, str):
             raise InputError(
-                f"`mask_path` of {name} in {file} is {_quoted(said)}, expected a path.", "Mend or remove it."
+                f"`mask_path` of {name} in {file} is {reprlib.repr(said)}, expected a path.", "Mend or remove it."
             )
         if said:
             masks[name] = file.parent / said.replace("\\", "/")
@@ -137,7 +138,7 @@ def _intrinsics(frame: Mapping[str, Any], name: str, file: Path) -> tuple[tuple[
         if found is None:
             return None
         if isinstance(found, bool) or not isinstance(found, (int, float)):
-            raise InputError(f"`{key}` of {name} in {file} is {_quoted(found)}, expected a number.", "Mend it.")
+            raise InputError(f"`{key}` of {name} in {file} is {reprlib.repr(found)}, expected a number.", "Mend it.")
         return float(found)
 
     width, height = value("w"), value("h")
@@ -186,10 +187,6 @@ def _image(path: Path) -> Path:
     if SUFFIX.search(path.name):
         return path
     return next((found for suffix in SUFFIXES if (found := path.with_name(path.name + suffix)).is_file()), path)
-
-
-def _quoted(value: Any) -> str:
-    return f"{str(value)[:40]!r}" if isinstance(value, str) else f"a {type(value).__name__}"
 
 
 def _array(value: Any, what: str, file: Path) -> np.ndarray:

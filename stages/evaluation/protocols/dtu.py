@@ -5,6 +5,7 @@ All in millimetres, in the frame of the data set's cameras.
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -15,9 +16,12 @@ from stages.errors import InputError
 from stages.evaluation.reading import read_prediction, read_surface
 from stages.evaluation.surfaces import Surface, Target
 from stages.evaluation.thinning import thin
+from stages.inputs.bounded import reason
 
 DENSITY = 0.2  # mm between points at least
 PATCH = 60.0  # mm below the box of the observed part, and half of what is looked at above it, as published
+MOST_POINTS = 100_000_000  # of a lattice; that of a table of 1 x 1 m has a quarter
+MOST_CELLS = 1 << 28  # of the observed part
 MAX_DISTANCE = 20.0  # mm: what is farther counts neither way
 
 
@@ -106,7 +110,11 @@ def observed(points: np.ndarray, truth: DtuTruth) -> np.ndarray:
 
 
 def lattice(vertices: np.ndarray, faces: np.ndarray, spacing: float) -> np.ndarray:
-    """The vertices [V, 3], and points on each triangle in a lattice along two of its sides, about `spacing` apart."""
+    """The vertices [V, 3], and points on each triangle in a lattice along two of its sides, about `spacing` apart.
+
+    Raises:
+        ValueError: they are more than `MOST_POINTS`.
+    """
     corners = vertices[faces].astype(np.float64)
     sides = corners[:, 1:] - corners[:, :1]
     lengths = np.linalg.norm(sides, axis=2)
@@ -115,6 +123,8 @@ def lattice(vertices: np.ndarray, faces: np.ndarray, spacing: float) -> np.ndarr
     # Slanted lattices are wider spaced along the sides, so that each point has a square of `spacing` to itself.
     steps = np.floor(lengths / (spacing * np.sqrt(lengths.prod(1) / area))[:, None]).astype(np.int64)
     found = [vertices.astype(np.float64)]
+    if steps.prod(1, dtype=np.float64).sum() / 2 > MOST_POINTS:
+        raise ValueError(f"points {spacing:g} apart on all of it are more than {MOST_POINTS}")
     kinds, kind_of = np.unique(steps, axis=0, return_inverse=True)
     by_kind = np.split(np.argsort(kind_of.ravel(), kind="stable"), np.cumsum(np.bincount(kind_of.ravel()))[:-1])
     for (first, second), rows in zip(kinds, by_kind, strict=True):
@@ -195,9 +205,12 @@ def read_dtu(data: Path, scan: int) -> DtuTruth:
 
 
 def _matrix(path: Path, key: str) -> np.ndarray:
-    from scipy.io import loadmat
+    from scipy.io import loadmat, whosmat
 
     try:
-        return np.asarray(loadmat(str(path))[key])
+        shape = {name: shape for name, shape, _ in whosmat(str(path))}[key]
+        if math.prod(shape) > MOST_CELLS:
+            raise ValueError(f"it has {math.prod(shape)} cells, at most {MOST_CELLS} are read")
+        return np.asarray(loadmat(str(path), variable_names=[key])[key])
     except Exception as error:  # scipy raises nearly anything on a damaged file
-        raise InputError(f"{path} holds no matrix {key} ({error}).", "Unpack DTU's SampleSet again.") from error
+        raise InputError(f"{path} holds no matrix {key} ({reason(error)}).", "Unpack DTU's SampleSet again.") from error

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -15,7 +14,8 @@ from stages.evaluation.alignment import by_cameras
 from stages.evaluation.reading import Cameras, own_cameras, read_matrix, read_prediction, read_surface
 from stages.evaluation.surfaces import Sampling, Surface, Target, draw_points, moved, score_at
 from stages.evaluation.thinning import one_a_cube
-from stages.inputs.texts import read_text
+from stages.inputs.texts import read_json, read_text
+from stages.posing.known import reading
 from stages.surface.triangle_mesh import face_normals
 
 # Metres; the toolbox's own, by scene.
@@ -274,24 +274,19 @@ def read_tanks(data: Path) -> TanksTruth:
 
 
 def _crop_volume(path: Path) -> CropVolume:
-    try:
-        data: dict[str, Any] = json.loads(read_text(path))
+    with reading(f"The crop volume {path}", "orthogonal_axis, axis_min, axis_max, bounding_polygon, as Open3D writes"):
+        data: dict[str, Any] = read_json(path)
         axis = "XYZ".index(data["orthogonal_axis"].upper())
-        polygon = np.delete(np.array(data["bounding_polygon"], dtype=np.float64), axis, axis=1)
-        return CropVolume(axis, float(data["axis_min"]), float(data["axis_max"]), polygon)
-    except (OSError, ValueError, KeyError, AttributeError, IndexError) as error:
-        raise InputError(
-            f"{path} is no crop volume ({error}).",
-            "It needs orthogonal_axis, axis_min, axis_max and bounding_polygon, as Open3D writes them.",
-        ) from error
+        corners = np.array(data["bounding_polygon"], dtype=np.float64)
+        if corners.ndim != 2 or corners.shape[1] != 3 or len(corners) < 3:
+            raise ValueError(f"its polygon is {corners.shape}")
+        return CropVolume(axis, float(data["axis_min"]), float(data["axis_max"]), np.delete(corners, axis, axis=1))
 
 
 def _trajectory(path: Path) -> np.ndarray:
     """Camera centres [N, 3] of a log: for each camera a line of three numbers and a matrix [4, 4] world_from_cam."""
-    try:
+    with reading(f"The trajectory {path}", "a line of three numbers and four of four, a camera each"):
         numbers = np.array(read_text(path).split(), dtype=np.float64).reshape(-1, 19)
-    except (OSError, ValueError) as error:
-        raise InputError(
-            f"{path} is no trajectory ({error}).", "It needs a line of three numbers and four of four, a camera each."
-        ) from error
+        if not np.isfinite(numbers).all():
+            raise ValueError("it has numbers that are not finite")
     return numbers[:, 3:].reshape(-1, 4, 4)[:, :3, 3]
