@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from stages.artifacts.artifact import Artifact
+from stages.inputs.meshes import read_geometry
 
 Mesh = tuple[np.ndarray, np.ndarray]
 """Vertices [V, 3] float32 in the scene frame and faces [F, 3] int32."""
@@ -16,10 +17,10 @@ def _mesh(stage: str, name: str) -> Artifact[Mesh]:
     """A binary PLY."""
 
     def load(folder: Path) -> Mesh:
-        import trimesh
-
-        mesh = trimesh.load(folder / name, process=False)
-        return np.asarray(mesh.vertices, dtype=np.float32), np.asarray(mesh.faces, dtype=np.int32)
+        vertices, faces, _ = read_geometry(folder / name)
+        if faces is None:
+            raise ValueError(f"{folder / name} has no faces")
+        return vertices.astype(np.float32), faces.astype(np.int32)
 
     def save(folder: Path, mesh: Mesh) -> None:
         import trimesh

@@ -173,7 +173,7 @@ def _rows(data: bytes) -> np.ndarray:
 # ---------------------------------------------------------------- glTF
 def plain_glb(data: bytes) -> bytes:
     """A GLB of the same meshes and nothing else."""
-    magic, version, _, length, kind = struct.unpack_from("<5I", data)
+    magic, version, _, length, kind = struct.unpack("<5I", data[:20].ljust(20, b"\0"))
     if (magic, version, kind) != (GLB, 2, GLB_JSON) or 20 + length > len(data):
         raise ValueError("it has no header of a GLB file of version 2")
     head = _plain_tree(parse_json(data[20 : 20 + length].decode("utf-8-sig")), len(data))
@@ -280,7 +280,7 @@ def check_pcd(data: bytes) -> None:
     row, follow = sum(size * count for size, count in zip(sizes, counts, strict=True)), len(data) - found.end()
     needed = points * 2 * sum(counts) - 1 if found[1] == b"ascii" else points * row
     if found[1] == b"binary_compressed":
-        packed, unpacked = struct.unpack_from("<2I", data, found.end())
+        packed, unpacked = struct.unpack("<2I", data[found.end() :][:8].ljust(8, b"\0"))
         if unpacked != needed or packed > follow - 8 or unpacked > LZF_GROWTH * packed:
             raise ValueError(f"{follow - 8} bytes follow, of which {packed} unpack to {unpacked}; {needed} are needed")
     elif needed > follow:

@@ -100,17 +100,17 @@ def _load(file: Path) -> dict[str, Any]:
 
 def _original_from_data(data: Mapping[str, Any], file: Path) -> tuple[float, np.ndarray, np.ndarray]:
     """Scale, rotation [3, 3] and translation [3] that undo `applied_transform` and `applied_scale`."""
-    applied = _array(data.get("applied_transform", np.eye(4)[:3]), "applied_transform", file)[:3]
-    scale = float(np.cbrt(np.linalg.det(applied[:, :3]))) if applied.shape == (3, 4) else 0.0
+    applied = _array(data.get("applied_transform", np.eye(4)[:3]), "applied_transform", file)
+    scale = float(np.cbrt(np.linalg.det(applied[:3, :3]))) if applied.shape in ((3, 4), (4, 4)) else 0.0
     if scale <= 0:
         raise InputError(
             f"`applied_transform` in {file} is no rotation with a scale and a shift.", "Remove it, if it is wrong."
         )
-    rotation = nearest_rotation(applied[:, :3] / scale, "applied_transform", file)
+    rotation = nearest_rotation(applied[:3, :3] / scale, "applied_transform", file)
     factor = _array(data.get("applied_scale", 1.0), "applied_scale", file)
     if factor.shape != () or factor <= 0:
         raise InputError(f"`applied_scale` in {file} is no number above 0.", "Remove it, if it is wrong.")
-    scale, shift = scale * float(factor), applied[:, 3] * float(factor)
+    scale, shift = scale * float(factor), applied[:3, 3] * float(factor)
     return 1 / scale, rotation.T, -(rotation.T @ shift) / scale
 
 
