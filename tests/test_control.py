@@ -166,6 +166,11 @@ def test_columns_called_longitude_and_latitude_are_degrees(tmp_path: Path):
         ("hello world\n", "line 1 is not understood"),
         ("", "names 0 points"),
         ("PK\x03\x04", "is no text"),
+        (TABLE.replace("A,1,", "A,1e300,", 1), "x is '1e300', a number is needed"),
+        (TABLE.replace("10,20", "9" * 400 + ",20"), "px is '9{40}', a number is needed"),
+        (TABLE + "a" * 200_000, "line 5 has more than 10000 characters"),
+        ("(" * 9000 + ",a,b\n" + ("1" * 9000 + "x 1\n") * 100, "line 1 is not understood"),
+        ("\n" * 900_000, "names 0 points"),
     ],
 )
 def test_what_cannot_be_read_is_said(text: str, message: str, tmp_path: Path):
@@ -377,6 +382,8 @@ def test_feet_degrees_and_heights_above_a_geoid():
         ("EPSG:32632", [5247811.5, 465123.25, 410.0], InputError, "1 of 1 points lie outside the area of WGS 84 / UTM"),
         ("EPSG:4326", [47.4, 98.5, 410.0], InputError, "lie outside the area of WGS 84"),
         ("EPSG:99999", [0.0, 0.0, 0.0], ConfigError, "There is no coordinate system EPSG:99999"),
+        ("+proj=utm +zone=32 +init=/dev/zero:1", [0.0, 0.0, 0.0], ConfigError, "There is no coordinate system"),
+        ("+proj=utm +zone=32 +nadgrids=/dev/zero", [0.0, 0.0, 0.0], ConfigError, "There is no coordinate system"),
         ("EPSG:4978", [1.0, 2.0, 3.0], ConfigError, "has no east and north"),
     ],
 )

@@ -321,3 +321,51 @@ def test_tanks_from_its_published_layout(tmp_path):
     (data / "Block.json").write_text("{}")
     code, refused = _in_main(*arguments)
     assert "has no 'orthogonal_axis'" in refused["error"]["message"]
+
+
+@pytest.mark.parametrize(
+    "option",
+    ["--spacing=nan", "--spacing=0", "--box=nan,0,0,1,1,1", "--box=nan%", "--box=1,2%", "--box=1e9", "--thresholds=inf",
+     "--thresholds=nan", "--samples=1000000000000", "--grow=1000000000", "--spacing=1e-9"],
+)  # fmt: skip
+def test_options_that_cannot_be(tmp_path: Path, option: str):
+    mesh = write_mesh(tmp_path / "a.ply", ball())
+    code, out = hineus("mesh", mesh, mesh, option)
+    assert code in (2, 3), out
+
+
+def test_a_crop_volume_and_a_trajectory_that_cannot_be(tmp_path: Path):
+    data = tmp_path / "Block"
+    trimesh.PointCloud(ball().vertices).export(write_mesh(data / "Block.ply", ball()))
+    for text in (
+        "[" * 100_000,
+        "[]",
+        '{"orthogonal_axis": 1}',
+        "NaN",
+        '{"orthogonal_axis": "Z", "bounding_polygon": 1}',
+    ):
+        (data / "Block.json").write_text(text)
+        with pytest.raises(InputError, match=r"The crop volume .* cannot be read"):
+            read_tanks(data)
+    polygon = [[-2, -2, 0], [2, -2, 0], [2, 2, 0]]
+    crop = {"orthogonal_axis": "Z", "axis_min": -1, "axis_max": 1, "bounding_polygon": polygon}
+    (data / "Block.json").write_text(json.dumps(crop))
+    np.savetxt(data / "Block_trans.txt", np.eye(4))
+    for text in ("nan " * 19, "1 " * 18, "x " * 19):
+        (data / "Block_COLMAP_SfM.log").write_text(text)
+        with pytest.raises(InputError, match=r"The trajectory .* cannot be read"):
+            read_tanks(data)
+
+
+def test_observed_cells_that_are_too_many(tmp_path: Path):
+    """A header of 2^60 cells; scipy would take memory for them."""
+    from stages.evaluation.protocols import dtu
+
+    file = tmp_path / "ObsMask1_10.mat"
+    savemat(file, {"ObsMask": np.zeros((2, 3, 4), np.uint8)})
+    whole = file.read_bytes()
+    shape = np.array([2, 3, 4], np.int32).tobytes()
+    assert shape in whole
+    file.write_bytes(whole.replace(shape, np.array([1 << 20] * 3, np.int32).tobytes()))
+    with pytest.raises(InputError, match=r"1152921504606846976 cells"):
+        dtu._matrix(file, "ObsMask")

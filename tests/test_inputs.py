@@ -21,9 +21,11 @@ from stages.capture.masks import unused_folder
 from stages.capture.video import extract_frames
 from stages.engine.fingerprint import SourceDigests
 from stages.errors import InputError
+from stages.inputs.bounded import read_bytes, reason
+from stages.inputs.depth import read_depth
 from stages.inputs.folders import MOST_BYTES, named_files, readable, short_name, unique_name
 from stages.inputs.formats import Kind, kind_of, kind_of_head, open_image, register_formats
-from stages.inputs.texts import read_text
+from stages.inputs.texts import read_json, read_text
 
 
 @pytest.fixture
@@ -342,6 +344,43 @@ def test_names_in_texts_that_are_not_utf_8_match_those_of_files(tmp_path: Path):
     (tmp_path / "t.txt").write_bytes(b"f\xfcr.jpg")
     (tmp_path / os.fsdecode(b"f\xfcr.jpg")).touch()
     assert readable(read_text(tmp_path / "t.txt")) in named_files(tmp_path)[0]
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [("[1, -2.5e3, true, null]", [1, -2500.0, True, None]), ("9007199254740993", 2**53 + 1), ("1" + "0" * 50, 1e50)],
+)
+def test_json_is_read(tmp_path: Path, text: str, expected: object):
+    (tmp_path / "t.json").write_text(text)
+    assert read_json(tmp_path / "t.json") == expected
+
+
+@pytest.mark.parametrize("text", ["NaN", "[-Infinity]", "1e999", "9" * 400, "9" * 5000, "[" * 100_000, "", "{"])
+def test_json_with_numbers_that_are_none_is_refused(tmp_path: Path, text: str):
+    (tmp_path / "t.json").write_text(text)
+    with pytest.raises((ValueError, RecursionError)) as caught:
+        read_json(tmp_path / "t.json")
+    assert len(reason(caught.value)) < 250
+
+
+def test_only_files_of_a_bounded_size_are_read(tmp_path: Path):
+    (tmp_path / "large").write_bytes(bytes(11))
+    os.mkfifo(tmp_path / "pipe")
+    for name, sentence in (("large", "11 bytes, at most 10"), ("pipe", "is no file"), (".", "is no file")):
+        with pytest.raises(ValueError, match=sentence):
+            read_bytes(tmp_path / name, 10)
+    with pytest.raises(ValueError, match="is no file"):
+        read_bytes(Path("/dev/zero"), 10)
+    assert read_bytes(tmp_path / "large", 11) == bytes(11)
+
+
+@pytest.mark.parametrize(
+    "data", [b"", b"\x89PNG", b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR" + b"\0\1\0\0" * 2, b"%!PS", bytes(99)]
+)
+def test_depth_images_that_are_none_are_refused(tmp_path: Path, data: bytes):
+    (tmp_path / "0-depth.png").write_bytes(data)
+    with pytest.raises(ValueError, match="is no"):
+        read_depth(tmp_path / "0-depth.png")
 
 
 def test_a_folder_that_cannot_be_read_is_told_of(photos: Path, monkeypatch: pytest.MonkeyPatch):

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import codecs
 import json
+import math
 import os
 import pickle
+import re
+import struct
 import unicodedata
+import zipfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -465,6 +470,244 @@ def test_metadata_of_another_shape_is_refused(tmp_path: Path):
     write_meganerf(tmp_path)
     torch.save({"W": 1, "H": 1, "intrinsics": torch.ones(3), "c2w": torch.eye(4)}, tmp_path / "metadata" / "000001.pt")
     with pytest.raises(InputError, match=r"holds c2w \(4, 4\) and intrinsics \(3,\), expected \(3, 4\) and \(4,\)"):
+        read_poses(tmp_path)
+
+
+# ---------------------------------------------------------------- what cannot be
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"w": 1e300}, "pixels, each must be from 1 to"),
+        ({"w": -3, "h": 7}, "is -3 x 7 pixels"),
+        ({"w": True}, "`w` of .* is True, expected a number"),
+        ({"fl_x": 0}, "no focal length"),
+        ({"fl_x": 1e300}, "cannot be"),
+        ({"fl_x": 1e-300}, "cannot be"),
+        ({"fl_y": -5.0}, "cannot be"),
+        ({"cx": 1e200}, "cannot be"),
+        ({"k1": 1e100}, "cannot be"),
+        ({"fl_x": None, "camera_angle_x": 0}, "angle of view"),
+        ({"fl_x": None, "camera_angle_x": 5}, "angle of view"),
+        ({"applied_scale": 0}, "`applied_scale` in .* is no number above 0"),
+        ({"applied_scale": "2"}, "`applied_scale` in"),
+        ({"applied_scale": [1, 2]}, "`applied_scale` in"),
+        ({"applied_transform": 5}, "`applied_transform` in .* is no rotation"),
+        ({"applied_transform": [[[1]]]}, "`applied_transform` in .* is no rotation"),
+        ({"applied_transform": [[1], [1, 2]]}, "no matrix of numbers"),
+        ({"frames": [{"file_path": ""}]}, "has no `file_path`"),
+        ({"frames": [{"file_path": "."}]}, "is called '.'"),
+        ({"frames": [{"file_path": "/"}]}, "is called '/'"),
+        ({"frames": [{"file_path": "a\0.png"}]}, "is called"),
+        ({"frames": [{"file_path": "a" * 10_000}]}, "is called"),
+        ({"frames": {"a": 1}}, "has no `frames`"),
+        ({"frames": [{"file_path": "a.png", "transform_matrix": [[10**400] * 4] * 4}]}, "computed with"),
+        ({"frames": [{"file_path": "a.png", "transform_matrix": [[math.nan] * 4] * 4}]}, "NaN is no number"),
+        ({"frames": [{"file_path": "a.png", "transform_matrix": [[0.0] * 4] * 4}]}, "has no rotation"),
+        ({"frames": [{"file_path": "a.png", "transform_matrix": "eye"}]}, "no matrix of numbers"),
+        ({"frames": [{"file_path": "a.png", "transform_matrix": [[1, 0, 0, 1e300], [0, 1, 0, 0], [0, 0, 1, 0]]}]},
+         "away from the origin"),
+    ],
+)  # fmt: skip
+def test_numbers_and_names_in_transforms_that_cannot_be(tmp_path: Path, changes: dict, sentence: str):
+    frame = {"file_path": "a.png", "transform_matrix": world_from_gl(0).tolist()}
+    data = {"fl_x": FOCAL, **SIZE, "frames": [frame], **changes}
+    if isinstance(data["frames"], list):
+        data["frames"] = [{**frame, **each} for each in data["frames"]]
+    file = tmp_path / "transforms.json"
+    file.write_text(json.dumps({key: value for key, value in data.items() if value is not None}))
+    with pytest.raises(InputError, match=sentence) as caught:
+        read_poses(file)
+    assert len(caught.value.message) < 600
+
+
+@pytest.mark.parametrize("text", ["", "[" * 100_000, '{"a":' * 50_000, "9" * 5000, "null", "\0", "{", '"a"', "[1, 2]"])
+def test_what_is_no_json_of_poses(tmp_path: Path, text: str):
+    (tmp_path / "transforms.json").write_text(text)
+    with pytest.raises(InputError, match=r"cannot be read|has no `frames`"):
+        read_poses(tmp_path)
+
+
+def test_images_that_poses_name_are_pictures_in_files(tmp_path: Path):
+    """A size that is not said is looked up; a pipe would be waited for."""
+    for name, target in (("pipe.png", None), ("zero.png", "/dev/zero"), ("eps.png", "%!PS-Adobe-3.0 EPSF-3.0\n")):
+        write_transforms(tmp_path, {"camera_angle_x": 1.0}, [name])
+        if target is None:
+            os.mkfifo(tmp_path / name)
+        elif target.startswith("/"):
+            (tmp_path / name).symlink_to(target)
+        else:
+            (tmp_path / name).write_text(target)
+        with pytest.raises(InputError, match="does not say how large its images are"):
+            read_poses(tmp_path)
+
+
+def binary_model(folder: Path) -> Path:
+    """As COLMAP writes it; two images with features."""
+    from stages.geometry.cameras import PinholeCameras
+    from stages.posing.colmap_model import pinhole_model
+
+    sizes = np.tile([WIDTH, HEIGHT], (2, 1))
+    intrinsics = np.tile(np.array([[FOCAL, 0, 160.0], [0, FOCAL, 120], [0, 0, 1]]), (2, 1, 1))
+    cameras = PinholeCameras(("a b.jpg", "c.jpg"), sizes, intrinsics, np.stack([cam_from_world(i) for i in range(2)]))
+    folder.mkdir(exist_ok=True)
+    pinhole_model(cameras, [np.ones((3, 2)), np.zeros((0, 2))]).write_binary(str(folder))
+    return folder
+
+
+def test_a_binary_model_of_two_images(tmp_path: Path):
+    assert_reprojects(read_poses(binary_model(tmp_path)), pinhole, ["a b.jpg", "c.jpg"])
+
+
+@pytest.mark.parametrize("name", ["cameras.bin", "images.bin"])
+def test_binary_models_are_read_no_further_than_they_reach(tmp_path: Path, name: str):
+    """Cut off anywhere, and with counts of 2^60 anywhere: COLMAP's own reader takes memory for them, or crashes."""
+    file = binary_model(tmp_path) / name
+    whole = file.read_bytes()
+    for end in range(len(whole)):
+        file.write_bytes(whole[:end])
+        with pytest.raises(InputError, match="cannot be read"):
+            read_poses(tmp_path)
+    refused = 0
+    for at in range(len(whole) - 8):
+        file.write_bytes(whole[:at] + b"\0\0\0\0\0\0\0\x10" + whole[at + 8 :])
+        try:
+            read_poses(tmp_path)
+        except InputError:
+            refused += 1
+    assert refused > len(whole) / 10
+
+
+@pytest.mark.parametrize(
+    ("changed", "sentence"),
+    [
+        (lambda text: text.replace("OPENCV", "LENS"), "is of model LENS with 8"),
+        (lambda text: text.replace("OPENCV", "PINHOLE"), "is of model PINHOLE with 8"),
+        (lambda text: text.replace(" 240 ", " 1000000000 "), "each must be from 1"),
+        (lambda text: text.replace(" 240 ", f" {'9' * 5000} "), "cannot be read"),
+        (lambda text: text.replace(" 163.0 ", " nan "), "cannot be"),
+        (lambda text: re.sub(r"(?m)^1 \S+ \S+ \S+ \S+ ", "1 0 0 0 0 ", text), "cannot be read"),
+        (lambda text: re.sub(r"(?m)^1 \S+ (\S+ \S+ \S+) ", r"1 nan \1 ", text), r"cannot be read|not finite"),
+        (lambda text: re.sub(r"(?m)^(1(?: \S+){6}) \S+ 1 ", r"\1 1e300 1 ", text), "away from the origin"),
+        (lambda text: text.replace(" 000.jpg", " /"), "is called '/'"),
+        (lambda text: text.replace(" 000.jpg", ""), "cannot be read"),
+    ],
+)
+def test_numbers_in_a_text_model_that_cannot_be(tmp_path: Path, changed: Callable[[str], str], sentence: str):
+    folder = text_model(tmp_path, [f"{name}.jpg" for name in NAMES])
+    for name in ("cameras.txt", "images.txt"):
+        (folder / name).write_text(changed((folder / name).read_text()))
+    with pytest.raises(InputError, match=sentence):
+        read_poses(folder)
+
+
+def test_quaternions_of_any_length(tmp_path: Path):
+    """COLMAP brings them to length 1."""
+    folder = text_model(tmp_path, [f"{name}.jpg" for name in NAMES])
+    lines = (folder / "images.txt").read_text().splitlines()
+    for i, line in enumerate(lines):
+        words = line.split()
+        if line.endswith(".jpg"):
+            lines[i] = " ".join([words[0], *(str(2 * float(word)) for word in words[1:5]), *words[5:]])
+    (folder / "images.txt").write_text("\n".join(lines))
+    assert_reprojects(read_poses(folder), opencv, [f"{name}.jpg" for name in NAMES])
+
+
+def npy(header: str, data: bytes = b"") -> bytes:
+    return b"\x93NUMPY\1\0" + struct.pack("<H", len(header) + 1) + header.encode() + b"\n" + data
+
+
+SHAPED = "{{'descr': '{}', 'fortran_order': False, 'shape': {}, }}"
+
+
+@pytest.mark.parametrize(
+    ("member", "sentence"),
+    [
+        (npy(SHAPED.format("<f8", "(1000000000000,)"), bytes(128)), "says that it is .* but has 128 bytes"),
+        (npy(SHAPED.format("|V0", "(1000000000000,)")), "numbers are needed"),
+        (npy(SHAPED.format("|O", "(1,)"), pickle.dumps([1])), "numbers are needed"),
+        (npy(SHAPED.format("<f8", "(-1,)")), "says that it is"),
+        (npy(SHAPED.format("<f8", "(4, 4)"), bytes(128)), "numbers that are not finite|cannot be"),
+        (npy(SHAPED.format("<f8", "(3, 4)"), bytes(96)), r"no 4 x 4 matrix \(\(3, 4\)"),
+        (npy(SHAPED.format("<f8", "(4, 4)"), np.full((4, 4), 1e300).tobytes()), r"cannot|not finite|no rotation"),
+        (npy("(" * 5000), "cannot be read"),
+        (b"", "cannot be read"),
+        (bytes(100_000_000), "unpacks to 100000198 bytes, at most"),
+    ],
+)
+def test_arrays_that_lie(tmp_path: Path, member: bytes, sentence: str):
+    file = write_neus(tmp_path, ["0.png"])
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("world_mat_0.npy", member)
+        archive.writestr("scale_mat_0.npy", npy(SHAPED.format("<f8", "(4, 4)"), np.eye(4).tobytes()))
+    with pytest.raises(InputError, match=sentence):
+        read_poses(file)
+    file.write_bytes(b"")
+    with pytest.raises(InputError, match="cannot be read"):
+        read_poses(file)
+
+
+class Named:
+    """Pickled as a call of any function."""
+
+    def __init__(self, call: Callable[..., object], *given: object) -> None:
+        self.call = call, given
+
+    def __reduce__(self):
+        return self.call
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"",
+        b"\x80\x04r\xff\xff\xff\x7f.",  # the memo at 2^31: C takes 16 GB for it
+        b"\x80\x04\x8e" + struct.pack("<Q", 1 << 60) + b"x.",  # bytes of 2^60
+        b"]" + b"q\0(h\0h\0l" * 40 + b".",  # lists of lists that are one
+        b"(" * 100_000 + b"l" * 100_000 + b".",
+        pickle.dumps((1, 2)),
+        pickle.dumps({"a": 1}),
+        pickle.dumps((np.array([None]), np.eye(3))),
+        pickle.dumps((np.eye(3, 4) * np.nan, np.eye(3))),
+        pickle.dumps((np.eye(3, 4), np.zeros((3, 3)))),
+        pickle.dumps((np.zeros((3, 4)), np.diag([FOCAL, FOCAL, 1]))),
+        pickle.dumps((Named(np.ndarray, (10**12,)), Named(np.ndarray, (10**12,)))),
+        pickle.dumps((Named(codecs.encode, b"a", "hex"), 1)),
+    ],
+)
+def test_pickles_that_cannot_be(tmp_path: Path, data: bytes):
+    write_nero(tmp_path)
+    (tmp_path / "0-camera.pkl").write_bytes(data)
+    with pytest.raises(InputError, match=r"0\.png|0-camera"):
+        read_poses(tmp_path)
+
+
+def test_tensors_that_cannot_be(tmp_path: Path):
+    import torch
+
+    write_meganerf(tmp_path)
+    file = tmp_path / "metadata" / "000000.pt"
+    whole = torch.load(file)
+    wide = torch.zeros(1).as_strided((10**6, 10**6), (0, 0))  # 4 bytes
+    for key, value in (("c2w", wide), ("W", wide), ("W", 10**400), ("H", math.nan), ("c2w", whole["c2w"] * math.nan),
+                       ("c2w", [[1.0]]), ("W", 0)):  # fmt: skip
+        torch.save({**whole, key: value}, file)
+        with pytest.raises(InputError, match="000000"):
+            read_poses(tmp_path)
+    torch.save({**whole, "c2w": Named(os.mkdir, str(tmp_path / "hacked"))}, file)
+    with pytest.raises(InputError, match="more than tensors and plain values"):
+        read_poses(tmp_path)
+    torch.save(whole, file, _use_new_zipfile_serialization=False)
+    with pytest.raises(InputError, match="not a zip file"):
+        read_poses(tmp_path)
+    assert not (tmp_path / "hacked").exists()
+
+
+@pytest.mark.parametrize("word", ["nan", "inf", "1e300", "x", "0", ""])
+def test_numbers_of_mvsnet_that_cannot_be(tmp_path: Path, word: str):
+    file = next(write_mvsnet(tmp_path).glob("*_cam.txt"))
+    words = file.read_text().split()
+    file.write_text(" ".join([*words[:1], *[word] * 3, *words[4:]]))
+    with pytest.raises(InputError, match=file.name):
         read_poses(tmp_path)
 
 

@@ -130,7 +130,10 @@ def read_split(file: Path) -> list[str]:
 def _load(file: Path) -> tuple[np.ndarray, np.ndarray]:
     """Pose [3, 4] and intrinsics [3, 3]."""
     with reading(f"The camera {file}", "a pose and intrinsics"):
-        pose, intrinsics = (array.values.astype(np.float64) for array in _unpickled(file)[:2])
+        found = _unpickled(file)
+        if not isinstance(found, list | tuple) or not all(isinstance(each, _Array) for each in found[:2]):
+            raise ValueError("it holds no arrays")
+        pose, intrinsics = (array.values.astype(np.float64) for array in found[:2])
         if pose.shape not in ((3, 4), (4, 4)) or intrinsics.shape != (3, 3):
             raise ValueError(f"it holds arrays {pose.shape} and {intrinsics.shape}, expected (3, 4) and (3, 3)")
     return pose[:3], intrinsics
