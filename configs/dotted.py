@@ -16,12 +16,14 @@ def flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def nested(flat: Mapping[str, Any]) -> dict[str, Any]:
-    """The reverse of `flatten`."""
+    """The reverse of `flatten`; where a key is both a value and a section, the later one wins."""
     values: dict[str, Any] = {}
     for dotted, value in flat.items():
         *sections, name = dotted.split(".")
         section = values
         for each in sections:
-            section = section.setdefault(each, {})
+            if not isinstance(section.get(each), dict):
+                section[each] = {}
+            section = section[each]
         section[name] = value
     return values

@@ -64,7 +64,7 @@ def load_config(preset: str | None = None, file: Path | None = None, sets: Seque
         groups.append([(f"preset '{preset}'", _parse(preset_text(preset), f"preset '{preset}'"))])
     if file is not None:
         groups.append([(str(file), _parse(_read(file), str(file)))])
-    groups.append([(f"--set {text}", _parse_set(text)) for text in sets])
+    groups.append([(_set(text), _parse_set(text)) for text in sets])
 
     merged: dict[str, Any] = {}  # by dotted key
     origins: dict[str, str] = {}
@@ -82,17 +82,21 @@ def load_config(preset: str | None = None, file: Path | None = None, sets: Seque
 
 def _backbone(name: Any) -> list[tuple[str, dict[str, Any]]]:
     """The layer of backbone `name`; none where there is no such backbone, which the schema then refuses."""
-    file = resources.files("configs") / "backbones" / f"{name}.yaml"
-    if not isinstance(name, str) or not name.isidentifier() or not file.is_file():
+    if name not in _names_in("backbones"):
         return []
+    file = resources.files("configs") / "backbones" / f"{name}.yaml"
     origin = f"backbone '{name}'"
     return [(origin, _checked(_parse(file.read_text(encoding="utf-8"), origin), origin))]
 
 
 def preset_names() -> list[str]:
     """Names of the presets that come with the program, sorted."""
-    folder = resources.files("configs") / "presets"
-    return sorted(entry.name.removesuffix(".yaml") for entry in folder.iterdir() if entry.name.endswith(".yaml"))
+    return _names_in("presets")
+
+
+def _names_in(folder: str) -> list[str]:
+    files = (resources.files("configs") / folder).iterdir()
+    return sorted(file.name.removesuffix(".yaml") for file in files if file.name.endswith(".yaml"))
 
 
 def preset_text(name: str) -> str:
@@ -103,7 +107,7 @@ def preset_text(name: str) -> str:
     """
     if name not in preset_names():
         raise ConfigError(
-            f"There is no preset '{name}'.",
+            f"There is no preset '{_short(name)}'.",
             f"{did_you_mean(name, preset_names(), '--preset {}')}The presets are {', '.join(preset_names())}.",
         )
     return (resources.files("configs") / "presets" / f"{name}.yaml").read_text(encoding="utf-8")
@@ -176,47 +180,101 @@ def _bounds(field: FieldInfo) -> str:
 
 
 # ---------------------------------------------------------------- reading YAML
+MOST_BYTES = 1 << 18  # of a settings file: all settings with their descriptions are a tenth of that
+MOST_DEPTH = 8  # of sections and lists in each other; settings lie at most five deep
+MOST_SHOWN = 200  # characters of what is refused
+
+
 class _Loader(yaml.SafeLoader):
-    """YAML with version 1.2's scalars: `off` is text, not false; `1e-3` is a number, not text."""
+    """Plain YAML: sections, lists, texts, numbers, true, false and null, by the rules of version 1.2.
+
+    `off` is text, not false; `1e-3` is a number, not text; a date is text. What no setting needs and what makes work or
+    values of other kinds is refused: anchors, aliases, tags, keys that come twice, deep nesting.
+    """
+
+    depth = 0
+
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
+        event: Any = self.peek_event()  # type: ignore[no-untyped-call]
+        if getattr(event, "anchor", None) is not None:
+            raise _refused("anchors and aliases (&name, *name) are not read here: write the value itself", event)
+        if getattr(event, "tag", None) is not None:
+            raise _refused(f"tags ({event.tag}) are not read here: write the plain value", event)
+        if self.depth > MOST_DEPTH:
+            raise _refused(f"sections and lists lie more than {MOST_DEPTH} deep in each other", event)
+        self.depth += 1
+        try:
+            return super().compose_node(parent, index)
+        finally:
+            self.depth -= 1
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        names = set()
+        for key, _ in node.value:
+            name = self.construct_object(key, deep=True)
+            if not isinstance(name, str) or not name or "." in name:
+                raise _refused(f"{shown(name)} is no name of a setting or section", key)
+            if name in names:
+                raise _refused(f"`{name}` is there twice", key)
+            names.add(name)
+        return super().construct_mapping(node, deep)
 
 
-_Loader.yaml_implicit_resolvers = {
-    first: [(tag, regex) for tag, regex in rules if not tag.endswith((":bool", ":float"))]
-    for first, rules in yaml.SafeLoader.yaml_implicit_resolvers.items()
-}
-_Loader.add_implicit_resolver(
-    "tag:yaml.org,2002:bool", re.compile(r"^(?:true|True|TRUE|false|False|FALSE)$"), list("tTfF")
-)
-_Loader.add_implicit_resolver(
-    "tag:yaml.org,2002:float",
-    re.compile(
-        r"^(?:[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN))$"
+def _refused(problem: str, place: Any) -> yaml.MarkedYAMLError:
+    return yaml.MarkedYAMLError(problem=problem, problem_mark=place.start_mark)
+
+
+# Longer numbers than these are read as the next wider kind: a float, which may be infinite, and then a text.
+_Loader.yaml_implicit_resolvers = {}
+for _kind, _starts, _pattern in (
+    ("null", ["~", "n", "N", ""], r"~|null|Null|NULL|"),
+    ("bool", list("tTfF"), r"true|True|TRUE|false|False|FALSE"),
+    ("int", list("-+0123456789"), r"[-+]?(?:0|[1-9][0-9]{0,18})|0x[0-9a-fA-F]{1,16}"),
+    (
+        "float",
+        list("-+.0123456789"),
+        r"[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN)",
     ),
-    list("-+.0123456789"),
-)
+):
+    _Loader.add_implicit_resolver(f"tag:yaml.org,2002:{_kind}", re.compile(f"^(?:{_pattern})$"), _starts)
 
 
 def _yaml(text: str) -> Any:
     return yaml.load(text, Loader=_Loader)  # a SafeLoader: plain data only
 
 
+def _problem(error: yaml.YAMLError) -> str:
+    """Where it is wrong and what, in one line."""
+    mark = getattr(error, "problem_mark", None)
+    what = " ".join(str(getattr(error, "problem", None) or error).split())
+    return f" at line {mark.line + 1}: {what}" if mark else f": {what}"
+
+
 def _read(file: Path) -> str:
+    def refusal(reason: str | None) -> ConfigError:
+        return ConfigError(f"The settings file {file} cannot be read: {reason}.", "Check the path.")
+
     try:
-        return file.read_text(encoding="utf-8-sig")  # editors of Windows write a byte-order mark
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
-        raise ConfigError(f"The settings file {file} cannot be read: {reason}.", "Check the path.") from error
+        # What is no file may have no end, or wait for somebody who writes into it.
+        if file.exists() and not file.is_file():
+            raise refusal("it is a folder" if file.is_dir() else "it is no file but a pipe, a socket or a device")
+        with file.open("rb") as stream:
+            content = stream.read(MOST_BYTES + 1)
+        if len(content) > MOST_BYTES:
+            raise refusal(f"it has more than {MOST_BYTES} bytes, so it is none of settings")
+        return content.decode("utf-8-sig")  # editors of Windows write a byte-order mark
+    except OSError as error:
+        raise refusal(error.strerror) from error
+    except UnicodeDecodeError as error:
+        raise refusal("not UTF-8 text") from error
 
 
 def _parse(text: str, origin: str) -> dict[str, Any]:
     try:
         data = _yaml(text)
     except yaml.YAMLError as error:
-        mark = getattr(error, "problem_mark", None)
-        where = f" at line {mark.line + 1}" if mark else ""
         raise ConfigError(
-            f"{origin} is not valid YAML{where}: {getattr(error, 'problem', error)}.",
-            "`hineus config` prints a valid one.",
+            f"{origin} is no YAML of settings{_problem(error)}.", "`hineus config` prints a valid one."
         ) from error
     if data is None:
         return {}
@@ -225,22 +283,36 @@ def _parse(text: str, origin: str) -> dict[str, Any]:
             f"{origin} holds {type(data).__name__} where sections were expected.",
             "`hineus config` prints a valid one.",
         )
-    return {str(key): value for key, value in data.items()}
+    return data
 
 
 def _parse_set(text: str) -> dict[str, Any]:
     key, equals, raw = text.partition("=")
     parts = key.strip().split(".")
-    if not equals or not all(parts):
-        raise ConfigError(f"--set {text} is not of the form section.key=value.", "For example `--set sfm.seed=1`.")
+    if not equals or not all(parts) or len(parts) > MOST_DEPTH:
+        raise ConfigError(f"{_set(text)} is not of the form section.key=value.", "For example `--set sfm.seed=1`.")
     try:
         value = _yaml(raw)
     except yaml.YAMLError as error:
         raise ConfigError(
-            f"--set {text}: the value is not valid YAML ({getattr(error, 'problem', error)}).",
+            f"{_set(text)}: the value is no YAML of settings{_problem(error)}.",
             "Quote it for the shell, for example `--set 'export.formats=[glb, ply]'`.",
         ) from error
     return nested({".".join(parts): value})
+
+
+def _set(text: str) -> str:
+    """The option as an origin of settings."""
+    return f"--set {_short(text)}"
+
+
+def shown(value: Any) -> str:
+    """A value as it is written in a refusal: not all of a long one."""
+    return _short(repr(value))
+
+
+def _short(text: str) -> str:
+    return text if len(text) <= MOST_SHOWN else f"{text[:MOST_SHOWN]}..."
 
 
 # ---------------------------------------------------------------- refusing
@@ -256,15 +328,17 @@ def _checked(
         dotted = f"{prefix}{key}"
         field = schema.model_fields.get(str(key))
         if field is None:
-            raise ConfigError(f"Unknown setting `{dotted}` in {origin}.", _nearest(dotted))
+            raise ConfigError(f"Unknown setting `{_short(dotted)}` in {origin}.", _nearest(dotted))
         section = _section(field)
         if section is None:
+            if isinstance(value, Mapping):
+                raise ConfigError(f"`{dotted}` in {origin} is a setting, not a section of settings.", _about(dotted))
             checked[str(key)] = value
         elif isinstance(value, Mapping):
             checked[str(key)] = _checked(value, origin, section, f"{dotted}.")
         elif value is not None:  # a section with all its lines commented out is fine
             raise ConfigError(
-                f"`{dotted}` in {origin} is a section of settings, not a value ({value!r}).",
+                f"`{dotted}` in {origin} is a section of settings, not a value ({shown(value)}).",
                 f"Set one of its keys, for example `{next(_fields(section, f'{dotted}.'))[0]}`.",
             )
     return checked
@@ -298,17 +372,20 @@ def _refusal(error: ValidationError, origins: Mapping[str, str]) -> ConfigError:
     origin = origins.get(key) or next((origins[part] for part in _ancestors(key) if part in origins), "the settings")
     field = known.get(key)
     if field is None:
-        return ConfigError(f"{detail['msg']} (in {origin}).", "`hineus config --describe` lists all settings.")
-    help_text = f"{key}: {field.description}. Default: {show_value(field.get_default(call_default_factory=True))}."
+        said = str(detail["ctx"]["error"]) if detail["type"] == "value_error" else detail["msg"]
+        return ConfigError(f"{said} (in {origin}).", "`hineus config --describe` lists all settings.")
+    found = f"`{key}` = {shown(detail['input'])} in {origin}"
     if detail["type"] == "value_error":  # the schema's own checks say what is wrong
-        return ConfigError(f"`{key}` = {detail['input']!r} in {origin}: {detail['ctx']['error']}.", help_text)
+        return ConfigError(f"{found}: {_short(str(detail['ctx']['error']))}.", _about(key))
     bounds = _bounds(field)
     problem = "is out of bounds: it must be" if detail["type"] in _BOUND_ERRORS else "is no valid value: it must be"
     wanted = bounds if detail["type"] in _BOUND_ERRORS else f"{_type_name(field.annotation)} {bounds}".strip()
-    return ConfigError(
-        f"`{key}` = {detail['input']!r} in {origin} {problem} {wanted}.",
-        help_text,
-    )
+    return ConfigError(f"{found} {problem} {wanted}.", _about(key))
+
+
+def _about(key: str) -> str:
+    field = dict(_fields())[key]
+    return f"{key}: {field.description}. Default: {show_value(field.get_default(call_default_factory=True))}."
 
 
 def _ancestors(key: str) -> Iterator[str]:

@@ -12,16 +12,23 @@ from pydantic import Field, field_validator
 
 from configs.section import Section
 from configs.texts import REGION_FORMS, read_distance, read_region
-from configs.training import TrainParams
+from configs.training import MOST_PHOTOS, MOST_SEED, TrainParams
+
+MOST_SIDE = 65_536  # pixels: a gigapixel picture is 32,768 high
 
 
 class IngestParams(Section):
     """Photos to upright RGB images."""
 
-    max_side: int = Field(3200, ge=64, description="photos larger than this are reduced to it, longest side in pixels")
-    min_images: int = Field(3, ge=2, description="fewer usable photos than this is an error")
+    max_side: int = Field(
+        3200, ge=64, le=MOST_SIDE, description="photos larger than this are reduced to it, longest side in pixels"
+    )
+    min_images: int = Field(3, ge=2, le=MOST_PHOTOS, description="fewer usable photos than this is an error")
     video_frames: int = Field(
-        80, ge=2, description="at most this many frames of a video become photos: spread by motion, the sharpest ones"
+        80,
+        ge=2,
+        le=MOST_PHOTOS,
+        description="at most this many frames of a video become photos: spread by motion, the sharpest ones",
     )
     auto_mask: Literal["off", "plain", "salient", "object"] = Field(
         "off",
@@ -60,7 +67,10 @@ class SfmParams(Section):
         "preemptive up to `preemptive_max` photos, then spatial or sequential",
     )
     preemptive_max: int = Field(
-        150, ge=2, description="with more photos than this, auto matches neighbours only, in space (GPS) or in name"
+        150,
+        ge=2,
+        le=MOST_PHOTOS,
+        description="with more photos than this, auto matches neighbours only, in space (GPS) or in name",
     )
     mapper: Literal["incremental", "global"] = Field("incremental", description="how poses are solved")
     wanted: float = Field(
@@ -75,8 +85,10 @@ class SfmParams(Section):
         description="features on the object only, where masks exist; auto: where too few photos have a pose without. "
         "always: for an object that was moved, as `--moving-object` says",
     )
-    max_image_size: int = Field(1600, ge=100, description="features are found at this longest side, pixels")
-    max_features: int = Field(8192, ge=100, description="SIFT features per image")
+    max_image_size: int = Field(
+        1600, ge=100, le=MOST_SIDE, description="features are found at this longest side, pixels"
+    )
+    max_features: int = Field(8192, ge=100, le=1_000_000, description="SIFT features per image")
     camera_model: Literal["SIMPLE_RADIAL", "RADIAL", "OPENCV", "SIMPLE_PINHOLE", "PINHOLE"] = Field(
         "SIMPLE_RADIAL", description="COLMAP camera model that is estimated"
     )
@@ -85,14 +97,14 @@ class SfmParams(Section):
         description="a last bundle adjustment of found poses; auto: frees each camera's principal point and radial k2 "
         "where observations held out of it are met better. off: what mapping found stays",
     )
-    min_registered: int = Field(3, ge=2, description="fewer registered photos than this is an error")
+    min_registered: int = Field(3, ge=2, le=MOST_PHOTOS, description="fewer registered photos than this is an error")
     min_registered_ratio: float = Field(
         0.3, ge=0, le=1, description="registering a smaller part of the photos than this is an error"
     )
     deterministic: bool = Field(
         False, description="single-threaded matching and mapping: same result every time, slower"
     )
-    seed: int = Field(0, ge=0, description="random seed")
+    seed: int = Field(0, ge=0, le=MOST_SEED, description="random seed")
 
 
 class PlaceParams(Section):
@@ -124,7 +136,10 @@ class PlaceParams(Section):
         "offset; null: metres east, north and up of an origin",
     )
     marker_size: float | None = Field(
-        None, gt=0, description="side of printed ArUco markers in the scene, metres; their size gives the scale"
+        None,
+        ge=1e-4,
+        le=1000,
+        description="side of printed ArUco markers in the scene, metres; their size gives the scale",
     )
     marker_dictionary: Literal[
         "4X4_50", "4X4_250", "5X5_100", "5X5_250", "6X6_250", "7X7_250", "ARUCO_ORIGINAL", "APRILTAG_36h11"
@@ -152,9 +167,12 @@ class PlaceParams(Section):
 class UndistortParams(Section):
     """Camera poses to pinhole images in a normalised frame."""
 
-    max_side: int = Field(1600, ge=64, description="longest side of the undistorted images, pixels")
+    max_side: int = Field(1600, ge=64, le=MOST_SIDE, description="longest side of the undistorted images, pixels")
     mask_erode: int = Field(
-        0, ge=0, description="masks shrink by this many pixels (at the undistorted size), and the object with them"
+        0,
+        ge=0,
+        le=1000,
+        description="masks shrink by this many pixels (at the undistorted size), and the object with them",
     )
     masks: Literal["auto", "alone", "beside"] = Field(
         "auto",
@@ -162,9 +180,14 @@ class UndistortParams(Section):
         "the object ends; auto: beside where the background stood still, by the points found on it. Masks of "
         "`ingest.auto_mask=salient` are always beside",
     )
-    roi_scale: float = Field(1.0, gt=0, description="the region of interest found automatically is scaled by this")
+    roi_scale: float = Field(
+        1.0, ge=0.01, le=100, description="the region of interest found automatically is scaled by this"
+    )
     subject: int = Field(
-        1, ge=1, description="where photos are about things far apart: which of them; 1 is what most photos are about"
+        1,
+        ge=1,
+        le=1000,
+        description="where photos are about things far apart: which of them; 1 is what most photos are about",
     )
 
 
@@ -176,7 +199,7 @@ class DensifyParams(Section):
         description="auto: semi-global matching of neighbouring photos; patch_match: COLMAP's, which needs a GPU and a "
         "pycolmap that was built with CUDA, and was never tried on one; off: no dense points",
     )
-    side: int = Field(1000, ge=64, description="photos are compared at this longest side, pixels")
+    side: int = Field(1000, ge=64, le=MOST_SIDE, description="photos are compared at this longest side, pixels")
     neighbors: int = Field(
         4, ge=2, le=20, description="photos that each photo is compared with: two must agree on a depth"
     )
@@ -185,7 +208,9 @@ class DensifyParams(Section):
 class HeldOutDensifyParams(DensifyParams):
     """With `train.hold_out`, as it reaches the stage: photos held out from training make no dense points either."""
 
-    hold_out: int = Field(0, ge=0, description="every n-th photo is left out, as in `train.hold_out`; 0: none")
+    hold_out: int = Field(
+        0, ge=0, le=MOST_PHOTOS, description="every n-th photo is left out, as in `train.hold_out`; 0: none"
+    )
 
 
 class ExtractParams(Section):
@@ -207,14 +232,14 @@ class ExtractParams(Section):
 class CleanupParams(Section):
     """Raw mesh to a clean, light one."""
 
-    target_faces: int = Field(100_000, ge=100, description="faces after decimation")
+    target_faces: int = Field(100_000, ge=100, le=100_000_000, description="faces after decimation")
     min_component: float = Field(
         0.002, ge=0, le=1, description="pieces with fewer faces than this part of the largest piece are dropped"
     )
-    min_views: int = Field(1, ge=0, description="faces seen by fewer cameras than this count as unseen")
+    min_views: int = Field(1, ge=0, le=MOST_PHOTOS, description="faces seen by fewer cameras than this count as unseen")
     keep_closed: bool = Field(False, description="a closed mesh: keep unseen faces, and close what cuts leave open")
     rings: int = Field(
-        3, ge=0, description="faces within this many steps of a seen one are kept, so borders are not ragged"
+        3, ge=0, le=1000, description="faces within this many steps of a seen one are kept, so borders are not ragged"
     )
     max_hidden_area: float = Field(
         0.002, ge=0, le=1, description="unseen patches up to this part of the seen area are kept: they close small gaps"
@@ -224,11 +249,14 @@ class CleanupParams(Section):
     )
     remove_ground: bool = Field(False, description="cut off the ground or table, where its plane was found")
     ground_tolerance: float = Field(
-        0.015, gt=0, description="the cut is this far above the ground's plane, in radii of the region of interest"
+        0.015,
+        gt=0,
+        le=1,
+        description="the cut is this far above the ground's plane, in radii of the region of interest",
     )
     mask_hull: bool = Field(True, description="where masks exist, drop faces that lie outside them")
     mask_margin: int = Field(
-        6, ge=0, description="masks grow by this many pixels before faces outside them are dropped"
+        6, ge=0, le=1000, description="masks grow by this many pixels before faces outside them are dropped"
     )
     mask_outside: float = Field(
         0.15,
@@ -246,7 +274,9 @@ class AtlasParams(Section):
         None, ge=64, le=16384, description="side of the texture, pixels; null: as large as the photos can fill"
     )
     padding: int = Field(4, ge=1, le=64, description="texels kept free between charts")
-    time_limit: float = Field(120.0, gt=0, description="seconds before the fallback parametrisation takes over")
+    time_limit: float = Field(
+        120.0, gt=0, le=1_000_000, description="seconds before the fallback parametrisation takes over"
+    )
 
 
 class BakeParams(Section):
@@ -259,12 +289,12 @@ class BakeParams(Section):
         False, description="count photos that show a point brighter than the others do less: fewer highlights"
     )
     robust_sigma: float = Field(
-        6.0, gt=0, description="colours further than this many (robust) standard deviations are rejected"
+        6.0, ge=0.01, le=1000, description="colours further than this many (robust) standard deviations are rejected"
     )
     normal_map: bool = Field(True, description="keep the detail that decimation takes away as a normal map")
     occlusion_rays: int = Field(64, ge=0, le=4096, description="rays per sample of the occlusion map; 0: no such map")
     occlusion_reach: float = Field(
-        0.5, gt=0, description="what lies further off occludes nothing, in radii of the region of interest"
+        0.5, ge=1e-4, le=100, description="what lies further off occludes nothing, in radii of the region of interest"
     )
 
 
@@ -294,7 +324,7 @@ class ExportParams(Section):
 class ReportParams(Section):
     """Everything to one HTML page."""
 
-    thumbnails: int = Field(300, ge=0, description="at most this many photos have a thumbnail")
+    thumbnails: int = Field(300, ge=0, le=MOST_PHOTOS, description="at most this many photos have a thumbnail")
 
 
 class Config(Section):

@@ -41,4 +41,6 @@ def settings_beyond(preset: str, config: Config) -> list[str]:
     given, wanted = (
         flatten(settings.model_dump(mode="json")) for settings in (load_config(preset, sets=backbone), config)
     )
-    return backbone + [f"{key}={json.dumps(value)}" for key, value in wanted.items() if value != given[key]]
+    return backbone + [
+        f"{key}={json.dumps(value, ensure_ascii=False)}" for key, value in wanted.items() if value != given[key]
+    ]

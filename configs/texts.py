@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import math
-
+LEAST, MOST = 1e-6, 1e9  # of lengths, and of coordinates: those around the Earth's centre reach 6.4e6 metres
 REGION_FORMS = "auto, 'sphere X Y Z RADIUS' or 'box X0 Y0 Z0 X1 Y1 Z1'"
 
 
@@ -18,10 +17,10 @@ def read_region(text: str) -> tuple[str, tuple[float, ...]]:
     if expected is None:
         raise ValueError(f"it must be {REGION_FORMS}")
     numbers = _numbers(rest, expected, f"'{form}'")
-    if form == "sphere" and numbers[3] <= 0:
-        raise ValueError(f"the sphere's radius must be positive, not {numbers[3]:g}")
-    if form == "box" and any(high <= low for low, high in zip(numbers[:3], numbers[3:], strict=True)):
-        raise ValueError("each of the box's X1 Y1 Z1 must be larger than its X0 Y0 Z0")
+    if form == "sphere" and numbers[3] < LEAST:
+        raise ValueError(f"the sphere's radius must be at least {LEAST:g}, not {numbers[3]:g}")
+    if form == "box" and any(high - low < LEAST for low, high in zip(numbers[:3], numbers[3:], strict=True)):
+        raise ValueError(f"each of the box's X1 Y1 Z1 must be larger than its X0 Y0 Z0, by at least {LEAST:g}")
     return form, numbers
 
 
@@ -35,8 +34,8 @@ def read_distance(text: str) -> tuple[tuple[float, ...], tuple[float, ...], floa
     first, second, metres = numbers[:3], numbers[3:6], numbers[6]
     if first == second:
         raise ValueError("the two points must not be the same")
-    if metres <= 0:
-        raise ValueError(f"the distance must be positive, not {metres:g} metres")
+    if metres < LEAST:
+        raise ValueError(f"the distance must be at least {LEAST:g} metres, not {metres:g}")
     return first, second, metres
 
 
@@ -45,6 +44,8 @@ def _numbers(words: list[str], expected: int, what: str) -> tuple[float, ...]:
         numbers = tuple(float(word) for word in words)
     except ValueError:
         raise ValueError(f"{what} takes {expected} numbers, got {' '.join(words)!r}") from None
-    if len(numbers) != expected or not all(map(math.isfinite, numbers)):
+    if len(numbers) != expected:
         raise ValueError(f"{what} takes {expected} numbers, got {len(numbers)}")
+    if not all(abs(number) <= MOST for number in numbers):
+        raise ValueError(f"{what} takes numbers from -{MOST:g} to {MOST:g}, got {' '.join(words)}")
     return numbers

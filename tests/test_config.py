@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -86,7 +87,7 @@ def test_set_takes_yaml_values(text: str, expected: Any) -> None:
         ("export.formats=[glb, fbx]", "`export.formats` = 'fbx' in", "list of (glb | usdz | obj | ply | stl | points)"),
         ("sfm=3", "`sfm` in --set sfm=3 is a section of settings", "`sfm.matcher`"),
         ("sfm.seed", "is not of the form section.key=value", "--set sfm.seed=1"),
-        ("sfm.seed=[1", "the value is not valid YAML", "Quote it"),
+        ("sfm.seed=[1", "the value is no YAML of settings", "Quote it"),
     ],
 )
 def test_refusals_name_the_setting_and_the_way_out(text: str, message: str, hint: str) -> None:
@@ -101,7 +102,7 @@ def test_refusals_name_the_setting_and_the_way_out(text: str, message: str, hint
     [
         ("sfm:\n  sed: 1\n", "Unknown setting `sfm.sed` in "),
         ("sfm:\n  seed: -1\n", "out of bounds: it must be >= 0"),
-        ("sfm: [\n", "is not valid YAML at line"),
+        ("sfm: [\n", "is no YAML of settings at line"),
         ("- 1\n", "holds list where sections were expected"),
     ],
 )
@@ -153,6 +154,146 @@ def test_a_backbone_over_a_file_that_states_everything_wins_and_below_it_does_no
 def test_an_unknown_backbone_is_refused_with_those_there_are():
     with pytest.raises(ConfigError, match=r"hineus \| neus2"):
         load_config("cpu", None, ["train.backbone=../presets/cpu"])
+
+
+# ---------------------------------------------------------------- files and values that are no settings
+HUGE = "9" * 5000
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        ("2020-13-45", "= '2020-13-45' in"),
+        ("2020-01-02", "= '2020-01-02' in"),
+        ("1:30:00", "= '1:30:00' in"),
+        (HUGE, "= inf in"),
+        (f"-{HUGE}", "= -inf in"),
+        (f"0x{HUGE}", "= '0x9999"),
+        (f"'{HUGE}'", "= '9999"),
+        ("99999999999999999999999", "is no valid value"),
+        (".inf", "= inf in"),
+        (".nan", "= nan in"),
+        ("1e999", "= inf in"),
+        ("1.5", "= 1.5 in"),
+        ("true", "it must be a number, not true or false"),
+        ("null", "= None in"),
+        ("!!bool abc", "tags (tag:yaml.org,2002:bool) are not read here"),
+        ("!!int abc", "tags ("),
+        ("!!binary AA==", "tags ("),
+        ("!!set {a, b}", "tags ("),
+        ("!!python/object/apply:os.system [echo]", "tags (tag:yaml.org,2002:python/object/apply:os.system)"),
+        ("!<tag:x> 1", "tags (tag:x)"),
+        ("&a [*a]", "anchors and aliases"),
+        ("&a {x: *a}", "anchors and aliases"),
+        ("&a 1", "anchors and aliases"),
+        ("{x: 1}", "is a setting, not a section of settings"),
+        ("{}", "is a setting, not a section of settings"),
+        ("{<<: {x: 1}}", "is a setting, not a section of settings"),
+        ("{a: 1, a: 2}", "`a` is there twice"),
+        ("{1: 2}", "1 is no name of a setting or section"),
+        ("{[a]: 2}", "['a'] is no name of a setting or section"),
+        ("{a.b: 2}", "'a.b' is no name of a setting or section"),
+        ("[" * 6000 + "]" * 6000, "more than 8 deep in each other"),
+        ("[" * 50_000, "more than 8 deep in each other"),
+        ("{a: " * 6000 + "}" * 6000, "more than 8 deep in each other"),
+        ("[" + "x," * 10_000 + "]", "= ['x', 'x', "),
+        ("x" * 100_000, "= 'xxx"),
+    ],
+    ids=lambda text: text[:20],
+)
+def test_values_that_are_none_are_refused_in_a_short_sentence(tmp_path: Path, value: str, message: str) -> None:
+    file = tmp_path / "mine.yaml"
+    file.write_text(f"sfm:\n  seed: {value}\n")
+    for given in ({"sets": [f"sfm.seed={value}"]}, {"file": file}):
+        with pytest.raises(ConfigError) as caught:
+            load_config(**given)
+        assert message in caught.value.message
+        assert len(caught.value.message) < 1000
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"sfm:\n  seed: 1\n---\nsfm:\n  seed: 2\n", "found another document"),
+        (b"sfm:\n  seed: 1\n  seed: 2\n", "at line 3: `seed` is there twice"),
+        (b"sfm: {}\nsfm: {}\n", "`sfm` is there twice"),
+        (b"<<: {sfm: {seed: 1}}\n", "Unknown setting `<<`"),
+        (b"train: {rays: 5, sampling: {rays: {x: 1}}}\n", "`train.sampling.rays` in"),
+        (b"train.rays: 5\ntrain: 3\n", "'train.rays' is no name"),
+        (b"null: 1\n", "None is no name"),
+        (b"train:\n  backbone: " + b"a" * 3000, "`train.backbone` = 'aaa"),
+        (b"train:\n  backbone: [hineus]\n", "`train.backbone` = ['hineus'] in"),
+        ("sfm:\n  seed: 1\n".encode("utf-16"), "not UTF-8 text"),
+        (b"sfm: \xff\n", "not UTF-8 text"),
+        (b"sfm: \x00\n", "unacceptable character #x0000"),
+        (b"\x1b[31m", "unacceptable character #x001b"),
+        (b"# " + b"x" * (1 << 18), "more than 262144 bytes"),
+        (b"sfm\n", "holds str where sections were expected"),
+        (b"%YAML 9.9\n--- {}\n", "found incompatible YAML document"),
+    ],
+    ids=lambda each: each[:20] if isinstance(each, bytes) else "",
+)
+def test_files_that_are_no_settings_are_refused(tmp_path: Path, content: bytes, message: str) -> None:
+    file = tmp_path / "mine.yaml"
+    file.write_bytes(content)
+    with pytest.raises(ConfigError) as caught:
+        load_config(file=file)
+    assert message in caught.value.message
+    assert "mine.yaml" in caught.value.message
+
+
+@pytest.mark.parametrize(
+    "content", ["", "\n", "# nothing\n", "---\n", "\ufeffsfm:\n", "{}", "sfm: null\n", "sfm: {}\n"]
+)
+def test_files_that_set_nothing_are_fine(tmp_path: Path, content: str) -> None:
+    file = tmp_path / "mine.yaml"
+    file.write_text(content, encoding="utf-8")
+    assert load_config(file=file) == Config()
+
+
+def test_what_is_no_file_is_not_read(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "round").symlink_to("round")
+    for place, reason in {
+        tmp_path: "it is a folder",
+        tmp_path / "pipe": "no file but a pipe",
+        Path("/dev/zero"): "no file but a pipe",
+        tmp_path / "round": "ymbolic link",
+        tmp_path / ("a" * 300): "File name too long",
+    }.items():
+        with pytest.raises(ConfigError, match=reason):
+            load_config(file=place)
+
+
+@pytest.mark.parametrize("text", ["", "=", "=1", ".=1", "sfm.=1", "sfm", ".".join("a" * 5000) + "=1", "a" * 5000])
+def test_set_without_a_setting_is_refused(text: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        load_config(sets=[text])
+    assert len(caught.value.message) < 1000
+
+
+def test_every_number_has_bounds_and_what_lies_outside_is_refused() -> None:
+    numbers = [setting for setting in describe_settings() if "number" in setting.type]
+    assert len(numbers) > 80
+    for setting in numbers:
+        rules = [rule.split() for rule in setting.bounds.split(", ")]
+        assert [sign[0] for sign, _ in rules] == [">", "<"], setting.key
+        low, high = (float(bound) for _, bound in rules)
+        outside = [low - 1, high + 1, -1e300, 1e300, -(2**63), 2**64, 10**400, "nan", "inf", "-inf", ".inf", ".nan"]
+        outside += [bound for sign, bound in rules if len(sign) == 1]
+        for value in outside:
+            with pytest.raises(ConfigError) as caught:
+                load_config(sets=[f"{setting.key}={value}"])
+            assert f"`{setting.key}` = " in caught.value.message
+            assert setting.bounds in caught.value.message
+
+
+def test_numbers_that_multiply_to_more_memory_than_any_machine_has_are_refused() -> None:
+    sets = ["train.sampling.rays=1000000", "train.sampling.samples=4096", "train.field.sdf_width=4096"]
+    with pytest.raises(ConfigError, match=r"GiB of memory, and 1,024 are the most; lower `train\.sampling\.rays`"):
+        load_config(sets=sets)
+    for preset in preset_names():
+        assert load_config(preset).train.least_bytes() < 8e9
 
 
 # ---------------------------------------------------------------- groups in groups, and names of before
@@ -273,13 +414,13 @@ def test_regions(text: str) -> None:
     [
         ("place.region=ball 1 2 3 4", "it must be auto, 'sphere X Y Z RADIUS' or 'box X0 Y0 Z0 X1 Y1 Z1'"),
         ("place.region=sphere 1 2 3", "'sphere' takes 4 numbers, got 3"),
-        ("place.region=sphere 1 2 3 -1", "the sphere's radius must be positive, not -1"),
+        ("place.region=sphere 1 2 3 -1", "the sphere's radius must be at least 1e-06, not -1"),
         ("place.region=box 0 0 0 1 1 0", "each of the box's X1 Y1 Z1 must be larger"),
         ("place.region=box 0 0 0 1 1 wide", "'box' takes 6 numbers, got '0 0 0 1 1 wide'"),
         ("place.region=sphere 0 0 0 .inf", "'sphere' takes 4 numbers, got"),
         ("place.known_distance=0 0 0 1 0 0", "takes 7 numbers, got 6"),
         ("place.known_distance=0 0 0 0 0 0 2", "the two points must not be the same"),
-        ("place.known_distance=0 0 0 1 0 0 0", "the distance must be positive, not 0 metres"),
+        ("place.known_distance=0 0 0 1 0 0 0", "the distance must be at least 1e-06 metres, not 0"),
     ],
 )
 def test_wrong_regions_and_distances_are_refused(text: str, message: str) -> None:

@@ -20,6 +20,7 @@ def test_a_preset_alone_needs_no_settings(preset):
     [
         ["train.steps=77", "export.formats=[glb, stl]", "place.known_distance=0 0 0 1 0 0 2.5"],
         ["train.backbone=neuralangelo"],
+        ["ingest.leave_out=[größe 😀.jpg, 'it''s']"],
         ["train.backbone=neus2", "train.density.form=laplace", "train.minutes=1.5"],
         [
             "sfm.deterministic=true",
