@@ -10,7 +10,8 @@ import signal
 import sys
 from collections.abc import Sequence
 from contextlib import suppress
-from typing import Annotated, Any
+from pathlib import Path
+from typing import Annotated, Any, NoReturn
 
 import typer
 from typer.core import TyperGroup
@@ -27,9 +28,14 @@ from hineus_cli.commands.status import status
 from hineus_cli.commands.view import view
 from hineus_cli.session import Session, print_json
 from hineus_cli.stopping import GOES_ON, Stopped, stopped_by_signals
+from hineus_cli.streams import flush_output, is_output_error, mend_streams
+from stages.engine.run_log import where_traceback_is
 from stages.engine.stage import Stage
-from stages.errors import HineusError
+from stages.engine.system import requirement_error
+from stages.errors import ConfigError, HineusError, WorkspaceError
 from stages.pipeline import PIPELINE
+
+USAGE_ERROR: Any = typer.BadParameter.__base__  # click's, which newer versions of typer bring with them
 
 
 class HineusGroup(TyperGroup):
@@ -41,16 +47,13 @@ class HineusGroup(TyperGroup):
         session = Session(self.pipeline)
         try:
             with stopped_by_signals():
-                return super().main(*args, obj=session, **extra)
+                sys.exit(super().main(*args, **extra | {"obj": session, "standalone_mode": False}))
         except HineusError as error:
-            _tell(session, type(error).__name__, error.message, error.hint, error.exit_code)
-            sys.exit(error.exit_code)
+            _end(session, type(error).__name__, error)
         except Exception as error:
-            from hineus_cli.console import is_output_error
-
-            told = _no_output(error) if is_output_error(error) else _unexpected(session, error)
-            _tell(session, type(error).__name__, *told, HineusError.exit_code)
-            sys.exit(HineusError.exit_code)
+            if type(error).__name__ == "NoArgsIsHelpError":  # the help is printed by then
+                sys.exit(ConfigError.exit_code)
+            _end(session, type(error).__name__, _in_our_terms(session, error))
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         # Before any option is looked at: what is wrong with one is told as JSON, too.
@@ -58,7 +61,11 @@ class HineusGroup(TyperGroup):
         return super().parse_args(ctx, args)
 
     def invoke(self, ctx: Any) -> Any:
+        from hineus_cli.console import set_up_logging
+
+        set_up_logging()
         try:
+            _refuse_no_folder()
             return super().invoke(ctx)
         except KeyboardInterrupt as interruption:
             stop = interruption if isinstance(interruption, Stopped) else Stopped(signal.SIGINT)
@@ -67,19 +74,34 @@ class HineusGroup(TyperGroup):
             raise typer.Exit(stop.exit_code) from None
 
 
-def _unexpected(session: Session, error: Exception) -> tuple[str, str]:
-    """Message and hint for an error nobody foresaw; its traceback goes to the log, or to stderr before there is one."""
+def _refuse_no_folder() -> None:
+    try:
+        Path.cwd()
+    except OSError:
+        raise WorkspaceError("The folder you are in is no longer there.", "Go to another one with `cd`.") from None
+
+
+def _in_our_terms(session: Session, error: Exception) -> HineusError:
+    """What is told of an error that is none of ours; the traceback of one that nobody foresaw is kept in a file."""
+    if is_output_error(error):
+        flush_output()  # or its end is told once more
+        return _no_output(error)
+    if isinstance(error, USAGE_ERROR):
+        command = error.ctx.command_path if error.ctx else "hineus"
+        return ConfigError(" ".join(error.format_message().split()), f"See `{command} --help`.")
+    if isinstance(error, typer.Abort) and isinstance(error.__cause__, EOFError):  # typer takes it for Ctrl-D
+        error = error.__cause__
+    if lacking := requirement_error(error, "This command"):
+        return lacking
     stage = session.progress.running if session.progress else None
     where = f" in stage {stage}" if stage else ""
-    if session.log_path is not None and session.log_path.exists():
-        hint = f"The full traceback is at the end of {session.log_path}."
-    else:
-        import traceback
+    what = " ".join([f"{type(error).__name__}:", *str(error).split()]).rstrip(":")
+    return HineusError(f"Unexpected error{where}: {what}.", f"{where_traceback_is(error)} Please report it with that.")
 
-        traceback.print_exc()
-        hint = "The traceback is above."
-    text = " ".join(str(error).split())
-    return f"Unexpected error{where}: {type(error).__name__}: {text}", f"{hint} Please report it with that."
+
+def _end(session: Session, kind: str, error: HineusError) -> NoReturn:
+    _tell(session, kind, error.message, error.hint, error.exit_code)
+    sys.exit(error.exit_code)
 
 
 def _tell(session: Session, kind: str, message: str, hint: str, exit_code: int) -> None:
@@ -139,18 +161,20 @@ app = build_app()
 
 def main() -> None:
     """The `hineus` command."""
-    from hineus_cli.console import flush_output, mend_streams, show_error
-
     mend_streams()
+    from hineus_cli.console import show_error, show_no_tracebacks
+
+    show_no_tracebacks()
     try:
         app(prog_name="hineus")
     finally:
         failed = flush_output()
         if failed is not None:
             if failed.errno != errno.EPIPE:  # as with `| head`, where all that was wanted was read
-                show_error(*_no_output(failed))
+                error = _no_output(failed)
+                show_error(error.message, error.hint)
             sys.exit(HineusError.exit_code)
 
 
-def _no_output(error: Exception) -> tuple[str, str]:
-    return f"The output cannot be written: {error}.", "Free some space, or send it elsewhere."
+def _no_output(error: Exception) -> HineusError:
+    return HineusError(f"The output cannot be written: {error}.", "Free some space, or send it elsewhere.")

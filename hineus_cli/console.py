@@ -5,19 +5,18 @@ Only this module configures logging. It is imported inside the commands, since r
 
 from __future__ import annotations
 
-import contextlib
-import errno
-import io
 import logging
-import os
 import sys
+import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import warnings
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from types import TracebackType
 from typing import Any
 
-from rich.console import Console
+from rich.console import Console, ConsoleOptions, RenderableType
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.segment import Segment
 from rich.table import Table
 from rich.text import Text
 
@@ -25,7 +24,7 @@ from stages.engine.run_log import TRACEBACKS, plain
 from stages.engine.runner import Listener, StageOutcome
 from stages.engine.stage import Stage
 from stages.engine.status import StageStatus
-from stages.engine.workspace import DISK_FULL, show_bytes
+from stages.engine.workspace import show_bytes
 
 OURS = ("hineus_cli", "stages", "configs")
 CONSOLE_HANDLER = "hineus-console"
@@ -56,7 +55,17 @@ def _console(stderr: bool) -> Console:
     stream = sys.stderr if stderr else sys.stdout
     width = None if stream.isatty() else PLAIN_WIDTH
     # Texts are printed as they are: `[red]` and `:key:` may be names of files.
-    return Console(stderr=stderr, width=width, highlight=False, soft_wrap=False, markup=False, emoji=False)
+    return _PlainConsole(stderr=stderr, width=width, highlight=False, soft_wrap=False, markup=False, emoji=False)
+
+
+class _PlainConsole(Console):
+    """Shows all text by `plain`, also in tables and beside bars: there is no other way from us to a terminal."""
+
+    def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
+        text = Text(renderable) if isinstance(renderable, str) else renderable
+        if isinstance(text, Text) and plain(text.plain) != text.plain:
+            text = text.blank_copy(plain(text.plain))
+        return super().render(text, options)
 
 
 def _redraws(console: Console) -> bool:
@@ -64,55 +73,9 @@ def _redraws(console: Console) -> bool:
     return console.file.isatty() and not console.is_dumb_terminal
 
 
-@contextlib.contextmanager
-def terminal_may_go() -> Iterator[None]:
-    """What is said inside to a terminal that was closed is said to nobody; a run that was disowned goes on."""
-    try:
-        yield
-    except OSError as error:
-        if error.errno != errno.EIO:
-            raise
-        os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
-
-
-@terminal_may_go()
 def say(text: str, style: str = "", console: Console | None = None) -> None:
     """One line for people, which only the terminal wraps, so that a command in it can be copied."""
-    (console or people()).print(Text(plain(text), style=style), soft_wrap=True)
-
-
-# ---------------------------------------------------------------- streams
-def mend_streams() -> None:
-    """Standard streams that are there and take every text, whatever they were started as.
-
-    One that is closed (`>&-`) becomes the null device; what an encoding does not have (LANG=C, or a file's name that
-    is no UTF-8) is printed as an escape.
-    """
-    for number, name in enumerate(("stdin", "stdout", "stderr")):
-        try:
-            os.fstat(number)
-        except OSError:
-            os.open(os.devnull, os.O_RDWR)  # takes the lowest free number: this one
-        if getattr(sys, name) is None:
-            setattr(sys, name, open(number, "r" if name == "stdin" else "w", closefd=False))  # noqa: SIM115
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")
-
-
-def is_output_error(error: BaseException) -> bool:
-    """Whether it says that stdout takes no more: its disk is full, or nobody reads it any more."""
-    return isinstance(error, OSError) and error.filename is None and error.errno in (*DISK_FULL, errno.EPIPE)
-
-
-def flush_output() -> OSError | None:
-    """Write what is left for stdout; the error, if that fails, and then what is left is forgotten."""
-    try:
-        sys.stdout.flush()
-    except OSError as error:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or Python tries again at its end
-        return error
-    return None
+    (console or people()).print(Text(plain(text, kept="\t"), style=style), soft_wrap=True)
 
 
 # ---------------------------------------------------------------- logging
@@ -126,11 +89,11 @@ class _PeopleHandler(logging.Handler):
             self.handleError(record)
 
 
-def set_up_logging(verbose: bool = False) -> None:
-    """Warnings of everybody and what our stages say go to stderr; `verbose` adds our debug lines."""
+def set_up_logging(level: int = logging.WARNING) -> None:
+    """Warnings of everybody and what our stages say from this level on go to stderr."""
     handler = _PeopleHandler()
     handler.name = CONSOLE_HANDLER
-    handler.setLevel(logging.DEBUG if verbose else logging.INFO)
+    handler.setLevel(level)
     handler.addFilter(lambda record: record.name != TRACEBACKS)
     root = logging.getLogger()
     for old in [old for old in root.handlers if old.name == CONSOLE_HANDLER]:
@@ -141,26 +104,27 @@ def set_up_logging(verbose: bool = False) -> None:
         logging.getLogger(name).setLevel(logging.DEBUG)
 
 
-@contextlib.contextmanager
-def stdout_kept_clean() -> Iterator[None]:
-    """What is printed inside, by Python or by a C library, goes to stderr: stdout is for the JSON that follows."""
-    sys.stdout.flush()
-    saved = os.dup(1)
-    try:
-        os.dup2(2, 1)
-        with contextlib.redirect_stdout(sys.stderr):
-            yield
-    finally:
-        os.dup2(saved, 1)
-        os.close(saved)
+def show_no_tracebacks() -> None:
+    """What Python itself would print goes to the log: of warnings a line, of errors in threads, in objects that end and
+    in logging the traceback for the log file."""
+
+    def told(message: Warning | str, category: type[Warning], filename: str, lineno: int, *_: Any, **__: Any) -> None:
+        logging.getLogger("warnings").warning("%s: %s (%s, line %d)", category.__name__, message, filename, lineno)
+
+    def logged(unraised: Any) -> None:
+        error = (unraised.exc_type, unraised.exc_value, unraised.exc_traceback)
+        logging.getLogger(TRACEBACKS).error("an error that ended nothing", exc_info=error)
+
+    warnings.showwarning = told
+    threading.excepthook = sys.unraisablehook = logged
+    logging.raiseExceptions = False
 
 
 # ---------------------------------------------------------------- errors
-@terminal_may_go()
 def show_error(message: str, hint: str = "") -> None:
     """What happened; then, as the last line, what to do."""
     console = people()
-    console.print(Text.assemble(("Error: ", "bold red"), plain(message)), soft_wrap=True)
+    console.print(Text.assemble(("Error: ", "bold red"), plain(message, kept="\t")), soft_wrap=True)
     if hint:
         say(hint, "cyan", console)
 
@@ -194,7 +158,6 @@ class ProgressDisplay(Listener):
         self._bars.start()
         return self
 
-    @terminal_may_go()
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
@@ -211,21 +174,18 @@ class ProgressDisplay(Listener):
 
         return show
 
-    @terminal_may_go()
     def stage_started(self, stage: Stage, reason: str) -> None:
         self.running = stage.name
         self._printed_at = time.monotonic()
         self._line(f"{stage.name}: {stage.summary or 'running'} ({reason})")
         self._task = self._bars.add_task(stage.name, total=None, note="")
 
-    @terminal_may_go()
     def stage_progress(self, stage: Stage, done: float, total: float, note: str) -> None:
-        self._bars.update(self._task, completed=done, total=total, note=plain(note))
+        self._bars.update(self._task, completed=done, total=total, note=note)
         if self._bars.disable and time.monotonic() - self._printed_at > PLAIN_EVERY_S:
             self._printed_at = time.monotonic()
             self._line(f"{stage.name}: {100 * done / max(total, 1e-9):.0f} % {note}".rstrip())
 
-    @terminal_may_go()
     def stage_finished(self, stage: Stage, outcome: StageOutcome) -> None:
         self.running = None
         if outcome.action == "ran":
@@ -272,11 +232,11 @@ def outcome_table(outcomes: Sequence[StageOutcome], width: int) -> Table:
         add(
             outcome.name,
             outcome.action,
-            Text(plain(outcome.reason)),
+            outcome.reason,
             f"{outcome.wall_s:.1f}",
             f"{outcome.cpu_s:.1f}",
             f"{outcome.peak_rss / GIB:.2f}",
-            Text(plain(key_numbers(outcome.numbers))),
+            key_numbers(outcome.numbers),
             style="dim" if outcome.action == "skipped" else None,
         )
     ran = [outcome for outcome in outcomes if outcome.action == "ran"]
@@ -302,7 +262,7 @@ def status_table(statuses: Sequence[StageStatus], width: int) -> Table:
         cells: list[str | Text] = [
             status.name,
             Text(status.state, style=_STATE_COLOURS[status.state]),
-            Text(plain(status.reason)),
+            status.reason,
         ]
         if made:
             cells += [show_bytes(made.size), f"{made.wall_s:.1f}", f"{made.cpu_s:.1f}", f"{made.peak_rss / GIB:.2f}"]

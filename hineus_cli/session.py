@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
@@ -13,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from hineus_cli.stopping import end_children
+from hineus_cli.streams import stdout_kept_clean
 from stages.engine.stage import Stage
 
 if TYPE_CHECKING:
@@ -29,15 +31,14 @@ class Session:
 
     pipeline: Sequence[Stage]
     json: bool = False
-    log_path: Path | None = None
     progress: ProgressDisplay | None = None
 
     @contextmanager
     def working(self, verbose: bool = False) -> Iterator[None]:
         """For what a command calls: it is logged, and stdout is kept clean for the JSON."""
-        from hineus_cli.console import set_up_logging, stdout_kept_clean
+        from hineus_cli.console import set_up_logging
 
-        set_up_logging(verbose)
+        set_up_logging(logging.DEBUG if verbose else logging.INFO)
         with stdout_kept_clean() if self.json else nullcontext():
             yield
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fcntl
+import json
 import os
 import pty
 import re
@@ -12,6 +13,7 @@ import subprocess
 import sys
 import termios
 import time
+import unicodedata
 from pathlib import Path
 
 import pytest
@@ -55,7 +57,7 @@ def folder(tmp_path: Path) -> Path:
 
 def environment(changes: dict[str, str]) -> dict[str, str]:
     given = {**os.environ, "PYTHONPATH": str(REPOSITORY), "TERM": "xterm-256color", **changes}
-    for name in ("NO_COLOR", "FORCE_COLOR", "COLUMNS"):
+    for name in ("NO_COLOR", "FORCE_COLOR", "COLUMNS", "LINES"):
         if name not in changes:
             given.pop(name, None)
     return given
@@ -103,6 +105,59 @@ def test_names_are_printed_as_they_are_on_a_terminal(folder: Path, columns: int)
     assert max(map(len, shown)) <= columns
     assert any("undistort" in line and "not made" in line for line in shown)
     assert came.rstrip().endswith("(to see it: `hineus view photos_hineus`)")
+
+
+NASTY = (
+    "\x1b]0;pwned\x07",
+    "\x1b[2J",
+    "\x1b]8;;http://x\x1b\\",
+    "\x9b31m",
+    "\x7f\b\r",
+    "\u202egpj.exe",
+    "\u2066\u2069\u200f\u061c",
+    "\u2028\u2029\x85",
+    "\udcff\udc9b",
+    "\U000e0041",
+    "\ufeff\u200b",
+    "[/]",
+    "[red]",
+    "[link=x]",
+    ":key:",
+    "a\nError: forged",
+)
+FORBIDDEN = {"Cc", "Cf", "Cs", "Zl", "Zp"}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "command",
+    [
+        "check photos", "check photos --json", "run photos; status photos_hineus", "status NAME", "run NAME",
+        "run photos -w NAME", "run photos -w photos/NAME", "run photos --masks NAME", "run photos --poses NAME",
+        "run photos --json; status photos_hineus --json", "run photos --control NAME", "run photos --preset NAME", "run photos --until NAME", "run photos --force NAME",
+        "run photos --from NAME", "run photos --device NAME", "run photos --time NAME", "run photos --hold-out NAME",
+        "run photos --workers NAME", "run photos --NAME", "NAME", "config --config NAME", "config --set NAME",
+        "config --set sfm.seed=NAME", "config --set NAME=1", "config --set train.backbone=NAME", "config --preset NAME",
+        "config --config holding.yaml", "view NAME", "view . --port NAME", "export-colmap NAME out",
+        "evaluate mesh NAME NAME", "evaluate NAME", "compare NAME NAME", "doctor --folder NAME", "bench NAME .",
+        "bench dtu NAME", "bench dtu . --peer NAME",
+    ],
+)  # fmt: skip
+def test_no_command_sends_a_terminal_what_it_obeys(folder: Path, command: str) -> None:
+    name = "".join(NASTY)
+    for part in NASTY:
+        (folder / f"photos/{part.replace('/', '')}.jpg").write_text("c")
+    (folder / "holding.yaml").write_text(f"sfm:\n  matcher: {json.dumps(name)}\n")
+    text = ""
+    for part in command.split("; "):
+        text += on_terminal(folder, 80, *(word.replace("NAME", name) for word in part.split()), TERM="dumb")[1]
+    text = text.replace("\r\n", "\n")
+    if (log := folder / "photos_hineus/hineus.log").exists():
+        text += log.read_text()
+    assert {c for c in text if unicodedata.category(c) in FORBIDDEN} <= {"\n"}, text
+    assert not any(line.startswith("Error: forged") for line in text.splitlines())
+    assert "Traceback" not in text
+    assert "Unexpected error" not in text
 
 
 @pytest.mark.slow
@@ -181,7 +236,7 @@ def test_a_run_that_nobody_reads_any_more_says_so_in_its_log(folder: Path) -> No
 def test_output_that_cannot_be_written_is_told(folder: Path, command: str) -> None:
     done = in_shell(folder, f"HINEUS {command} > /dev/full")
     assert done.returncode == 1
-    assert b"Error: The output cannot be written: [Errno 28] No space left on device." in done.stderr
+    assert done.stderr.count(b"Error: The output cannot be written: [Errno 28] No space left on device.") == 1
     assert b"Traceback" not in done.stderr
 
 
@@ -190,8 +245,61 @@ def test_output_that_cannot_be_written_is_told(folder: Path, command: str) -> No
 def test_closed_streams_stop_nothing(folder: Path, closed: str) -> None:
     for options in ("", "--json"):
         done = in_shell(folder, f"HINEUS run photos --until ingest {options} {closed}")
-        assert done.returncode == 0, done.stderr
-    assert (folder / "photos_hineus/ingest/letters.txt").is_file()
+        lost = options and re.search(r"(^| )>&-", closed)
+        assert done.returncode == (1 if lost else 0), done.stderr
+        assert (folder / "photos_hineus/ingest/letters.txt").is_file()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("closed", [">&-", ">&- 2>&-", "<&- >&- 2>&-"])
+@pytest.mark.parametrize("command", ["config", "presets", "config --describe", "check photos --json", "--version"])
+def test_what_is_asked_for_and_cannot_be_printed_is_an_error(folder: Path, command: str, closed: str) -> None:
+    done = in_shell(folder, f"HINEUS {command} {closed}")
+    assert done.returncode == 1
+    assert b"Traceback" not in done.stderr
+    told = done.stderr.count(b"Error: The output cannot be written: [Errno 9] Bad file descriptor.")
+    assert told == ("2>&-" not in closed)
+
+
+@pytest.mark.slow
+def test_closed_streams_are_no_file_s_numbers(folder: Path) -> None:
+    """What a library prints to number 1 or 2 must not land in a file that was opened since."""
+    (folder / "prints.py").write_text(
+        "import os\n"
+        "from hineus_cli.streams import mend_streams\n"
+        "mend_streams()\n"
+        "with open('kept.txt', 'w') as file:\n"
+        "    for number in (1, 2):\n"
+        "        os.write(number, b'noise')\n"
+        "    os.system('echo noise; echo noise >&2')\n"
+        "    file.write(str(file.fileno() > 2))\n"
+    )
+    subprocess.run(
+        ["bash", "-c", f"{sys.executable} prints.py <&- >&- 2>&-"], cwd=folder, env=environment({}), check=True
+    )
+    assert (folder / "kept.txt").read_text() == "True"
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+@pytest.mark.parametrize("options", ["", "--json"])
+def test_a_run_goes_on_where_only_its_progress_cannot_be_shown(folder: Path, options: str) -> None:
+    done = in_shell(folder, f"HINEUS run photos {options} 2> /dev/full")
+    assert done.returncode == 0
+    assert (folder / "photos_hineus/export/model.glb").is_file()
+    assert bool(done.stdout) == bool(options)
+    assert in_shell(folder, "HINEUS run nowhere 2> /dev/full").returncode == 3
+    assert in_shell(folder, "HINEUS config > /dev/full 2> /dev/full").returncode == 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("size", ["1", "0", "-3", "junk", "", "²", "9999", "99999999999"])
+def test_any_size_of_a_terminal_is_fine(folder: Path, size: str) -> None:
+    sizes = {"COLUMNS": size, "LINES": size, "TERMINAL_WIDTH": size}
+    for command in ("--help", "run --help", "presets", "run photos", "status photos_hineus", "run nowhere"):
+        code, came = on_terminal(folder, 80, *command.split(), **sizes)
+        assert code == (3 if "nowhere" in command else 0), came
+        assert "Traceback" not in came
 
 
 @pytest.mark.slow
@@ -243,3 +351,7 @@ def test_paths_as_arguments(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
 
 def test_control_characters_are_shown() -> None:
     assert plain("a\x1b[31mb\x9b\x7f\r\ttab\nline ü") == "a\\x1b[31mb\\x9b\\x7f\\x0d\ttab\nline ü"
+    assert plain("\u202egpj\u2028\udcff\U000e0041", kept="") == "\\u202egpj\\u2028\\udcff\\U000e0041"
+    assert plain("line\nline", kept="") == "line\\x0aline"
+    for name in ("Größe", "日本語　写真", "a\xa0b", "👩\u200d🚀", "क्\u200dष", "[red]"):
+        assert plain(name) == name

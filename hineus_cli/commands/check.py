@@ -71,18 +71,18 @@ def check(
     from rich.table import Table
     from rich.text import Text
 
-    from hineus_cli.console import plain, product
+    from hineus_cli.console import product
     from stages.preflight import facts
 
     table = Table.grid(padding=(0, 2))
     for what, found in facts(done):
-        table.add_row(Text(what, style="bold"), Text(plain(found)))
+        table.add_row(Text(what, style="bold"), found)
     for what, style, lines in (
         ("warning", "yellow", done.warnings),
         ("no-go", "red", (*done.refusals, *done.shortages)),
     ):
         for line in lines:
-            table.add_row(Text(what, style=style), Text(plain(line)))
-    table.add_row(Text("verdict", style="bold"), Text(done.verdict))
+            table.add_row(Text(what, style=style), line)
+    table.add_row(Text("verdict", style="bold"), done.verdict)
     product().print(table)
     raise typer.Exit(exit_code)

@@ -24,10 +24,9 @@ def demo(
     verbose: Verbose = False,
 ) -> None:
     """Make photos of a known object, reconstruct it, and score the result against the truth."""
-    from stages.scenes.demo import WORKSPACE, run_demo
+    from stages.scenes.demo import run_demo
 
     session: Session = context.obj
-    session.log_path = folder.absolute() / WORKSPACE / "hineus.log"
     with session.running(verbose) as progress:
         made = run_demo(folder, preset, device, workers, session.pipeline, progress, progress.bar("photos"))
     _show(made)

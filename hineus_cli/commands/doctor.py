@@ -38,7 +38,7 @@ def doctor(
         table.add_column(heading, overflow="fold")
     for finding in findings:
         state = Text(finding.state, style=COLOURS[finding.state])
-        table.add_row(finding.what, state, Text(finding.found), Text(finding.advice))
+        table.add_row(finding.what, state, finding.found, finding.advice)
     product().print(table)
     if lacking:
         names = ", ".join(finding.what for finding in lacking)

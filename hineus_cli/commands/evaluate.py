@@ -260,7 +260,7 @@ def _show_numbers(found: dict[str, Any]) -> None:
 
 
 def _show_views(found: dict[str, Any]) -> None:
-    from hineus_cli.console import plain, product, table_of
+    from hineus_cli.console import product, table_of
 
     rows = [*found["photos"], {"name": "mean", **found["mean"]}]
     columns = [
@@ -272,7 +272,7 @@ def _show_views(found: dict[str, Any]) -> None:
     ]
     table = table_of("photo", *(" ".join(column) for column in columns))
     for row in rows:
-        table.add_row(plain(row["name"]), *(_cell(row[what][region], key) for what, region, key in columns))
+        table.add_row(row["name"], *(_cell(row[what][region], key) for what, region, key in columns))
     product().print(table)
 
 

@@ -61,9 +61,8 @@ def stage_command(stage: Stage) -> Callable[..., None]:
 
 
 def _run(session: Session, request: Request, verbose: bool) -> None:
-    from stages.reconstruct import choose_folder, reconstruct
+    from stages.reconstruct import reconstruct
 
-    session.log_path = choose_folder(request).absolute() / "hineus.log"
     with session.running(verbose) as progress:
         result = reconstruct(request, session.pipeline, progress)
     _show(result)

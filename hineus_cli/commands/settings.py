@@ -17,7 +17,6 @@ def show_config(
 ) -> None:
     """Print the settings as they would be used, as YAML that `--config` takes; or describe them all."""
     from rich.table import Table
-    from rich.text import Text
 
     from configs.load import config_yaml, describe_settings, load_config, show_value
     from hineus_cli.console import product
@@ -31,7 +30,7 @@ def show_config(
     table.add_column("meaning", overflow="fold")
     for setting in describe_settings():
         values = f"{setting.type}, {setting.bounds}" if setting.bounds else setting.type
-        table.add_row(setting.key, show_value(setting.default), Text(f"{setting.description} ({values})"))
+        table.add_row(setting.key, show_value(setting.default), f"{setting.description} ({values})")
     product().print(table)
 
 

@@ -4,19 +4,48 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import tempfile
+import traceback
+import unicodedata
 from collections.abc import Iterator
 from pathlib import Path
 
 TRACEBACKS = "stages.tracebacks"  # the logger whose records go to the log file only
+TRACEBACK_IS = "The full traceback is"
+
+SHOWN = {"Cc", "Cf", "Cs", "Zl", "Zp"}  # categories of characters that are no text but act on it
+JOINERS = "\u200c\u200d"  # parts of words in some scripts, and of emoji
 
 
-# File names may hold what a terminal obeys: it is shown, not sent.
-_CONTROLS = {code: f"\\x{code:02x}" for code in (*range(0x20), *range(0x7F, 0xA0)) if chr(code) not in "\n\t"}
+def plain(text: str, kept: str = "\n\t") -> str:
+    """A text as it may be printed: what a terminal obeys, or reorders text by, is shown as `\\x1b` and not sent.
+
+    Names of files may hold such characters, and what is printed may hold names. Control characters but those of `kept`
+    are among them, marks of direction and other invisible ones, and bytes that are no UTF-8.
+    """
+    if text.isprintable():
+        return text
+    return "".join(c if c in kept or c in JOINERS or unicodedata.category(c) not in SHOWN else _shown(c) for c in text)
 
 
-def plain(text: str) -> str:
-    """A text as it may be printed: control characters, which a file's name may hold, as `\\x1b`."""
-    return text.translate(_CONTROLS)
+def _shown(character: str) -> str:
+    code = ord(character)
+    return f"\\x{code:02x}" if code < 0x100 else f"\\u{code:04x}" if code < 0x10000 else f"\\U{code:08x}"
+
+
+def where_traceback_is(error: Exception) -> str:
+    """A sentence: the log file of a run that the error ended, or else a new file among the temporary ones."""
+    for note in getattr(error, "__notes__", ()):
+        if note.startswith(TRACEBACK_IS):
+            return str(note)
+    try:
+        with tempfile.NamedTemporaryFile(
+            "w", prefix="hineus-", suffix=".log", delete=False, encoding="utf-8", errors="backslashreplace"
+        ) as file:
+            file.write(plain("".join(traceback.format_exception(error))))
+    except OSError:
+        return "Its traceback could not be written."
+    return f"{TRACEBACK_IS} in {file.name}."
 
 
 class _LogFile(logging.FileHandler):
@@ -44,8 +73,9 @@ def log_to_file(path: Path) -> Iterator[None]:
     except SystemExit:  # the console's answer to a pipe that is closed, as by `| head`
         logging.getLogger(TRACEBACKS).warning("stopped, since nobody reads what is printed any more")
         raise
-    except Exception:
+    except Exception as error:
         logging.getLogger(TRACEBACKS).error("the run failed", exc_info=True)
+        error.add_note(f"{TRACEBACK_IS} at the end of {path}.")
         raise
     finally:
         root.removeHandler(handler)

@@ -223,7 +223,7 @@ def _call(
             # The last publication is the best guess at how much this one needs.
             needed = max(status.manifest.size - written if status.manifest else 0, written, 1)
             raise disk_full_error(workspace.root, f"running '{stage.name}'", error, needed) from error
-        if wanted := requirement_error(error, stage.name):
+        if wanted := requirement_error(error, f"Stage {stage.name}"):
             raise wanted from error
         raise
 

@@ -49,25 +49,28 @@ def apt_line(libraries: list[str]) -> str:
     return "apt-get install -y " + " ".join(SYSTEM_LIBRARIES.get(name, name) for name in libraries)
 
 
-def requirement_error(error: BaseException, stage: str) -> SystemRequirementError | None:
-    """`error` in the user's terms, if it says that something is missing on this machine; None otherwise."""
+def requirement_error(error: BaseException, who: str) -> SystemRequirementError | None:
+    """`error` in the user's terms, if it says that something is missing on this machine; None otherwise.
+
+    `who` met it: "Stage sfm".
+    """
     found = _MISSING_LIBRARY.search(str(error)) if isinstance(error, (ImportError, OSError)) else None
     if found:
         library = found[1]
         absent = sorted({*missing_libraries(), library}, key=[*SYSTEM_LIBRARIES, library].index)
         return SystemRequirementError(
-            f"Stage {stage} needs the system library {library}, which is not installed.",
+            f"{who} needs the system library {library}, which is not installed.",
             f"Run `{apt_line(absent)}`, then `hineus doctor`.",
         )
     if isinstance(error, ModuleNotFoundError) and error.name:
         package = error.name.partition(".")[0]
         return SystemRequirementError(
-            f"Stage {stage} needs the Python package {package}, which is not installed.",
+            f"{who} needs the Python package {package}, which is not installed.",
             "Run `pip install hineus` again in this environment, then `hineus doctor`.",
         )
     if isinstance(error, MemoryError):
         return SystemRequirementError(
-            f"Stage {stage} ran out of memory: {str(error) or 'an allocation failed'}.",
+            f"{who} ran out of memory: {str(error) or 'an allocation failed'}.",
             "Close other programs, or choose a smaller preset with `--preset tiny`.",
         )
     return None
