@@ -134,8 +134,8 @@ FORBIDDEN = {"Cc", "Cf", "Cs", "Zl", "Zp"}
     [
         "check photos", "check photos --json", "run photos; status photos_hineus", "status NAME", "run NAME",
         "run photos -w NAME", "run photos -w photos/NAME", "run photos --masks NAME", "run photos --poses NAME",
-        "run photos --json; status photos_hineus --json", "run photos --control NAME", "run photos --preset NAME", "run photos --until NAME", "run photos --force NAME",
-        "run photos --from NAME", "run photos --device NAME", "run photos --time NAME", "run photos --hold-out NAME",
+        "run photos --json; status photos_hineus --json", "run photos --control NAME", "run photos --preset NAME",
+        "run photos --until NAME", "run photos --force NAME", "run photos --from NAME", "run photos --device NAME", "run photos --time NAME", "run photos --hold-out NAME",
         "run photos --workers NAME", "run photos --NAME", "NAME", "config --config NAME", "config --set NAME",
         "config --set sfm.seed=NAME", "config --set NAME=1", "config --set train.backbone=NAME", "config --preset NAME",
         "config --config holding.yaml", "view NAME", "view . --port NAME", "export-colmap NAME out",

@@ -52,7 +52,7 @@ class _LogFile(logging.FileHandler):
     """A log that cannot be written (the disk is full) is no reason to hide the error that says so."""
 
     def format(self, record: logging.LogRecord) -> str:
-        return plain(super().format(record))
+        return plain(super().format(record)).replace("\n", "\n    ")  # what starts a line is ours
 
     def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802 - the name is logging's
         """Go on without this record."""
