@@ -11,12 +11,15 @@ def main() -> None:
     """The `hineus` command."""
     if other := shadowed(Path(__file__).parents[1]):
         sys.exit(
-            f"Error: {other} is found instead of our part of the same name.\n"
+            f"Error: {other!r} is found instead of our part of the same name.\n"
             "Leave that folder or PYTHONPATH, or install in an environment of its own: `uv tool install hineus`."
         )
-    from hineus_cli.app import main as run
+    try:
+        from hineus_cli.app import main as run
 
-    run()
+        run()
+    except KeyboardInterrupt:  # before the commands, which say more, can take it
+        sys.exit(130)
 
 
 def shadowed(home: Path) -> str | None:

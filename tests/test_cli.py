@@ -8,6 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 from rich.console import Console
@@ -273,6 +274,65 @@ def test_unforeseen_error_is_short_and_its_traceback_is_in_the_log(folder: Path)
     assert "Traceback" not in result.stderr
     assert "Traceback (most recent call last)" in log.read_text()
     assert hineus("run", "photos").exit_code == 0
+
+
+UNFORESEEN = [
+    (
+        ZeroDivisionError("one\nover \x1b[31mnothing"),
+        1,
+        "Unexpected error{}: ZeroDivisionError: one over \\x1b[31mnothing.",
+    ),
+    (RecursionError(), 1, "Unexpected error{}: RecursionError."),
+    (AssertionError(), 1, "Unexpected error{}: AssertionError."),
+    (KeyError("\udcff\u202e"), 1, "Unexpected error{}: KeyError: '\\udcff\\u202e'."),
+    (EOFError("too short"), 1, "Unexpected error{}: EOFError: too short."),
+    (OSError(5, "Input/output error"), 1, "Unexpected error{}: OSError: [Errno 5] Input/output error."),
+    (UnicodeDecodeError("utf-8", b"\xff", 0, 1, "no"), 1, "Unexpected error{}: UnicodeDecodeError: 'utf-8' codec"),
+    (MemoryError(), 6, "ran out of memory: an allocation failed."),
+    (ModuleNotFoundError("No module named 'laspy'", name="laspy"), 6, "needs the Python package laspy"),
+]
+
+
+@pytest.mark.parametrize(("error", "exit_code", "sentence"), UNFORESEEN, ids=lambda each: type(each).__name__)
+@pytest.mark.parametrize("in_stage", [False, True])
+def test_no_error_shows_a_traceback(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, error: Exception, exit_code: int, sentence: str, in_stage: bool
+) -> None:
+    hineus("run", "photos")  # a log file of an earlier run tells nothing of this one
+    monkeypatch.setattr("tempfile.tempdir", str(folder))
+    if in_stage:
+        result = hineus(
+            "run", "photos", "--json", "--force", "sfm", pipeline=with_stage("sfm", run=failing(lambda: error))
+        )
+    else:
+        monkeypatch.setattr("stages.engine.workspace.Workspace.open", Mock(side_effect=error))
+        result = hineus("status", "photos_hineus", "--json")
+    assert result.exit_code == exit_code
+    assert sentence.format(" in stage sfm" if in_stage else "") in result.stderr
+    assert "Traceback" not in result.stdout + result.stderr
+    assert json.loads(result.stdout)["error"]["exit_code"] == exit_code
+    kept = list(folder.glob("hineus-*.log"))
+    assert len(kept) == (not in_stage and exit_code == 1)
+    for file in kept:
+        assert f"The full traceback is in {file}. Please report it" in result.stderr
+        assert file.read_text().startswith("Traceback (most recent call last)")
+
+
+def test_usage_errors_are_json_too(folder: Path) -> None:
+    result = hineus("run", "--json", "--bogus")
+    assert json.loads(result.stdout)["error"]["message"].startswith("No such option: --bogus")
+    assert result.exit_code == 2
+    assert result.stderr.startswith("Error: No such option: --bogus")
+    assert "--help`" in result.stderr.splitlines()[1]
+
+
+def test_a_folder_that_is_gone_is_told(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (folder / "gone").mkdir()
+    monkeypatch.chdir(folder / "gone")
+    (folder / "gone").rmdir()
+    for command in (["run"], ["status"], ["config"], ["run", "photos"]):
+        result = hineus(*command)
+        assert (result.exit_code, "no longer there" in result.stderr) == (5, True)
 
 
 def test_interruption_is_told(folder: Path) -> None:
