@@ -134,7 +134,7 @@ Until = Annotated[
     str | None, typer.Option(help="Stop after this stage.", show_default=False, autocompletion=stage_names)
 ]
 Device = Annotated[str, typer.Option(help="auto, cpu or cuda.", autocompletion=devices)]
-Workers = Annotated[int | None, typer.Option(min=1, help="CPU threads; default: all.", show_default=False)]
+Workers = Annotated[int | None, typer.Option(min=1, max=1024, help="CPU threads; default: all.", show_default=False)]
 Time = Annotated[
     float | None,
     typer.Option(

@@ -233,6 +233,11 @@ def test_wrong_times_are_refused(text: str) -> None:
         (["run", "photos", "--device", "tpu"], 2, ["There is no device 'tpu'"]),
         (["run", "photos", "--device", "cuda"], 6, ["No CUDA device can be used here.", "hineus doctor"]),
         (["run", "photos", "--bogus"], 2, ["No such option: --bogus"]),
+        (["run", "photos", "--workers", "0"], 2, ["--workers"]),
+        (["run", "photos", "--workers", "1000000000"], 2, ["--workers"]),
+        (["run", "photos", "--time", "1e300"], 2, ["`train.minutes` = 1e+300", "<= 1000000"]),
+        (["evaluate", "mesh", "a.ply", "b.ply", "--seed", "-1"], 2, ["--seed"]),
+        (["bench", "dtu", ".", "--seeds", "1000000000"], 2, ["--seeds"]),
         (["status", "nowhere"], 5, ["There is no workspace at", "hineus run PHOTOS"]),
     ],
 )

@@ -30,7 +30,7 @@ def bench(
     ] = None,
     preset: Preset = None,
     sets: Sets = None,
-    seeds: Annotated[int, typer.Option(min=1, help="Runs of each scene, with seeds 0, 1, ...")] = 1,
+    seeds: Annotated[int, typer.Option(min=1, max=1000, help="Runs of each scene, with seeds 0, 1, ...")] = 1,
     until: Until = None,
     hold_out: Annotated[int | None, hold_out_option("from every stage as a test, where the suite names none")] = None,
     masks: Annotated[bool, typer.Option("--masks", help="Use the masks that come with the photos.")] = False,

@@ -36,7 +36,7 @@ Matrix = Annotated[
     Path | None,
     typer.Option(help="Text file of 4 x 4 numbers that takes what is judged to the truth's frame.", show_default=False),
 ]
-Seed = Annotated[int, typer.Option(help="Of the random numbers that choose points.")]
+Seed = Annotated[int, typer.Option(min=0, max=2**31 - 1, help="Of the random numbers that choose points.")]
 DistanceMap = Annotated[
     Path | None,
     typer.Option("--map", help="Write what is judged, coloured by its distance to the truth, as PLY.",
