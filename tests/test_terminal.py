@@ -29,15 +29,30 @@ REPOSITORY = Path(__file__).parents[1]
 ODD = ("[red]Größe :key:.jpg", "\x1b]0;pwned\x07.jpg", "\udcff.jpg")
 
 PROGRAM = f"""
-import sys
+import logging, sys, threading, warnings
 sys.path.insert(0, {str(Path(__file__).parent)!r})
 from toy_pipeline import TOY, with_stage
 import hineus_cli.app
 
 def notes(context):
     for index, path in enumerate(sorted(context.sources["photos"].rglob("*"))):
-        context.progress(index, 9, str(path.relative_to(context.sources["photos"])))
+        name = str(path.relative_to(context.sources["photos"]))
+        context.progress(index, 9, name)
+        warnings.warn(name)
+        logging.getLogger("library").warning("%s", name)
+        failing = threading.Thread(target=fail, args=(name,))
+        failing.start()
+        failing.join()
+        Failing.name = name
+        Failing()
     return TOY[0].run(context)
+
+def fail(name):
+    raise ValueError(name)
+
+class Failing:
+    def __del__(self):
+        fail(self.name)
 
 hineus_cli.app.app = hineus_cli.app.build_app(with_stage("ingest", run=notes))
 hineus_cli.app.main()
