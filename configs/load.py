@@ -213,7 +213,7 @@ class _Loader(yaml.SafeLoader):
         for key, _ in node.value:
             name = self.construct_object(key, deep=True)
             if not isinstance(name, str) or not name or "." in name:
-                raise _refused(f"{shown(name)} is no name of a setting or section", key)
+                raise _refused(f"{_shown(name)} is no name of a setting or section", key)
             if name in names:
                 raise _refused(f"`{name}` is there twice", key)
             names.add(name)
@@ -306,7 +306,7 @@ def _set(text: str) -> str:
     return f"--set {_short(text)}"
 
 
-def shown(value: Any) -> str:
+def _shown(value: Any) -> str:
     """A value as it is written in a refusal: not all of a long one."""
     return _short(repr(value))
 
@@ -338,7 +338,7 @@ def _checked(
             checked[str(key)] = _checked(value, origin, section, f"{dotted}.")
         elif value is not None:  # a section with all its lines commented out is fine
             raise ConfigError(
-                f"`{dotted}` in {origin} is a section of settings, not a value ({shown(value)}).",
+                f"`{dotted}` in {origin} is a section of settings, not a value ({_shown(value)}).",
                 f"Set one of its keys, for example `{next(_fields(section, f'{dotted}.'))[0]}`.",
             )
     return checked
@@ -374,7 +374,7 @@ def _refusal(error: ValidationError, origins: Mapping[str, str]) -> ConfigError:
     if field is None:
         said = str(detail["ctx"]["error"]) if detail["type"] == "value_error" else detail["msg"]
         return ConfigError(f"{said} (in {origin}).", "`hineus config --describe` lists all settings.")
-    found = f"`{key}` = {shown(detail['input'])} in {origin}"
+    found = f"`{key}` = {_shown(detail['input'])} in {origin}"
     if detail["type"] == "value_error":  # the schema's own checks say what is wrong
         return ConfigError(f"{found}: {_short(str(detail['ctx']['error']))}.", _about(key))
     bounds = _bounds(field)
