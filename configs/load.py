@@ -251,22 +251,13 @@ def _problem(error: yaml.YAMLError) -> str:
 
 
 def _read(file: Path) -> str:
-    def refusal(reason: str | None) -> ConfigError:
-        return ConfigError(f"The settings file {file} cannot be read: {reason}.", "Check the path.")
+    from stages.inputs.bounded import reason  # they import numpy, which takes its time
+    from stages.inputs.texts import read_text
 
     try:
-        # What is no file may have no end, or wait for somebody who writes into it.
-        if file.exists() and not file.is_file():
-            raise refusal("it is a folder" if file.is_dir() else "it is no file but a pipe, a socket or a device")
-        with file.open("rb") as stream:
-            content = stream.read(MOST_BYTES + 1)
-        if len(content) > MOST_BYTES:
-            raise refusal(f"it has more than {MOST_BYTES} bytes, so it is none of settings")
-        return content.decode("utf-8-sig")  # editors of Windows write a byte-order mark
-    except OSError as error:
-        raise refusal(error.strerror) from error
-    except UnicodeDecodeError as error:
-        raise refusal("not UTF-8 text") from error
+        return read_text(file, MOST_BYTES)
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"The settings file {file} cannot be read: {reason(error)}.", "Check the path.") from error
 
 
 def _parse(text: str, origin: str) -> dict[str, Any]:

@@ -223,11 +223,12 @@ def test_values_that_are_none_are_refused_in_a_short_sentence(tmp_path: Path, va
         (b"null: 1\n", "None is no name"),
         (b"train:\n  backbone: " + b"a" * 3000, "`train.backbone` = 'aaa"),
         (b"train:\n  backbone: [hineus]\n", "`train.backbone` = ['hineus'] in"),
-        ("sfm:\n  seed: 1\n".encode("utf-16"), "not UTF-8 text"),
-        (b"sfm: \xff\n", "not UTF-8 text"),
+        ("sfm:\n  seed: 1\n".encode("utf-16")[:-1], "truncated data"),
+        ("sfm:\n  seed: 1\n".encode("utf-16-be"), "unacceptable character #x0000"),
+        (b"sfm: \xff\n", "unacceptable character #xdcff"),
         (b"sfm: \x00\n", "unacceptable character #x0000"),
         (b"\x1b[31m", "unacceptable character #x001b"),
-        (b"# " + b"x" * (1 << 18), "more than 262144 bytes"),
+        (b"# " + b"x" * (1 << 18), "at most 262144 are read"),
         (b"sfm\n", "holds str where sections were expected"),
         (b"%YAML 9.9\n--- {}\n", "found incompatible YAML document"),
     ],
@@ -251,13 +252,20 @@ def test_files_that_set_nothing_are_fine(tmp_path: Path, content: str) -> None:
     assert load_config(file=file) == Config()
 
 
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
+def test_files_as_programs_of_windows_write_them(tmp_path: Path, encoding: str) -> None:
+    file = tmp_path / "mine.yaml"
+    file.write_bytes("sfm:\r\n  seed: 3\r\n".encode(encoding))
+    assert load_config(file=file).sfm.seed == 3
+
+
 def test_what_is_no_file_is_not_read(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "round").symlink_to("round")
     for place, reason in {
-        tmp_path: "it is a folder",
-        tmp_path / "pipe": "no file but a pipe",
-        Path("/dev/zero"): "no file but a pipe",
+        tmp_path: "no file but a folder",
+        tmp_path / "pipe": "no file but a folder, a pipe",
+        Path("/dev/zero"): "no file but a folder, a pipe",
         tmp_path / "round": "ymbolic link",
         tmp_path / ("a" * 300): "File name too long",
     }.items():

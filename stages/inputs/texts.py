@@ -15,16 +15,16 @@ ENCODINGS = {codecs.BOM_UTF8: "utf-8-sig", codecs.BOM_UTF16_LE: "utf-16", codecs
 LONGEST_NUMBER = 40  # digits of a whole number; what is longer is taken as decimal, and mostly too large
 
 
-def read_text(file: Path) -> str:
+def read_text(file: Path, most: int = MOST_TEXT) -> str:
     """The text of a file, without a byte-order mark and with "\\n" at the end of lines.
 
     Bytes that are not UTF-8 become lone surrogates, as in the names of files (see `readable`).
 
     Raises:
         OSError: it cannot be read.
-        ValueError: it is no file or too large, or its byte-order mark says UTF-16, which it is not.
+        ValueError: it is no file or larger than `most` bytes, or its byte-order mark says UTF-16, which it is not.
     """
-    data = read_bytes(file, MOST_TEXT)
+    data = read_bytes(file, most)
     encoding = next((name for mark, name in ENCODINGS.items() if data.startswith(mark)), "utf-8")
     errors = "strict" if encoding == "utf-16" else "surrogateescape"
     return data.decode(encoding, errors).replace("\r\n", "\n")
