@@ -22,7 +22,10 @@ from stages.compiling import njit, prange, prefetch_row, uint32
 PRIME_Y, PRIME_Z = np.uint32(2654435761), np.uint32(805459861)
 CHUNK = 512  # points whose rows, features and Jacobian stay in a core's L2 cache
 AHEAD = 32  # points whose rows are on their way: 16 to 128 do, and 0 takes 2.7 times as long
-_OPTIONS = dict(cache=True, fastmath=True, nogil=True, error_model="numpy", boundscheck=False)
+# No `fastmath`. The process that compiles a kernel runs another copy of it than those that find it in the cache, and
+# with leave to reorder sums LLVM rounds in the two differently: the first training would not be the second. It would
+# save one or two parts in a hundred of a step.
+_OPTIONS = dict(cache=True, nogil=True, error_model="numpy", boundscheck=False)
 
 
 @njit(inline="always")
