@@ -275,7 +275,7 @@ def test_rough_poses_stay_rough_while_others_are_placed_beside_them(
 ) -> None:
     artifacts.REGISTRATION.save(tmp_path, artifacts.Registration(relaxed=before))
     context = StageContext({}, {}, tmp_path, tmp_path, SfmParams(), previous=tmp_path)
-    assert _is_relaxed(context, Step(rung, 3, 9, 1.0, 0.0, kept=True)) is relaxed
+    assert _is_relaxed(context, Step(rung, 3, 9, 1.0, kept=True)) is relaxed
 
 
 @pytest.mark.parametrize("base", [Base(), Base(affine=True), Base(masked=True, focal_priors=False), Base(corners=True)])

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
+import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -45,6 +47,18 @@ from stages.neural.training_photos import Photos
 from stages.surface import border
 from stages.surface.border import BorderCut, region_without_cut
 from stages.surface.triangle_mesh import vertex_normals
+
+A_FEW_STEPS = """
+import hashlib
+import torch
+from ball_training import make_trainer
+torch.set_num_threads(1)
+trainer = make_trainer()
+for i in range(3):
+    trainer.step(i / 3)
+for name, value in trainer.fields.state_dict().items():
+    print(name, hashlib.sha256(value.numpy().tobytes()).hexdigest())
+"""
 
 
 @pytest.mark.parametrize("share", [0.0, 1.0], ids=["evenly", "by need"])
@@ -265,6 +279,24 @@ def assert_same_training(one: StageContext, other: StageContext) -> None:
     fields = [load_field(artifacts.FIELD.load(c.out)) for c in (one, other)]
     points = np.random.default_rng(0).uniform(-1, 1, (50, 3))
     assert np.array_equal(fields[0].sdf(points), fields[1].sdf(points))
+
+
+@pytest.mark.slow
+def test_kernels_compiled_just_now_learn_the_same_as_those_kept_before(tmp_path):
+    here = Path(__file__).parent
+    environment = {
+        **os.environ,
+        "NUMBA_CACHE_DIR": str(tmp_path),
+        "OMP_NUM_THREADS": "1",
+        "PYTHONPATH": os.pathsep.join([str(here.parent), str(here)]),
+    }
+    command = [sys.executable, "-c", A_FEW_STEPS]
+    first, second = (
+        subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout for _ in range(2)
+    )
+    assert list(tmp_path.rglob("*.nbc"))
+    assert first.count("\n") > 5
+    assert first == second
 
 
 @pytest.mark.slow

@@ -61,7 +61,6 @@ class Step:
     Attributes:
         rung: its name.
         registered, points, error_px: of the model it found; 0, 0 and None where it found none.
-        seconds: it took.
         kept: whether its model was the best so far.
         note: why it failed, or nothing.
     """
@@ -70,7 +69,6 @@ class Step:
     registered: int
     points: int
     error_px: float | None
-    seconds: float
     kept: bool
     note: str = ""
 
@@ -91,9 +89,7 @@ def better(new: Solution | None, old: Solution | None) -> bool:
     return (len(new.registered), -new.error_px) > (len(old.registered), -old.error_px)
 
 
-def climb(
-    rungs: Sequence[Rung], wanted: int, enough: int, clock: Callable[[], float] = time.monotonic
-) -> tuple[Solution | None, list[Step]]:
+def climb(rungs: Sequence[Rung], wanted: int, enough: int) -> tuple[Solution | None, list[Step]]:
     """Take the rungs in order until `wanted` photos are placed, and keep the best solution.
 
     The climb also ends after `PATIENCE` rungs in a row that place no further photo, if `enough` are placed.
@@ -113,7 +109,7 @@ def climb(
             continue
         if steps:
             log.info("%d photos placed, %d wanted: trying %s", placed, wanted, rung.name)
-        found, note, start = None, "", clock()
+        found, note, start = None, "", time.monotonic()
         try:
             found = rung.attempt(best)
         except (RuntimeError, ValueError) as error:  # COLMAP's checks
@@ -123,22 +119,20 @@ def climb(
             log.warning("%s failed: %s", rung.name, note)
         kept = better(found, best)
         fruitless = 0 if found is not None and len(found.registered) > placed else fruitless + 1
-        steps.append(_step(rung.name, found, clock() - start, kept, note))
-        log.info(describe(steps[-1]))
+        steps.append(_step(rung.name, found, kept, note))
+        log.info("%s (%.1f s)", describe(steps[-1]), time.monotonic() - start)
         best = found if kept else best
     return best, steps
 
 
-def _step(name: str, found: Solution | None, seconds: float, kept: bool, note: str) -> Step:
+def _step(name: str, found: Solution | None, kept: bool, note: str) -> Step:
     if found is None:
-        return Step(name, 0, 0, None, round(seconds, 2), kept, note)
-    return Step(
-        name, len(found.registered), found.points, round(found.error_px, 4), round(seconds, 2), kept, note
-    )  # fmt: skip
+        return Step(name, 0, 0, None, kept, note)
+    return Step(name, len(found.registered), found.points, round(found.error_px, 4), kept, note)
 
 
 def describe(step: Step) -> str:
     """A line for people."""
     if step.error_px is None:
-        return f"{step.rung}: {step.note or 'no model'} ({step.seconds:.1f} s)"
-    return f"{step.rung}: {step.registered} photos, {step.points} points, {step.error_px:.2f} px ({step.seconds:.1f} s)"
+        return f"{step.rung}: {step.note or 'no model'}"
+    return f"{step.rung}: {step.registered} photos, {step.points} points, {step.error_px:.2f} px"
