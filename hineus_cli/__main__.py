@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+# No others before `leave_current_folder`: they would come from there.
+import os
 import sys
-from importlib.util import find_spec
-from pathlib import Path
+
+HOME = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
 
 
 def main() -> None:
     """The `hineus` command."""
-    if other := shadowed(Path(__file__).parents[1]):
+    leave_current_folder()
+    if other := shadowed(HOME):
         sys.exit(
             f"Error: {other!r} is found instead of our part of the same name.\n"
             "Leave that folder or PYTHONPATH, or install in an environment of its own: `uv tool install hineus`."
@@ -22,12 +25,34 @@ def main() -> None:
         sys.exit(130)
 
 
-def shadowed(home: Path) -> str | None:
+def leave_current_folder() -> None:
+    """Find no modules in the current folder, which may be full of somebody else's files.
+
+    `python -m` puts it into the path, and so does an empty entry of PYTHONPATH. It stays where it is named there in
+    full, or where we or Python lie in it.
+    """
+    try:
+        here = os.path.realpath(os.getcwd())
+    except OSError:  # it was deleted
+        here = ""
+    pythons = (os.path.realpath(prefix) + os.sep for prefix in (sys.prefix, sys.base_prefix))
+    if here == os.path.realpath(HOME) or (here + os.sep).startswith(tuple(pythons)):
+        return
+    named = os.environ.get("PYTHONPATH", "").split(os.pathsep)
+    sys.path[:] = [
+        place for place in sys.path if os.path.isabs(place) and (place in named or os.path.realpath(place) != here)
+    ]
+
+
+def shadowed(home: str) -> str | None:
     """Where a package lies that Python takes for one of ours, since they have common names; None where none does."""
+    from importlib.util import find_spec
+    from pathlib import Path
+
     for name in ("stages", "configs"):
         spec = find_spec(name)
         places = [Path(place) for place in (spec and spec.submodule_search_locations) or ()]
-        if not any(place.resolve() == (home / name).resolve() for place in places):
+        if not any(place.resolve() == (Path(home) / name).resolve() for place in places):
             return str(places[0] if places else (spec and spec.origin) or f"no package {name}")
     return None
 

@@ -3,6 +3,18 @@
 The folder of the package need not be writable. `NUMBA_CACHE_DIR` chooses another place.
 """
 
+from pathlib import Path
+
+from stages.errors import InputError
+
+# Numba would take settings from there, and the current folder may be somebody else's.
+SETTINGS = Path(".numba_config.yaml")
+if SETTINGS.exists():
+    raise InputError(
+        f"Numba would take its settings from {SETTINGS.absolute()}, which may be somebody else's.",
+        "Go to another folder, or remove that file and set NUMBA_... variables instead.",
+    )
+
 import numba
 from llvmlite import ir
 from numba.core import types

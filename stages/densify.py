@@ -133,7 +133,8 @@ def _say_why(photos: int, pairs: int, depth_maps: int) -> None:
 def _threads(workers: int) -> Iterator[None]:
     """So many threads for the compiled loops, and one for each of OpenCV's calls: a pool makes these in parallel."""
     import cv2
-    import numba
+
+    from stages.compiling import numba
 
     before = cv2.getNumThreads(), numba.get_num_threads()
     cv2.setNumThreads(1)

@@ -13,6 +13,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Literal
 
+from stages import children
 from stages.caches import cache_folder, compiler_folder, system_temporary, why_unusable
 from stages.capture.salient import INSTALL, PACKAGE
 from stages.engine.system import SYSTEM_LIBRARIES, apt_line, installed_version, missing_libraries
@@ -137,7 +138,7 @@ def _system_libraries(broken: bool) -> Finding:
 
 def _gpu() -> Finding:
     try:
-        found = _python(_GPU_PROBE)
+        found = children.run(children.program_command(_GPU_PROBE), IMPORT_TIME_LIMIT_S)
     except (OSError, subprocess.TimeoutExpired) as error:
         return Finding("GPU", "note", f"unknown: {error}")
     name = found.stdout.strip() or "unknown: torch does not import"
@@ -210,16 +211,10 @@ def _names() -> Finding:
 def _probe(program: str) -> str | None:
     """The last line of what went wrong in running `program`, None where nothing did."""
     try:
-        result = _python(program)
+        result = children.run(children.program_command(program), IMPORT_TIME_LIMIT_S)
     except subprocess.TimeoutExpired:
         return f"did not load within {IMPORT_TIME_LIMIT_S} s"
     if result.returncode == 0:
         return None
     lines = result.stderr.strip().splitlines()
     return lines[-1] if lines else f"loading it ended with exit code {result.returncode}"
-
-
-def _python(program: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, timeout=IMPORT_TIME_LIMIT_S, check=False
-    )

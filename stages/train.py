@@ -439,8 +439,9 @@ def _previous_field(context: StageContext[TrainParams]) -> Path:
 
 def _use_threads(context: StageContext[TrainParams]) -> None:
     """Torch and numba take as many threads as the run was given."""
-    import numba
     import torch
+
+    from stages.compiling import numba
 
     torch.set_num_threads(context.workers)
     numba.set_num_threads(min(context.workers, numba.config.NUMBA_NUM_THREADS))

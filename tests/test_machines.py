@@ -12,15 +12,18 @@ from collections import Counter
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import psutil
 import pytest
 
-from hineus_cli.__main__ import shadowed
-from stages import caches, limits, machine_check
+import hineus_cli.__main__
+from hineus_cli.__main__ import leave_current_folder, shadowed
+from stages import caches, children, limits, machine_check
 from stages.engine.locking import take
 from stages.engine.system import SYSTEM_LIBRARIES, missing_libraries
 from stages.engine.workspace import storage_errors
 from stages.errors import WorkspaceError
+from stages.texture.charts import unwrap_xatlas
 
 REPOSITORY = Path(__file__).parents[1]
 FULL = OSError(errno.ENOSPC, "No space left on device")
@@ -49,6 +52,13 @@ def test_compiled_code_goes_to_the_users_cache(tmp_path: Path, monkeypatch: pyte
     assert os.environ["NUMBA_CACHE_DIR"] == str(tmp_path / "cache" / "hineus" / "numba")
     assert stat.S_IMODE((tmp_path / "cache" / "hineus").stat().st_mode) == 0o700
     caches.cache_folder.cache_clear()
+
+
+def test_numba_takes_no_settings_of_the_current_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / ".numba_config.yaml").write_text("disable_jit: 1", encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    ended = children.run(children.program_command("import stages.compiling"), 60)
+    assert ended.stderr.splitlines()[-1].startswith("stages.errors.InputError: Numba would take its settings from /")
 
 
 def test_without_a_cache_it_goes_to_a_folder_of_this_user_alone(no_cache: Path) -> None:
@@ -328,7 +338,7 @@ def test_every_file_can_lie_on_windows_and_macos() -> None:
 
 # ---------------------------------------------------------------- modules of common names
 def test_another_package_of_the_same_name_is_found_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert shadowed(REPOSITORY) is None
+    assert shadowed(str(REPOSITORY)) is None
     (tmp_path / "configs").mkdir()
     (tmp_path / "configs" / "__init__.py").touch()
     monkeypatch.setenv("PYTHONPATH", f"{tmp_path}{os.pathsep}{REPOSITORY}")
@@ -337,6 +347,68 @@ def test_another_package_of_the_same_name_is_found_out(tmp_path: Path, monkeypat
     assert ended.returncode == 1
     assert ended.stderr.startswith(f"Error: {tmp_path / 'configs'} is found instead of our part")
     assert "Traceback" not in ended.stderr
+
+
+@pytest.mark.parametrize(
+    ("folder", "named", "stays"),
+    [("photos", "", False), ("photos", ":/elsewhere", False), ("photos", "photos", True), ("home", "", True)],
+    ids=["of somebody else", "an empty entry", "named in full", "ours"],
+)
+def test_the_current_folder_is_in_the_path_only_on_purpose(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, folder: str, named: str, stays: bool
+) -> None:
+    here = tmp_path / folder
+    here.mkdir()
+    monkeypatch.chdir(here)
+    monkeypatch.setattr(hineus_cli.__main__, "HOME", str(tmp_path / "home"))
+    monkeypatch.setenv("PYTHONPATH", str(here) if named == folder else named)
+    monkeypatch.setattr(sys, "path", [str(here), "/elsewhere"])
+    leave_current_folder()
+    assert sys.path == [str(here), "/elsewhere"] if stays else ["/elsewhere"]
+
+
+@pytest.fixture
+def ran(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The current folder is somebody else's, whose modules have names that we import: a file that they make if run."""
+    ran, folder = tmp_path / "ran", tmp_path / "planted"
+    folder.mkdir()
+    installed = ("numpy", "torch", "cv2", "xatlas", "numba", "trimesh", "typer", "yaml", "pydantic")
+    for name in (*installed, "secrets", "uuid", "colorsys"):  # and of Python's own, such as are imported late
+        (folder / f"{name}.py").write_text(f"open({str(ran)!r}, 'a').write(__name__ + ' ')", encoding="utf-8")
+    monkeypatch.chdir(folder)
+    monkeypatch.setenv("PYTHONPATH", f"{os.pathsep}{REPOSITORY}")
+    return ran
+
+
+@pytest.mark.parametrize(
+    "arguments", [["--version"], ["presets"], pytest.param(["doctor"], marks=pytest.mark.slow)], ids=lambda a: a[0]
+)
+def test_a_command_runs_no_code_of_the_current_folder(ran: Path, arguments: list[str]) -> None:
+    command = [sys.executable, "-m", "hineus_cli", *arguments]
+    ended = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert ended.returncode == 0, ended.stderr
+    assert not ran.exists()
+
+
+def test_a_child_runs_no_code_of_the_current_folder(ran: Path) -> None:
+    ended = children.run(children.program_command("import numpy, secrets; print(numpy.pi)"), 60)
+    assert ended.stdout == "3.141592653589793\n", ended.stderr
+    assert not ran.exists()
+
+
+def test_xatlas_runs_no_code_of_the_current_folder(ran: Path) -> None:
+    vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], dtype=np.float64)
+    faces = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]], dtype=np.int32)
+    layout = unwrap_xatlas(vertices, faces, 64, 2, 60)
+    assert len(layout.faces) == 4
+    assert not ran.exists()
+
+
+def test_a_child_finds_what_this_process_does(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What it has from PYTHONPATH or of the user's own packages, which isolated interpreters leave out."""
+    (tmp_path / "their_own.py").write_text("print('found')", encoding="utf-8")
+    monkeypatch.syspath_prepend(tmp_path)
+    assert children.run(children.program_command("import stages, their_own"), 60).stdout == "found\n"
 
 
 def test_doctor_names_packages_that_share_our_modules_names(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -78,7 +78,7 @@ def short_products(wanted: bool, device: torch.device) -> Iterator[None]:
 def _has_numba() -> bool:
     """Says once what goes missing without it."""
     try:
-        import numba  # noqa: F401
+        import stages.compiling  # noqa: F401
     except ImportError as error:
         log.warning("no CPU kernels (%s): training in plain PyTorch, about three times slower", error)
         return False

@@ -5,15 +5,14 @@ Texel coordinates here have their origin at the bottom-left corner of the textur
 
 from __future__ import annotations
 
-import os
 import subprocess
-import sys
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from stages import children
 from stages.geometry.vectors import unit
 from stages.surface.triangle_mesh import face_adjacency, face_areas, face_normals, label_pieces, vertex_normals
 
@@ -56,8 +55,6 @@ def unwrap_xatlas(
     Raises:
         XatlasError: the limit was reached, xatlas crashed, or its charts do not fit.
     """
-    root = str(Path(__file__).resolve().parents[2])
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([root, os.environ.get("PYTHONPATH", "")])}
     with tempfile.TemporaryDirectory(prefix="atlas-") as folder:
         source, target = Path(folder) / "in.npz", Path(folder) / "out.npz"
         np.savez(
@@ -68,9 +65,9 @@ def unwrap_xatlas(
             resolution=texture_size - padding,
             padding=padding,
         )
-        command = [sys.executable, "-m", "stages.texture.xatlas_worker", str(source), str(target)]
+        command = children.module_command("stages.texture.xatlas_worker", str(source), str(target))
         try:
-            done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=time_limit)
+            done = children.run(command, time_limit)
         except subprocess.TimeoutExpired as error:
             raise XatlasError(f"xatlas needed more than {time_limit:g} s for {len(faces)} faces") from error
         if done.returncode != 0 or not target.is_file():

@@ -1,4 +1,4 @@
-"""xatlas in a process of its own, so that a time limit can end it: `python -m stages.texture.xatlas_worker IN OUT`.
+"""xatlas in a process of its own, so that a time limit can end it, given IN and OUT.
 
 Nearly all its time goes into the charts, so they are made once; then they are packed again and again at other scales
 until they fill the texture.

@@ -1,6 +1,5 @@
-"""The peers that come as packages, each a program of its own, so that time and memory are theirs alone:
-
-python builtin.py NAME PHOTOS MODEL OUT
+"""The peers that come as packages, each a program of its own, so that time and memory are theirs alone, given
+NAME PHOTOS MODEL OUT.
 """
 
 from __future__ import annotations

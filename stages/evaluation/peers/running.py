@@ -11,7 +11,6 @@ import contextlib
 import shlex
 import shutil
 import subprocess
-import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +18,7 @@ from typing import Any
 
 import psutil
 
-from stages import artifacts
+from stages import artifacts, children
 from stages.engine.resources import children_cpu_seconds
 from stages.errors import ConfigError, ReconstructionError, did_you_mean
 from stages.evaluation.machine import machine
@@ -61,8 +60,7 @@ def parse_peer(text: str) -> Peer:
                 f"There is no built-in peer '{name}'.",
                 f"{guess}Those are {', '.join(builtin.PEERS)}; others by command: `--peer 'NAME=COMMAND {{out}}'`.",
             )
-        # isolated: the folder of the file would hide modules of the same names
-        return Peer(name, (sys.executable, "-I", builtin.__file__, name, "{photos}", "{model}", "{out}"))
+        return Peer(name, tuple(children.module_command(builtin.__name__, name, "{photos}", "{model}", "{out}")))
     try:
         words = tuple(shlex.split(command))
     except ValueError as error:
