@@ -2,6 +2,7 @@
 # make check  lint, types, who-may-import-whom, the quick tests: under a minute on two cores
 # make test   all tests, shapes checked
 # make trust  wrong input, kills, a full disk and attacks on the server: all of it, an hour on a core (docs/trust.md)
+# make lowest the quick tests with the oldest versions that pyproject.toml admits
 # make bench-smoke   a small scene through the whole pipeline, its figures against committed ones
 # make lint   formatting, lint, types, who-may-import-whom
 # make image  the container of the Dockerfile, built and tried out
@@ -12,7 +13,7 @@ PYTHON ?=
 export PYTHON
 BIN := .venv/bin
 
-.PHONY: help venv demo check quick test trust bench-smoke lint format docs image vendor clean
+.PHONY: help venv demo check quick test trust lowest bench-smoke lint format docs image vendor clean
 
 help:
 	@sed -n 's/^# //p' Makefile
@@ -35,6 +36,9 @@ test: venv
 
 trust: venv
 	OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(BIN)/python -m pytest --whole tests/trust tests/test_view.py
+
+lowest:
+	.ci/lowest.sh
 
 bench-smoke: venv
 	$(BIN)/python -m benchmarks.smoke
