@@ -13,6 +13,7 @@ from stages.engine.fingerprint import FileDigests
 from stages.engine.manifest import ManifestDamaged
 from stages.engine.status import previous_to_continue
 from stages.engine.workspace import Workspace
+from stages.errors import WorkspaceError
 from stages.ingest import INGEST
 from stages.posing.adding import enough_placed
 from stages.sfm import SFM
@@ -50,7 +51,7 @@ def what_is_kept(
         left = {path for path, digest in before.items() if digest in known}
         kept = _of_poses_and_training(workspace, config, left, len(new), len(gone), forced)
         return f"{len(known)} photos known, {len(new)} new, {len(gone)} gone: {kept}"
-    except (ManifestDamaged, FileNotFoundError):  # a file of the workspace is gone: the stages tell which
+    except (ManifestDamaged, WorkspaceError):  # a file of the workspace is gone or damaged: the stages tell which
         return ""
 
 

@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from configs.dotted import flatten
-from stages.errors import InputError
+from stages.artifacts.own_files import parse_json, read_own, write_own
+from stages.errors import InputError, WorkspaceError
 from stages.inputs.folders import named_files, readable
 
 CHUNK_BYTES = 1 << 20
@@ -204,17 +205,15 @@ class SourceDigests:
         if self._cache_path is None or not self._changed:
             return
         self._cache_path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = self._cache_path.with_suffix(".tmp")
-        temporary.write_text(json.dumps(self._cache), encoding="utf-8")
-        temporary.replace(self._cache_path)
+        write_own(self._cache_path, json.dumps(self._cache))
         self._changed = False
 
 
 def _read_cache(path: Path | None) -> dict[str, list[Any]]:
     # A cache that cannot be read is only slow, never wrong.
     try:
-        cache = json.loads(path.read_text(encoding="utf-8")) if path else {}
-    except (OSError, ValueError):
+        cache = parse_json(read_own(path)) if path else {}
+    except (OSError, ValueError, WorkspaceError):
         return {}
     valid = isinstance(cache, dict) and all(isinstance(row, list) and len(row) == 3 for row in cache.values())
     return cache if valid else {}
