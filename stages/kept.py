@@ -98,7 +98,7 @@ def _of_counts(
         return poses
     if TRAIN.name in forced or previous_to_continue(TRAIN, workspace, config, hashes=False) is None:
         return f"{poses}, training starts anew"
-    trained = len(artifacts.SCENE.load(workspace.stage_folder(TRAIN.name)).cameras)
+    trained = len(artifacts.CAMERAS.load(workspace.stage_folder(TRAIN.name)))
     goes_on = little_changed(new + gone, trained) and not config.train.hold_out
     return f"{poses}, training {'goes on from what it has learned' if goes_on else 'starts anew'}"
 

@@ -16,7 +16,7 @@ _RECORDS = "images.json"
 LEFT_OUT = "named in ingest.leave_out"  # why a photo was skipped that no stage may see
 
 
-@with_config(allow_inf_nan=False)
+@with_config(allow_inf_nan=False, extra="forbid")
 @dataclass(frozen=True)
 class ImageRecord:
     """One photo that was taken in.

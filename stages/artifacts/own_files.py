@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import errno
 import json
+import math
 import os
 import shlex
 import stat
@@ -95,10 +96,10 @@ def open_own(path: str | os.PathLike[str], flags: int) -> int:
 
 
 def read_own(path: Path) -> bytes:
-    """The contents of a file of ours.
+    """The contents of a text of ours.
 
     Raises:
-        WorkspaceError: it is a link, no file, or larger than anything that we write.
+        WorkspaceError: it is a link, no file, or larger than any that we write.
         OSError: it is not there, or cannot be read.
     """
     with open(path, "rb", opener=open_own) as file:
@@ -118,13 +119,15 @@ def parse_json(data: bytes) -> Any:
         ValueError: it is none, or nested too deep, or holds NaN or infinity.
     """
     try:
-        return json.loads(data.decode("utf-8"), parse_constant=_no_number)
+        return json.loads(data.decode("utf-8"), parse_constant=_finite, parse_float=_finite)
     except RecursionError as error:
         raise ValueError("nested too deep") from error
 
 
-def _no_number(text: str) -> None:
-    raise ValueError(f"{text} is no number")
+def _finite(text: str) -> float:
+    if not math.isfinite(number := float(text)):
+        raise ValueError(f"{text} is no finite number")
+    return number
 
 
 def write_own(path: Path, text: str) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -161,9 +162,9 @@ class SourceDigests:
         self._files: dict[str, FileDigests | None] = {}
 
     def available(self, name: str) -> bool:
-        """False where the path was given but is not there (any more)."""
+        """False where the path was given but is not there (any more), or may not be looked at."""
         path = self.sources.get(name)
-        return path is None or path.exists()
+        return path is None or os.path.exists(path)
 
     def files(self, name: str) -> FileDigests | None:
         """Digest of each file of source `name`, None where it was not given.

@@ -201,8 +201,8 @@ class Workspace:
         return holder is not None and holder.host == socket.gethostname() and bool(psutil.pid_exists(holder.pid))
 
     def is_writing(self, stage: str) -> bool:
-        """Whether the stage's outputs are being written, or were when the process was killed."""
-        return (self.work_folder(stage) / "out").is_dir()
+        """Whether the run that has the lock is writing the stage's outputs; a killed one's are no longer written."""
+        return self.in_use() and (self.work_folder(stage) / "out").is_dir()
 
     # ------------------------------------------------------------ record and settings
     def remember(self, sources: Mapping[str, Path | None], preset: str | None, config: Mapping[str, Any]) -> None:
@@ -223,7 +223,7 @@ class Workspace:
 
     def _root_of_sources(self, sources: Mapping[str, Path | None]) -> str:
         """The root beside which the sources lie, or lay: of those that are not found yet it is the last run's."""
-        unfound = any(path is not None and not path.exists() for path in sources.values())
+        unfound = any(path is not None and not os.path.exists(path) for path in sources.values())
         return self.record.root if unfound and self.record.root else str(self.root)
 
     # ------------------------------------------------------------ stages
@@ -454,14 +454,18 @@ def _parse_record(text: bytes, path: Path) -> Record:
 
 
 def _sources(given: Mapping[str, Any]) -> dict[str, str | None]:
-    """Raises ValueError where a path is none or not absolute: relative to what it would be depends on who asks."""
+    """Raises ValueError where a path is none or not absolute: what it is relative to would be whoever asks."""
     for name, place in given.items():
-        absolute = isinstance(place, str) and any(
-            kind(place).is_absolute() for kind in (PurePosixPath, PureWindowsPath)
-        )
-        if place is not None and not absolute:
+        if place is not None and not _is_absolute(place):
             raise ValueError(f"the place of its {name} is {place!r}, not an absolute path")
     return dict(given)
+
+
+def _is_absolute(place: Any) -> bool:
+    """Whether it is an absolute path here or, in a workspace from there, on another system."""
+    if not isinstance(place, str) or "\0" in place:
+        return False
+    return PurePosixPath(place).is_absolute() or PureWindowsPath(place).is_absolute()
 
 
 def _hineus_version() -> str:
