@@ -387,7 +387,7 @@ def named(full: StageContext, name: str) -> Structure:
 
 
 ODD = (
-    "<img src=x onerror=alert(1)>", '"]]><script>alert(1)</script>', "</script><script>alert(1)</script>", "\u2028alert(1)",
+    "<img src=x onerror=alert(1)>", '"]]><script>alert(1)</script>', "</script><script>alert(1)</script>", "\u2028",
     "' onmouseover='alert(1)' x='", '" onmouseover="alert(1)" x="', "</title></style></pre></svg>", "&lt;img src=x&gt;",
     "{{ 7 * 7 }}{% x %}", "`${alert(1)}`", "\u202egpj.exe", "<!--<script>", "-->",
 )  # fmt: skip

@@ -125,7 +125,7 @@ def test_nor_is_it_by_the_next_run_before_its_own_training(workspace, tmp_path, 
 @pytest.mark.parametrize(
     "line",
     ["", "5", "[]", "{", "[" * 100_000, "\xff", '{"step": "x", "psnr": 1}', '{"step": 1, "psnr": "x"}', '{"psnr": [1]}',
-     '{"step": %d, "psnr": 2}' % 10**400, '{"step": 3, "psnr": 1e999}', '{"step": NaN, "psnr": 3}', '{"step": null}'],
+     '{"step": 1' + 400 * "0" + ', "psnr": 2}', '{"step": 3, "psnr": 1e999}', '{"step": NaN, "psnr": 3}'],
 )  # fmt: skip
 def test_lines_of_metrics_that_cannot_be_read_are_left_out(tmp_path, line):
     path = tmp_path / "metrics.jsonl"

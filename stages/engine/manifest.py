@@ -87,7 +87,8 @@ class Manifest:
         """Bytes of all outputs."""
         return sum(file.size for file in self.outputs.values())
 
-    def to_json(self) -> str:
+    def to_json(self, sealed: bool = False) -> str:
+        """As text; `sealed` with a checksum of all of it, as it is published."""
         identity = self.identity
         data = {
             "stage": identity.stage,
@@ -107,7 +108,8 @@ class Manifest:
             "versions": dict(self.versions),
             "created": self.created,
         }
-        return json.dumps({**data, "checksum": digest(data)}, indent=1, allow_nan=False) + "\n"
+        seal = {"checksum": digest(data)} if sealed else {}
+        return json.dumps(data | seal, indent=1, allow_nan=False) + "\n"
 
     @staticmethod
     def from_json(text: str | bytes) -> Manifest:

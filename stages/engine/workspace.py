@@ -275,7 +275,7 @@ class Workspace:
         """
         work = self.work_folder(stage)
         out, old = work / "out", work / "old"
-        text = manifest.to_json()
+        text = manifest.to_json(sealed=True)
         with storage_errors(self.root, f"publishing '{stage}'", needed=len(text)):
             _sync_tree(out)
             write_own(out / MANIFEST, text)
