@@ -21,6 +21,7 @@ from pathlib import Path
 log = logging.getLogger(__name__)
 
 PROBE = bytes(1 << 22)  # all compiled code takes about 3 MB, and a full quota may still take some bytes
+TEMPORARY = "tmp-"  # so begin the names of folders of temporary files
 ENOUGH_TEMPORARY = 1 << 29  # bytes; a USDZ with the largest textures takes a third of it
 
 
@@ -118,7 +119,7 @@ def temporary_files(work: Path) -> Iterator[None]:
         yield
         return
     before = tempfile.tempdir, os.environ.get("TMPDIR")
-    with tempfile.TemporaryDirectory(prefix="tmp-", dir=work, ignore_cleanup_errors=True) as folder:
+    with tempfile.TemporaryDirectory(prefix=TEMPORARY, dir=work, ignore_cleanup_errors=True) as folder:
         log.info("temporary files lie in the workspace: %s", f"{usual} is nearly full" if usual else "no TMPDIR")
         tempfile.tempdir = os.environ["TMPDIR"] = folder
         try:

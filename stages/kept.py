@@ -13,6 +13,7 @@ from stages.engine.fingerprint import FileDigests
 from stages.engine.manifest import ManifestDamaged
 from stages.engine.status import previous_to_continue
 from stages.engine.workspace import Workspace
+from stages.errors import WorkspaceError
 from stages.ingest import INGEST
 from stages.posing.adding import enough_placed
 from stages.sfm import SFM
@@ -50,7 +51,7 @@ def what_is_kept(
         left = {path for path, digest in before.items() if digest in known}
         kept = _of_poses_and_training(workspace, config, left, len(new), len(gone), forced)
         return f"{len(known)} photos known, {len(new)} new, {len(gone)} gone: {kept}"
-    except (ManifestDamaged, FileNotFoundError):  # a file of the workspace is gone: the stages tell which
+    except (ManifestDamaged, WorkspaceError):  # a file of the workspace is gone or damaged: the stages tell which
         return ""
 
 
@@ -97,7 +98,7 @@ def _of_counts(
         return poses
     if TRAIN.name in forced or previous_to_continue(TRAIN, workspace, config, hashes=False) is None:
         return f"{poses}, training starts anew"
-    trained = len(artifacts.SCENE.load(workspace.stage_folder(TRAIN.name)).cameras)
+    trained = len(artifacts.CAMERAS.load(workspace.stage_folder(TRAIN.name)))
     goes_on = little_changed(new + gone, trained) and not config.train.hold_out
     return f"{poses}, training {'goes on from what it has learned' if goes_on else 'starts anew'}"
 

@@ -269,7 +269,7 @@ def _tell_sources(request: Request, workspace: Workspace, sources: Mapping[str, 
                 source_option(name),
                 shlex.quote(before),
             )
-        elif not now.exists() or (name == "photos" and not holds_files(now)):
+        elif not os.path.exists(now) or (name == "photos" and not holds_files(now)):
             log.warning("%s", _gone(name, now, workspace.root))
         elif str(now) != before:
             log.info("%s: %s (those of the last run were %s)", name, now, before)

@@ -71,8 +71,8 @@ def find_source(workspace: Workspace, name: str, photos: Path | None = None) -> 
     recorded = workspace.record.sources.get(name)
     if recorded is None:
         return None
-    moved = (place for place in _moved_places(workspace, Path(recorded), photos) if place.exists())
-    return Path(recorded) if Path(recorded).exists() else next(moved, Path(recorded))
+    moved = (place for place in _moved_places(workspace, Path(recorded), photos) if os.path.exists(place))
+    return Path(recorded) if os.path.exists(recorded) else next(moved, Path(recorded))
 
 
 def _moved_places(workspace: Workspace, recorded: Path, photos: Path | None) -> Iterator[Path]:
@@ -85,7 +85,7 @@ def _moved_places(workspace: Workspace, recorded: Path, photos: Path | None) -> 
 
 def holds_files(path: Path) -> bool:
     """Whether there is a file at all: not in a folder that was emptied, nor where a disk is no longer mounted."""
-    return path.is_file() or (path.is_dir() and bool(named_files(path)[0]))
+    return os.path.isfile(path) or (os.path.isdir(path) and bool(named_files(path)[0]))
 
 
 # ---------------------------------------------------------------- other photos

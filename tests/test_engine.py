@@ -339,8 +339,12 @@ def test_folder_with_other_things_is_no_workspace(bench: Bench) -> None:
 
 
 def test_read_only_workspace_is_told(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(path: Any, *_: Any) -> int:
-        raise OSError(errno.EROFS, "Read-only file system", str(path))
+    opened = os.open
+
+    def refuse(path: Any, flags: int, *more: Any) -> int:
+        if flags & os.O_RDWR:
+            raise OSError(errno.EROFS, "Read-only file system", str(path))
+        return opened(path, flags, *more)
 
     bench.run()
     monkeypatch.setattr(workspace_module.os, "open", refuse)
@@ -350,7 +354,7 @@ def test_read_only_workspace_is_told(bench: Bench, monkeypatch: pytest.MonkeyPat
 
 def test_full_disk_while_publishing_loses_nothing(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     bench.run()
-    original = workspace_module._write
+    original = workspace_module.write_own
 
     def full(path: Path, text: str) -> None:
         if path.name == MANIFEST:
@@ -358,7 +362,7 @@ def test_full_disk_while_publishing_loses_nothing(bench: Bench, monkeypatch: pyt
         original(path, text)
 
     with monkeypatch.context() as patch:
-        patch.setattr(workspace_module, "_write", full)
+        patch.setattr(workspace_module, "write_own", full)
         patch.setattr(workspace_module, "free_bytes", lambda root: 12_345_678)
         with pytest.raises(WorkspaceError) as caught:
             bench.run(sets=("sfm.max_features=200",))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import json
 import re
 import xml.etree.ElementTree as ET
 from dataclasses import replace
@@ -19,12 +20,12 @@ from rigs import scene_without_points, shell, three_rings
 from configs.load import load_config
 from configs.params import ReportParams
 from stages import artifacts
-from stages.artifacts import ImageRecord, VertexQuality
+from stages.artifacts import ImageRecord, ImageSet, Registration, SkippedImage, Unregistered, VertexQuality, write_png
 from stages.drawing.overview import overview_svg
 from stages.engine.stage import StageContext
 from stages.engine.workspace import Record
 from stages.geometry.normalisation import rotation_onto
-from stages.geometry.place import Place, given_region
+from stages.geometry.place import ControlMark, ControlPoint, Place, given_region
 from stages.geometry.similarity import Similarity
 from stages.geometry.up import y_up_rotation
 from stages.report import THREE, region_corners
@@ -332,6 +333,75 @@ def test_it_is_said_where_the_region_grew():
     assert "It grew to 1.44 times its radius in training" in said(region_grown=1.437)
     assert "It grew" not in said(region_grown=1.0)
     assert "It grew" not in said()
+
+
+class Structure(HTMLParser):
+    """The tags of a page with the names of their attributes, and its scripts."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.tags: list[tuple[str, ...]] = []
+        self.scripts: list[str] = []
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append((tag, *(name for name, _ in attrs)))
+        if tag == "script":
+            self.scripts.append("")
+
+    def handle_data(self, data):
+        if self.cdata_elem == "script":
+            self.scripts[-1] += data
+
+
+def named(full: StageContext, name: str) -> Structure:
+    """The structure of a page whose names, sentences, settings and places all hold `name`."""
+    photo = f"{name}.png"
+    write_png(artifacts.Pictures(full.inputs["ingest"]).path(photo), np.full((30, 40, 3), 120, np.uint8))
+    write_png(artifacts.Pictures(full.inputs["undistort"]).path(photo), np.full((16, 16, 3), 77, np.uint8))
+    records = [ImageRecord(each, each, 40, 30, None, "0", 5.0, False, "00") for each in (photo, f"out {photo}")]
+    skipped = (SkippedImage(photo, name),)
+    artifacts.IMAGE_SET.save(full.inputs["ingest"], ImageSet(tuple(records), skipped))
+    left_out = (Unregistered(name=f"out {photo}", reason=name),)
+    ladder = ({"rung": name, "registered": 1}, {"rung": name, "registered": 1})
+    artifacts.REGISTRATION.save(full.inputs["sfm"], Registration(unregistered=left_out, ladder=ladder))
+    scene = artifacts.SCENE.load(full.inputs["train"])
+    scene = replace(scene, cameras=replace(scene.cameras, names=(photo,)))
+    artifacts.SCENE.save(full.inputs["train"], scene)
+    artifacts.HELD_OUT.save(full.inputs["train"], [photo])
+    point = ControlPoint(name, (0, 0, 0), True, True, None, None, (ControlMark(photo, 2.0, False),))
+    place = replace(artifacts.WORLD_PLACE.load(full.inputs["place"]), scale_from=name, control=(point,), crs=name)
+    artifacts.WORLD_PLACE.save(full.inputs["place"], place)
+    said = {"warnings": [{"sentence": name, "command": name}], "up_from": name, "region_from": name, "text": name}
+    manifests = {stage: manifest(stage, **said) for stage in full.manifests}
+    manifests = {
+        stage: replace(
+            each, versions={"hineus": name}, created=name, identity=replace(each.identity, params={name: name})
+        )
+        for stage, each in manifests.items()
+    }
+    record = Record(sources={"photos": f"/{name}", "masks": f"/{name}"}, preset=name)
+    config = load_config("tiny", sets=["ingest.leave_out=" + json.dumps([name])])
+    structure = Structure()
+    structure.feed(page(replace(full, manifests=manifests, record=record, config=config)))
+    return structure
+
+
+ODD = (
+    "<img src=x onerror=alert(1)>", '"]]><script>alert(1)</script>', "</script><script>alert(1)</script>", "\u2028",
+    "' onmouseover='alert(1)' x='", '" onmouseover="alert(1)" x="', "</title></style></pre></svg>", "&lt;img src=x&gt;",
+    "{{ 7 * 7 }}{% x %}", "`${alert(1)}`", "\u202egpj.exe", "<!--<script>", "-->",
+)  # fmt: skip
+
+
+@pytest.mark.slow
+def test_names_of_all_kinds_stay_text(full):
+    name = "".join(ODD)
+    plain, odd = named(full, "plain"), named(full, name)
+    assert odd.tags == plain.tags
+    code = [script for script in odd.scripts if not script.startswith("{")]
+    assert code == [script for script in plain.scripts if not script.startswith("{")]
+    [data] = [json.loads(script) for script in odd.scripts if script.startswith("{")]
+    assert [camera["name"] for camera in data["cameras"]] == [f"{name}.png"]
 
 
 def test_warnings_of_stages_are_on_top_of_the_page(full):

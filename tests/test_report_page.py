@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import json
 import re
 import shlex
 import shutil
@@ -277,3 +278,16 @@ def test_what_lies_outside_the_region_fades(full):
         pure.append(((blue > 180) & (green < 110) & (red < 90)).sum())
     assert pure[0] > 1000
     assert pure[1] < 0.01 * pure[0]
+
+
+def test_the_live_page_draws_under_its_policy(tmp_path):
+    workspace = Workspace.open(tmp_path / "ws", create=True)
+    with workspace.lock():
+        workspace.remember({"photos": None}, "cpu", {})
+        scratch = workspace.begin("train", "print")[1]
+        lines = [json.dumps({"step": step, "psnr": 10 + step}) for step in range(4)]
+        artifacts.METRICS.load(scratch).write_text("\n".join(lines))
+        with serving(watch(workspace.root, ())) as url:
+            dom = browse(tmp_path, url, "--dump-dom").stdout  # which asserts that nothing was refused
+    assert 'data-live="ready"' in dom
+    assert re.search(r"<figure><svg [^>]*>.*<polyline .*</svg><figcaption>psnr: now 13<", dom)

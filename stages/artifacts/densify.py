@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from stages.artifacts.artifact import arrays_artifact, in_folder
+from stages.artifacts.own_files import inside
 from stages.artifacts.pictures import write_png
 from stages.errors import WorkspaceError
 from stages.geometry.point_cloud import PointCloud
@@ -27,11 +28,11 @@ class DepthMaps:
 
     def path(self, name: str) -> Path:
         """Where the depth map of image `name` lies: a TIFF of 32-bit floats; may not exist."""
-        return self.folder / _DEPTHS / f"{name}.tiff"
+        return inside(self.folder / _DEPTHS, f"{name}.tiff")
 
     def trust_path(self, name: str) -> Path:
         """Where the trust of these depths lies: 255 stands for 1; may not exist."""
-        return self.folder / _TRUST / f"{name}.png"
+        return inside(self.folder / _TRUST, f"{name}.png")
 
     def save(self, name: str, depth: Float32[np.ndarray, "h w"], trust: Float32[np.ndarray, "h w"]) -> None:
         """Write the depths along the optical axis of image `name`, 0 where unknown, in units of the poses; and their

@@ -5,8 +5,10 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
+from pydantic import with_config
+
 from stages.artifacts.artifact import Artifact
-from stages.artifacts.json_files import read_json, write_json
+from stages.artifacts.json_files import PathInside, read_record, write_json
 from stages.artifacts.pictures import pictures_of
 
 _RECORDS = "images.json"
@@ -14,6 +16,7 @@ _RECORDS = "images.json"
 LEFT_OUT = "named in ingest.leave_out"  # why a photo was skipped that no stage may see
 
 
+@with_config(allow_inf_nan=False, extra="forbid")
 @dataclass(frozen=True)
 class ImageRecord:
     """One photo that was taken in.
@@ -36,7 +39,7 @@ class ImageRecord:
         cam_from_frame: [3][3] rotation from what the views of a frame share into this one.
     """
 
-    name: str
+    name: PathInside
     source: str
     width: int
     height: int
@@ -80,11 +83,7 @@ def _save_image_set(folder: Path, image_set: ImageSet) -> None:
 
 
 def _load_image_set(folder: Path) -> ImageSet:
-    data = read_json(folder / _RECORDS)
-    return ImageSet(
-        tuple(ImageRecord(**record) for record in data["images"]),
-        tuple(SkippedImage(**record) for record in data["skipped"]),
-    )
+    return read_record(folder / _RECORDS, ImageSet)
 
 
 PHOTOS = pictures_of("ingest")

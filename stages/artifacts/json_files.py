@@ -7,16 +7,42 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import numpy as np
-from pydantic import BaseModel, BeforeValidator, ConfigDict, PlainSerializer, ValidationError
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    PlainSerializer,
+    TypeAdapter,
+    ValidationError,
+)
 
 from stages.artifacts.artifact import Artifact
+from stages.artifacts.own_files import parse_json, read_own, stays_inside
 from stages.errors import WorkspaceError
+
+
+def _numbers(value: Any) -> np.ndarray:
+    array = np.asarray(value)
+    if array.dtype.kind not in "biuf" or not np.isfinite(array).all():
+        raise ValueError("expected finite numbers")
+    return array
+
+
+def _path_inside(name: str) -> str:
+    if not stays_inside(name):
+        raise ValueError(f"{name!r} leads out of its folder")
+    return name
+
+
+# A file's path relative to a folder of ours.
+PathInside = Annotated[str, AfterValidator(_path_inside)]
 
 if TYPE_CHECKING:
     Array = np.ndarray
 else:
     # Nested lists of numbers in the file.
-    Array = Annotated[np.ndarray, BeforeValidator(np.asarray), PlainSerializer(lambda array: array.tolist())]
+    Array = Annotated[np.ndarray, BeforeValidator(_numbers), PlainSerializer(lambda array: array.tolist())]
 
 
 class Record(BaseModel):
@@ -27,7 +53,8 @@ class Record(BaseModel):
     )
 
 
-Schema = TypeVar("Schema", bound=Record)
+Schema = TypeVar("Schema")
+RecordSchema = TypeVar("RecordSchema", bound=Record)
 
 
 def write_record(path: Path, record: Record) -> None:
@@ -35,29 +62,34 @@ def write_record(path: Path, record: Record) -> None:
 
 
 def read_record(path: Path, schema: type[Schema]) -> Schema:
-    """The record in a file.
+    """The record in a file: a `Record`, or another type that pydantic can check.
 
     Raises:
         WorkspaceError: there is no such file (an older version may have made the workspace), or it is not what the
             schema says.
     """
     try:
-        return schema.model_validate_json(path.read_bytes())
+        return TypeAdapter(schema).validate_json(read_own(path))
     except OSError as error:
         raise WorkspaceError(
             f"{path} cannot be read: {error.strerror}.",
             f"Bring the workspace up to date: `hineus run --workspace {path.parent.parent}`.",
         ) from error
     except ValidationError as error:
-        found = error.errors(include_url=False, include_input=False)[0]
-        where = ".".join(str(part) for part in found["loc"]) or "the whole file"
         raise WorkspaceError(
-            f"{path} cannot be read: {found['msg']} ({where}).",
+            f"{path} cannot be read: {first_problem(error)}.",
             f"Make it again: `hineus run PHOTOS --force {path.parent.name}`.",
         ) from error
 
 
-def record_artifact(stage: str, file: str, schema: type[Schema]) -> Artifact[Schema]:
+def first_problem(error: ValidationError) -> str:
+    """What pydantic found first, and where: "Field required (outputs)"."""
+    found = error.errors(include_url=False, include_input=False)[0]
+    where = ".".join(str(part) for part in found["loc"]) or "the whole file"
+    return f"{found['msg']} ({where})"
+
+
+def record_artifact(stage: str, file: str, schema: type[RecordSchema]) -> Artifact[RecordSchema]:
     """A record as a JSON file."""
     return Artifact(
         stage,
@@ -72,4 +104,10 @@ def write_json(path: Path, data: Any) -> None:
 
 
 def read_json(path: Path) -> Any:
-    return json.loads(path.read_text(encoding="utf-8"))
+    """What `write_json` wrote.
+
+    Raises:
+        OSError: it is not there, or cannot be read.
+        ValueError: it is no JSON.
+    """
+    return parse_json(path.read_bytes())

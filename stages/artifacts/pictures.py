@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from stages.artifacts.artifact import Artifact, in_folder
+from stages.artifacts.own_files import inside
 from stages.errors import WorkspaceError
 
 IMAGES, MASKS = "images", "masks"
@@ -38,11 +39,11 @@ class Pictures:
         return self.folder / self.kind
 
     def path(self, name: str) -> Path:
-        return self.images / name
+        return inside(self.images, name)
 
     def mask_path(self, name: str) -> Path:
         """Where the mask of image `name` lies; may not exist."""
-        return self.masks / f"{name}.png"
+        return inside(self.masks, f"{name}.png")
 
     def image(self, name: str) -> np.ndarray:
         """Image `name`: [H, W, 3] uint8 RGB.

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from stages.artifacts.artifact import Artifact, place_artifact
-from stages.artifacts.json_files import read_json, write_json
+from stages.artifacts.json_files import read_record, write_json
 from stages.artifacts.scene import cameras_of, scene_of
 
 _HELD_OUT = "held_out.json"
@@ -18,7 +18,7 @@ def _save_held_out(folder: Path, names: Sequence[str]) -> None:
 
 def _load_held_out(folder: Path) -> tuple[str, ...]:
     path = folder / _HELD_OUT
-    return tuple(read_json(path)) if path.exists() else ()
+    return read_record(path, tuple[str, ...]) if path.exists() else ()
 
 
 # The scene that everything from here on is in: undistort's, or one whose region was grown.

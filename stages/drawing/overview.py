@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from markupsafe import Markup
 
 from stages.geometry.cameras import PosedScene
 from stages.geometry.place import BOX_EDGES
@@ -14,7 +15,7 @@ MIN_REACH, MAX_REACH, AIR = 1.3, 12.0, 1.08
 COLORS = {"point": "#8a94a3", "inside": "#3c8d5a", "camera": "#2f6fb0", "region": "#d9822b", "ground": "#a0522d"}
 
 
-def overview_svg(scene: PosedScene, box_corners: np.ndarray | None = None) -> str:
+def overview_svg(scene: PosedScene, box_corners: np.ndarray | None = None) -> Markup:
     """An SVG for a page, with two views of the scene frame: from above (x right, y up) and from the side (x, z).
 
     Args:
@@ -36,7 +37,7 @@ def overview_svg(scene: PosedScene, box_corners: np.ndarray | None = None) -> st
             f'<text x="8" y="18" font-size="12" fill="#888" font-family="sans-serif">{title}</text></svg>'
         )
     width = 2 * SIDE + 12
-    return (
+    return Markup(  # numbers and titles of ours: there is nothing to escape
         f'<svg viewBox="0 0 {width} {SIDE}" role="img" '
         f'aria-label="Cameras, points and region of interest">{"".join(views)}</svg>'
     )

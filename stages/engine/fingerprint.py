@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -11,7 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from configs.dotted import flatten
-from stages.errors import InputError
+from stages.artifacts.own_files import parse_json, read_own, write_own
+from stages.errors import InputError, WorkspaceError
 from stages.inputs.folders import named_files, readable
 
 CHUNK_BYTES = 1 << 20
@@ -160,9 +162,9 @@ class SourceDigests:
         self._files: dict[str, FileDigests | None] = {}
 
     def available(self, name: str) -> bool:
-        """False where the path was given but is not there (any more)."""
+        """False where the path was given but is not there (any more), or may not be looked at."""
         path = self.sources.get(name)
-        return path is None or path.exists()
+        return path is None or os.path.exists(path)
 
     def files(self, name: str) -> FileDigests | None:
         """Digest of each file of source `name`, None where it was not given.
@@ -204,17 +206,15 @@ class SourceDigests:
         if self._cache_path is None or not self._changed:
             return
         self._cache_path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = self._cache_path.with_suffix(".tmp")
-        temporary.write_text(json.dumps(self._cache), encoding="utf-8")
-        temporary.replace(self._cache_path)
+        write_own(self._cache_path, json.dumps(self._cache))
         self._changed = False
 
 
 def _read_cache(path: Path | None) -> dict[str, list[Any]]:
     # A cache that cannot be read is only slow, never wrong.
     try:
-        cache = json.loads(path.read_text(encoding="utf-8")) if path else {}
-    except (OSError, ValueError):
+        cache = parse_json(read_own(path)) if path else {}
+    except (OSError, ValueError, WorkspaceError):
         return {}
     valid = isinstance(cache, dict) and all(isinstance(row, list) and len(row) == 3 for row in cache.values())
     return cache if valid else {}

@@ -11,8 +11,12 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+from pydantic import ConfigDict, ValidationError
+
 from stages.artifacts.artifact import Artifact
-from stages.engine.fingerprint import Identity, digest, file_sha256
+from stages.artifacts.json_files import PathInside, Record, first_problem
+from stages.artifacts.own_files import read_own
+from stages.engine.fingerprint import FileDigests, Identity, digest, file_sha256
 from stages.engine.system import installed_version
 
 MANIFEST = "manifest.json"
@@ -83,7 +87,8 @@ class Manifest:
         """Bytes of all outputs."""
         return sum(file.size for file in self.outputs.values())
 
-    def to_json(self) -> str:
+    def to_json(self, sealed: bool = False) -> str:
+        """As text; `sealed` with a checksum of all of it, as it is published."""
         identity = self.identity
         data = {
             "stage": identity.stage,
@@ -103,39 +108,55 @@ class Manifest:
             "versions": dict(self.versions),
             "created": self.created,
         }
-        return json.dumps(data, indent=1, allow_nan=False) + "\n"
+        seal = {"checksum": digest(data)} if sealed else {}
+        return json.dumps(data | seal, indent=1, allow_nan=False) + "\n"
 
     @staticmethod
-    def from_json(text: str) -> Manifest:
+    def from_json(text: str | bytes) -> Manifest:
         """Raises ManifestDamaged where the text is not one, or does not agree with its own hashes."""
         try:
-            data = json.loads(text)
-            manifest = Manifest(
-                identity=Identity(
-                    data["stage"],
-                    data["version"],
-                    data["params"],
-                    data["inputs"],
-                    data["sources"],
-                    data.get("previous"),
-                ),
-                outputs={path: OutputFile(**file) for path, file in data["outputs"].items()},
-                numbers=data["numbers"],
-                wall_s=data["wall_s"],
-                cpu_s=data["cpu_s"],
-                peak_rss=data["peak_rss"],
-                versions=data["versions"],
-                created=data["created"],
-            )
-            sound = (
-                manifest.identity.fingerprint == data["fingerprint"]
-                and manifest.outputs_digest == data["outputs_digest"]
-            )
-        except (ValueError, KeyError, TypeError, AttributeError) as error:
-            raise ManifestDamaged(f"not a manifest: {error}") from error
-        if not sound:
+            read = _Written.model_validate_json(text)
+        except ValidationError as error:
+            raise ManifestDamaged(f"not a manifest: {first_problem(error)}") from error
+        identity = Identity(read.stage, read.version, read.params, read.inputs, read.sources, read.previous)
+        manifest = Manifest(
+            identity,
+            read.outputs,
+            read.numbers,
+            read.wall_s,
+            read.cpu_s,
+            read.peak_rss,
+            read.versions,
+            read.created,
+        )
+        data = json.loads(text)
+        checksum = data.pop("checksum", None)  # the first manifests have none
+        agrees = manifest.identity.fingerprint == read.fingerprint and manifest.outputs_digest == read.outputs_digest
+        if not agrees or checksum not in (None, digest(data)):
             raise ManifestDamaged("its hashes do not agree with its contents")
         return manifest
+
+
+class _Written(Record):
+    """A manifest as it lies on the disk."""
+
+    model_config = ConfigDict(extra="ignore")
+
+    stage: str
+    version: int
+    fingerprint: str
+    params: dict[str, Any]
+    inputs: dict[str, str]
+    sources: dict[str, FileDigests | None]
+    previous: str | None = None
+    outputs: dict[PathInside, OutputFile]
+    outputs_digest: str
+    numbers: dict[str, Any]
+    wall_s: float
+    cpu_s: float
+    peak_rss: int
+    versions: dict[str, str]
+    created: str
 
 
 def load_manifest(folder: Path) -> Manifest | None:
@@ -143,12 +164,13 @@ def load_manifest(folder: Path) -> Manifest | None:
 
     Raises:
         ManifestDamaged: there is one, but not a whole one.
+        WorkspaceError: it is a link or no file.
     """
     try:
-        text = (folder / MANIFEST).read_text(encoding="utf-8")
+        text = read_own(folder / MANIFEST)
     except (FileNotFoundError, NotADirectoryError):
         return None
-    except (OSError, UnicodeDecodeError) as error:
+    except OSError as error:
         raise ManifestDamaged(str(error)) from error
     return Manifest.from_json(text)
 

@@ -8,7 +8,10 @@ import tempfile
 import traceback
 import unicodedata
 from collections.abc import Iterator
+from io import TextIOWrapper
 from pathlib import Path
+
+from stages.artifacts.own_files import open_own
 
 TRACEBACKS = "stages.tracebacks"  # the logger whose records go to the log file only
 TRACEBACK_IS = "The full traceback is"
@@ -50,6 +53,9 @@ def where_traceback_is(error: Exception) -> str:
 
 class _LogFile(logging.FileHandler):
     """A log that cannot be written (the disk is full) is no reason to hide the error that says so."""
+
+    def _open(self) -> TextIOWrapper:
+        return open(self.baseFilename, "a", encoding=self.encoding, errors=self.errors, opener=open_own)
 
     def format(self, record: logging.LogRecord) -> str:
         return plain(super().format(record)).replace("\n", "\n    ")  # what starts a line is ours

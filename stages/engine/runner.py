@@ -96,8 +96,9 @@ def run_pipeline(
         workspace.remember(sources, preset, config.model_dump(mode="json"))
         present = Present(workspace, config, SourceDigests(sources, workspace.digest_cache))
         statuses: dict[str, StageStatus] = {}
-        for stage in selected:
+        for stage in pipeline:  # first, so that what is being written from here on is this run's
             workspace.recover(stage.name)
+        for stage in selected:
             status = stage_status(stage, present, statuses)
             with storage_errors(workspace.root, "keeping the photos' digests"):
                 present.digests.save()

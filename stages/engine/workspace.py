@@ -23,11 +23,20 @@ import socket
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
-from pathlib import Path
+from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
 
 import psutil
 
+from stages.artifacts.own_files import (
+    open_own,
+    parse_json,
+    read_own,
+    refuse_foreign,
+    sync,
+    write_own,
+)
+from stages.caches import TEMPORARY
 from stages.engine.locking import take
 from stages.engine.manifest import (
     MANIFEST,
@@ -43,10 +52,15 @@ from stages.errors import WorkspaceError
 from stages.inputs.folders import WORKSPACE_RECORD, is_workspace, readable
 
 FORMAT = 1
+LOCK, WORK, LOG, CONFIG = ".lock", ".work", "hineus.log", "config.yaml"
+# What lies beside the stages' folders; of those in the first row the contents are changed where they lie.
+WRITTEN_IN_PLACE = (LOCK, LOG)
+OWN_FILES = (*WRITTEN_IN_PLACE, WORKSPACE_RECORD, CONFIG, f"{WORKSPACE_RECORD}.tmp", f"{CONFIG}.tmp")
 WORKSPACE_SUFFIX = "_hineus"  # of the folder that is made beside photos
 
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
 NOT_WRITABLE = (errno.EROFS, errno.EACCES, errno.EPERM, errno.ENOTDIR, errno.ENOENT)
+MOST_PID = 1 << 31
 LOCKS_UNSUPPORTED = (errno.ENOLCK, errno.ENOTSUP, errno.ENOSYS)
 
 NEARLY_FULL_BYTES = 1 << 20  # libraries hide "disk full" in errors of their own; less free than this gives it away
@@ -81,20 +95,22 @@ class Workspace:
         self.root = root
         self.record = record
         self._locked = False
+        self._looked_at: set[str] = set()  # stages in whose folders there is nothing but files and folders
 
     @staticmethod
     def open(root: Path, create: bool = False) -> Workspace:
         """Open the workspace at `root`; with `create`, an absent or empty folder becomes one when locked.
 
         Raises:
-            WorkspaceError: there is no workspace, it is of a newer version, it cannot be read, or the folder
-                holds something else, which stages would overwrite.
+            WorkspaceError: there is no workspace, it is of a newer version, it cannot be read, a file of ours in it is
+                a link or no file, or the folder holds something else, which stages would overwrite.
         """
         root = Path(root).absolute()
         _check_name(root)
+        _refuse_foreign_files(root)
         path = root / WORKSPACE_RECORD
         try:
-            text = path.read_text(encoding="utf-8")
+            data = read_own(path)
         except (FileNotFoundError, NotADirectoryError):
             return _new_workspace(root, create)
         except OSError as error:
@@ -102,15 +118,23 @@ class Workspace:
                 f"The workspace {root} cannot be read: {error.strerror}.",
                 "Check who owns the folder with `ls -ld`.",
             ) from error
-        return Workspace(root, _parse_record(text, path))
+        return Workspace(root, _parse_record(data, path))
 
     # ------------------------------------------------------------ where things lie
     def stage_folder(self, stage: str) -> Path:
-        """Where the stage's published outputs lie."""
-        return self.root / stage
+        """Where the stage's published outputs lie.
+
+        Raises:
+            WorkspaceError: there is a link, a pipe or a device among them.
+        """
+        folder = self.root / stage
+        if stage not in self._looked_at:
+            refuse_foreign(folder)
+            self._looked_at.add(stage)
+        return folder
 
     def work_folder(self, stage: str) -> Path:
-        return self.root / ".work" / stage
+        return self.root / WORK / stage
 
     def scratch_folder(self, stage: str) -> Path:
         """What the stage keeps over a kill, such as checkpoints; may not exist."""
@@ -118,15 +142,15 @@ class Workspace:
 
     @property
     def config_path(self) -> Path:
-        return self.root / "config.yaml"
+        return self.root / CONFIG
 
     @property
     def log_path(self) -> Path:
-        return self.root / "hineus.log"
+        return self.root / LOG
 
     @property
     def digest_cache(self) -> Path:
-        return self.root / ".work" / "source_digests.json"
+        return self.root / WORK / "source_digests.json"
 
     # ------------------------------------------------------------ lock
     @contextmanager
@@ -134,14 +158,16 @@ class Workspace:
         """Hold the workspace alone; nests within one object. The kernel frees it however the process ends.
 
         Raises:
-            WorkspaceError: another process holds it, or the folder cannot be written.
+            WorkspaceError: another process holds it, the folder cannot be written, or writing in it would change
+                files elsewhere.
         """
         if self._locked:
             yield
             return
         with storage_errors(self.root, "opening the workspace"):
             self.root.mkdir(parents=True, exist_ok=True)
-            descriptor = os.open(self.root / ".lock", os.O_RDWR | os.O_CREAT, 0o644)
+            _refuse_foreign_files(self.root, in_place=True)
+            descriptor = open_own(self.root / LOCK, os.O_RDWR | os.O_CREAT)
         try:
             self._take(descriptor)
             self._locked = True
@@ -158,7 +184,7 @@ class Workspace:
         try:
             take(descriptor)
         except BlockingIOError:
-            raise _busy_error(self.root, (self.root / ".lock").read_bytes()) from None
+            raise _busy_error(self.root, _lock_holder(self.root)) from None
         except OSError as error:
             # Some network file systems have no locks. Working without one is better than not working.
             if error.errno not in LOCKS_UNSUPPORTED:
@@ -171,15 +197,12 @@ class Workspace:
 
     def in_use(self) -> bool:
         """Whether a process on this machine that took the lock is still there. Takes no lock, so it disturbs none."""
-        try:
-            data = json.loads((self.root / ".lock").read_bytes())
-            return data["host"] == socket.gethostname() and bool(psutil.pid_exists(int(data["pid"])))
-        except (OSError, ValueError, KeyError, TypeError):
-            return False
+        holder = _lock_holder(self.root)
+        return holder is not None and holder.host == socket.gethostname() and bool(psutil.pid_exists(holder.pid))
 
     def is_writing(self, stage: str) -> bool:
-        """Whether the stage's outputs are being written, or were when the process was killed."""
-        return (self.work_folder(stage) / "out").is_dir()
+        """Whether the run that has the lock is writing the stage's outputs; a killed one's are no longer written."""
+        return self.in_use() and (self.work_folder(stage) / "out").is_dir()
 
     # ------------------------------------------------------------ record and settings
     def remember(self, sources: Mapping[str, Path | None], preset: str | None, config: Mapping[str, Any]) -> None:
@@ -195,12 +218,12 @@ class Workspace:
         )
         header = f"# The settings of the last run (preset: {preset or 'none'}). Use them again with --config.\n"
         with storage_errors(self.root, "keeping the settings"):
-            _write(self.root / WORKSPACE_RECORD, json.dumps(asdict(self.record), indent=1) + "\n")
-            _write(self.config_path, header + yaml.safe_dump(jsonable(config), sort_keys=False))
+            write_own(self.root / WORKSPACE_RECORD, json.dumps(asdict(self.record), indent=1) + "\n")
+            write_own(self.config_path, header + yaml.safe_dump(jsonable(config), sort_keys=False))
 
     def _root_of_sources(self, sources: Mapping[str, Path | None]) -> str:
         """The root beside which the sources lie, or lay: of those that are not found yet it is the last run's."""
-        unfound = any(path is not None and not path.exists() for path in sources.values())
+        unfound = any(path is not None and not os.path.exists(path) for path in sources.values())
         return self.record.root if unfound and self.record.root else str(self.root)
 
     # ------------------------------------------------------------ stages
@@ -210,7 +233,10 @@ class Workspace:
         Raises:
             ManifestDamaged: it was, but its manifest is damaged.
         """
-        return load_manifest(self.stage_folder(stage))
+        manifest = load_manifest(self.stage_folder(stage))
+        if manifest is not None and manifest.identity.stage != stage:
+            raise ManifestDamaged(f"it is of stage {manifest.identity.stage}")
+        return manifest
 
     def recover(self, stage: str) -> None:
         """Complete a publication that a crash cut off, drop what a killed stage had written; needs the lock."""
@@ -233,7 +259,7 @@ class Workspace:
             if _scratch_owner(owner) != fingerprint:
                 _remove(scratch)
             scratch.mkdir(parents=True, exist_ok=True)
-            _write(owner, json.dumps({"fingerprint": fingerprint}))
+            write_own(owner, json.dumps({"fingerprint": fingerprint}))
             out.mkdir()
         return out, scratch
 
@@ -249,10 +275,10 @@ class Workspace:
         """
         work = self.work_folder(stage)
         out, old = work / "out", work / "old"
-        text = manifest.to_json()
+        text = manifest.to_json(sealed=True)
         with storage_errors(self.root, f"publishing '{stage}'", needed=len(text)):
             _sync_tree(out)
-            _write(out / MANIFEST, text)
+            write_own(out / MANIFEST, text)
             _replace(out, self.stage_folder(stage), old)
             _remove(old)
             _remove(self.scratch_folder(stage))
@@ -315,24 +341,40 @@ def show_bytes(count: float) -> str:
     return f"{count:.3g} TB"
 
 
-def _busy_error(root: Path, holder: bytes) -> WorkspaceError:
+@dataclass(frozen=True)
+class _Holder:
+    """Who wrote the lock: process, machine, and UTC time."""
+
+    pid: int
+    host: str
+    since: str
+
+
+def _lock_holder(root: Path) -> _Holder | None:
+    """None where the lock says nothing: nobody has it, or what is written there is no lock of ours."""
     try:
-        data = json.loads(holder)
-        pid, host, since = int(data["pid"]), str(data["host"]), str(data["since"])
-    except (ValueError, KeyError, TypeError):
+        data = parse_json(read_own(root / LOCK))
+        pid = int(data["pid"])
+        return _Holder(pid, str(data["host"]), str(data["since"])) if 0 < pid < MOST_PID else None
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+
+
+def _busy_error(root: Path, holder: _Holder | None) -> WorkspaceError:
+    if holder is None:
         return WorkspaceError(
             f"The workspace {root} is in use by another process.",
             "Wait for it to end, or work in another folder with `--workspace DIR`.",
         )
-    here = host == socket.gethostname()
-    if here and not psutil.pid_exists(pid):
+    here = holder.host == socket.gethostname()
+    if here and not psutil.pid_exists(holder.pid):
         return WorkspaceError(
-            f"The workspace {root} is held by a left-over child of process {pid}, which has ended.",
-            f"Find it with `fuser {root / '.lock'}` and end it, then try again.",
+            f"The workspace {root} is held by a left-over child of process {holder.pid}, which has ended.",
+            f"Find it with `fuser {root / LOCK}` and end it, then try again.",
         )
-    stop = f"`kill {pid}`" if here else f"`kill {pid}` on {host}"
+    stop = f"`kill {holder.pid}`" if here else f"`kill {holder.pid}` on {holder.host}"
     return WorkspaceError(
-        f"The workspace {root} is in use by process {pid} on {host} since {since}.",
+        f"The workspace {root} is in use by process {holder.pid} on {holder.host} since {holder.since}.",
         f"Wait for it to end, stop it with {stop}, or work in another folder with `--workspace DIR`.",
     )
 
@@ -347,6 +389,19 @@ def _check_name(root: Path) -> None:
             f"The workspace {readable(str(root))} has a name that is not UTF-8, which OpenCV cannot read.",
             "Choose another folder with `--workspace DIR`, or rename what is in its way with `mv`.",
         ) from error
+
+
+def _refuse_foreign_files(root: Path, in_place: bool = False) -> None:
+    """Raises WorkspaceError where something beside the stages' folders is not what a run leaves there.
+
+    Temporary files of a killed run may be anything: they are never opened again.
+
+    Args:
+        in_place: whether files are going to be written.
+    """
+    for name in OWN_FILES:
+        refuse_foreign(root / name, "file", in_place and name in WRITTEN_IN_PLACE)
+    refuse_foreign(root / WORK, "folder", in_place, but=TEMPORARY)
 
 
 def _new_workspace(root: Path, create: bool) -> Workspace:
@@ -375,13 +430,12 @@ def _no_workspace(root: Path) -> WorkspaceError:
 
 
 def _is_own(path: Path) -> bool:
-    names = (".lock", ".work", "hineus.log", "config.yaml", f"{WORKSPACE_RECORD}.tmp", "config.yaml.tmp")
-    return path.name in names or (path / MANIFEST).is_file()
+    return path.name in (*OWN_FILES, WORK) or (path / MANIFEST).is_file()
 
 
-def _parse_record(text: str, path: Path) -> Record:
+def _parse_record(text: bytes, path: Path) -> Record:
     try:
-        data = json.loads(text)
+        data = parse_json(text)
         found = int(data["format"])
         if found > FORMAT:
             raise WorkspaceError(
@@ -389,14 +443,29 @@ def _parse_record(text: str, path: Path) -> Record:
                 f"this is hineus {_hineus_version()}, which knows formats up to {FORMAT}.",
                 "Get the newer one with `pip install --upgrade hineus`, or use another `--workspace DIR`.",
             )
-        sources = dict(data.get("sources", {}))
         texts = {name: str(data.get(name, "")) for name in ("hineus", "created", "root")}
-        return Record(found, sources, data.get("preset"), **texts)
+        preset = data.get("preset")
+        return Record(found, _sources(data.get("sources", {})), None if preset is None else str(preset), **texts)
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise WorkspaceError(
             f"{path} is damaged ({error}).",
             f"Remove that file and run again with the photos: `rm {path}`. Finished stages are kept.",
         ) from error
+
+
+def _sources(given: Mapping[str, Any]) -> dict[str, str | None]:
+    """Raises ValueError where a path is none or not absolute: what it is relative to would be whoever asks."""
+    for name, place in given.items():
+        if place is not None and not _is_absolute(place):
+            raise ValueError(f"the place of its {name} is {place!r}, not an absolute path")
+    return dict(given)
+
+
+def _is_absolute(place: Any) -> bool:
+    """Whether it is an absolute path here or, in a workspace from there, on another system."""
+    if not isinstance(place, str) or "\0" in place:
+        return False
+    return PurePosixPath(place).is_absolute() or PureWindowsPath(place).is_absolute()
 
 
 def _hineus_version() -> str:
@@ -418,7 +487,7 @@ def _replace(out: Path, final: Path, old: Path) -> None:
     if final.exists():
         final.rename(old)
     out.rename(final)
-    _sync(final.parent)
+    sync(final.parent)
 
 
 def _remove(path: Path) -> None:
@@ -428,36 +497,15 @@ def _remove(path: Path) -> None:
         path.unlink(missing_ok=True)
 
 
-def _write(path: Path, text: str) -> None:
-    """Write a small file whole or not at all, and make sure it is on the disk."""
-    temporary = path.with_name(path.name + ".tmp")
-    with temporary.open("w", encoding="utf-8") as file:
-        file.write(text)
-        file.flush()
-        os.fsync(file.fileno())
-    temporary.replace(path)
-    _sync(path.parent)
-
-
-def _sync(path: Path) -> None:
-    if os.name == "nt":  # it syncs neither folders nor files that are open for reading
-        return
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-
-
 def _sync_tree(folder: Path) -> None:
     for parent, _, files in os.walk(folder, topdown=False):
         for name in files:
-            _sync(Path(parent) / name)
-        _sync(Path(parent))
+            sync(Path(parent) / name)
+        sync(Path(parent))
 
 
 def _scratch_owner(path: Path) -> str | None:
     try:
-        return str(json.loads(path.read_text(encoding="utf-8"))["fingerprint"])
+        return str(parse_json(read_own(path))["fingerprint"])
     except (OSError, ValueError, KeyError, TypeError):
         return None
