@@ -31,7 +31,7 @@ def read_bytes(file: Path, most: int) -> bytes:
     if found.st_size > most:
         raise ValueError(f"it has {found.st_size} bytes, at most {most} are read")
     with file.open("rb") as stream:
-        return stream.read(most)
+        return stream.read(found.st_size)
 
 
 def read_arrays(file: Path) -> dict[str, np.ndarray]:
