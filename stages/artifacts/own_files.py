@@ -109,7 +109,7 @@ def read_own(path: Path) -> bytes:
                 f"{path} has {size:,} bytes; at most {MOST_BYTES:,} are read.",
                 f"It is no file of ours: remove it with `rm {shlex.quote(str(path))}`, and run again.",
             )
-        return file.read(MOST_BYTES)
+        return file.read(size)
 
 
 def parse_json(data: bytes) -> Any:

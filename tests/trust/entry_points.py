@@ -177,7 +177,7 @@ def _matrix(draw: DrawFn, tiny: Tiny, folder: Path) -> Commands:
 
 # ---------------------------------------------------------------- a workspace of someone else, or damaged
 def _record(draw: DrawFn, tiny: Tiny, folder: Path) -> Commands:
-    shutil.copytree(tiny.workspace, folder / "w", copy_function=os.link)
+    shutil.copytree(tiny.workspace, folder / "w")
     records = ["workspace.json", "config.yaml", *(f"{stage}/manifest.json" for stage in STAGES)]
     name = draw(st.sampled_from(records))
     (folder / "w" / name).unlink()
@@ -187,7 +187,7 @@ def _record(draw: DrawFn, tiny: Tiny, folder: Path) -> Commands:
 
 def _artifact(draw: DrawFn, tiny: Tiny, folder: Path) -> Commands:
     """A stage runs on what another one left, which is damaged: at equal size half of the time, which is not seen."""
-    shutil.copytree(tiny.workspace, folder / "w", copy_function=os.link)
+    shutil.copytree(tiny.workspace, folder / "w")
     i = draw(st.integers(0, len(STAGES) - 2))
     files = [
         file
