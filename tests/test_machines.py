@@ -345,7 +345,7 @@ def test_another_package_of_the_same_name_is_found_out(tmp_path: Path, monkeypat
     version = [sys.executable, "-m", "hineus_cli", "--version"]
     ended = subprocess.run(version, capture_output=True, text=True, cwd=REPOSITORY.parent, check=False)
     assert ended.returncode == 1
-    assert ended.stderr.startswith(f"Error: {tmp_path / 'configs'} is found instead of our part")
+    assert ended.stderr.startswith(f"Error: {str(tmp_path / 'configs')!r} is found instead of our part")
     assert "Traceback" not in ended.stderr
 
 

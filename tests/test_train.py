@@ -340,7 +340,7 @@ def test_a_budget_in_minutes_ends_on_time_whatever_the_steps(tmp_path):
 
 def test_without_numba_a_step_is_the_same_and_it_is_said_once(monkeypatch, caplog):
     with_kernels = make_trainer().step(0.5)
-    monkeypatch.setitem(sys.modules, "numba", None)
+    monkeypatch.setitem(sys.modules, "stages.compiling", None)
     acceleration._has_numba.cache_clear()
     try:
         trainer = make_trainer()
