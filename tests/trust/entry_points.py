@@ -17,7 +17,8 @@ from typing import Any
 from hypothesis import strategies as st
 from hypothesis.strategies import DrawFn, SearchStrategy
 from mutations import NUMBERS, WORDS, encoded, wrong_bytes, wrong_text, wrong_tree
-from tiny import RUN, STAGES, Tiny
+from tiny import RUN, STAGES, WITHIN_S, Tiny
+from trust_runs import SECONDS
 
 Commands = Sequence[Sequence[str]]
 TAKING_IN = ("-w", "w", "--until", "ingest", *RUN)
@@ -30,11 +31,13 @@ class EntryPoint:
     Attributes:
         share: its part of all inputs, relative to the others'.
         lay: draws an input into a folder, and gives the commands to try there.
+        seconds: that a command may take.
     """
 
     name: str
     share: int
     lay: Callable[[DrawFn, Tiny, Path], Commands]
+    seconds: float = SECONDS
 
 
 def wrong_file(draw: DrawFn, valid: Path, place: Path) -> None:
@@ -220,7 +223,7 @@ ENTRY_POINTS = (
     EntryPoint("mesh", 12, _mesh),
     EntryPoint("matrix", 3, _matrix),
     EntryPoint("record of a workspace", 8, _record),
-    EntryPoint("artifact of a stage", 6, _artifact),
+    EntryPoint("artifact of a stage", 6, _artifact, WITHIN_S),
 )
 
 
