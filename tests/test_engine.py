@@ -5,9 +5,11 @@ from __future__ import annotations
 import errno
 import json
 import os
+import shutil
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,6 +19,7 @@ from toy_pipeline import LETTERS, MODEL, POSES, TOY, failing, text_artifact, wit
 
 from configs.load import load_config
 from configs.params import Config
+from stages.engine import manifest as manifest_module
 from stages.engine import workspace as workspace_module
 from stages.engine.fingerprint import SourceDigests, file_sha256
 from stages.engine.manifest import MANIFEST, Manifest, ManifestDamaged, OutputFile, load_manifest
@@ -25,7 +28,14 @@ from stages.engine.runner import StageOutcome, run_pipeline
 from stages.engine.stage import StageContext
 from stages.engine.status import Present, StageStatus, pipeline_status
 from stages.engine.workspace import FORMAT, Workspace
-from stages.errors import ConfigError, HineusError, InputError, SystemRequirementError, WorkspaceError
+from stages.errors import (
+    ConfigError,
+    HineusError,
+    InputError,
+    ReconstructionError,
+    SystemRequirementError,
+    WorkspaceError,
+)
 
 REPOSITORY = Path(__file__).parents[1]
 
@@ -164,11 +174,83 @@ def test_missing_and_truncated_outputs_are_made_again(bench: Bench) -> None:
     assert bench.ran() == {"ingest": "output letters.txt damaged (2 bytes, published with 3)"}
 
 
-def test_flipped_bit_is_found_by_hash(bench: Bench) -> None:
+def test_flipped_bits_are_found_in_small_files_at_once_and_in_large_ones_on_request(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
     bench.run()
     (bench.root / "ingest" / "letters.txt").write_text("abX")
+    found = "output letters.txt damaged (contents changed)"
+    assert bench.states()["ingest"] == f"missing: {found}"
+    monkeypatch.setattr(manifest_module, "CHEAP_BYTES", 2)
     assert bench.states()["ingest"].startswith("fresh")
-    assert bench.states(hashes=True)["ingest"] == "missing: output letters.txt damaged (contents changed)"
+    assert bench.states(hashes=True)["ingest"] == f"missing: {found}"
+    monkeypatch.undo()
+    assert bench.ran() == {"ingest": found}
+
+
+DAMAGES: dict[str, Callable[[Path], Any]] = {
+    "flipped": lambda file: file.write_text(file.read_text()[:-1] + "X"),
+    "truncated": lambda file: file.write_text(""),
+    "removed": lambda file: file.unlink(),
+    "a folder": lambda file: (file.unlink(), file.mkdir()),
+    "without manifest": lambda file: (file.parents[1] / MANIFEST).write_text("{"),
+    "gone": lambda file: shutil.rmtree(file.parents[1]),
+}
+
+
+@pytest.mark.parametrize("error", [KeyError("a raw error"), MemoryError(), ReconstructionError("too few", "take more")])
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_a_stage_that_fails_on_damaged_input_names_the_stage_to_run_again(
+    bench: Bench, damage: str, error: Exception
+) -> None:
+    def run(context: StageContext) -> dict[str, Any]:
+        DAMAGES[damage](bench.root / "sfm" / "model" / "poses.txt")  # large, or while the run goes on
+        raise error
+
+    with pytest.raises(WorkspaceError, match=f"{bench.root}/sfm is not as it was published: ") as caught:
+        bench.run(with_stage("undistort", run=run))
+    assert caught.value.hint == f"Make it again: `hineus run --workspace {bench.root} --force sfm`."
+    assert caught.value.__cause__ is error
+    bench.run(force=("sfm",))
+    assert set(bench.states(hashes=True).values()) == {"fresh: nothing changed"}
+
+
+@pytest.mark.parametrize("removed", [False, True])
+def test_a_photo_that_changes_while_it_is_read_is_told(
+    bench: Bench, removed: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    photo = bench.photos / "IMG_1.jpg"
+
+    def run(context: StageContext) -> dict[str, Any]:
+        photo.unlink() if removed else photo.write_text("Blueberry")
+        return TOY[0].run(context)
+
+    def fail(context: StageContext) -> dict[str, Any]:
+        run(context)
+        raise ValueError("a raw error")
+
+    said = f"{photo} was {'removed' if removed else 'changed'} while stage ingest read it"
+    with pytest.raises(InputError, match=said):
+        bench.run(with_stage("ingest", run=fail))
+    photo.write_text("banana")
+    bench.run(with_stage("ingest", run=run))
+    assert f"{said}: the next run takes it in anew" in caplog.text
+    assert bench.ran()["ingest"] == f"photo IMG_1.jpg {'removed' if removed else 'changed'}"
+
+
+def test_looking_at_a_publication_that_is_replaced_this_instant_is_no_error(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench.run()
+    before = Manifest.from_json((bench.root / "sfm" / MANIFEST).read_text())
+    original = manifest_module.file_sha256
+
+    def vanishing(path: Path) -> str:
+        shutil.rmtree(bench.root / "sfm")
+        return original(path)
+
+    monkeypatch.setattr(manifest_module, "file_sha256", vanishing)
+    assert manifest_module.output_problem(bench.root / "sfm", before) == "output model/poses.txt missing"
 
 
 @pytest.mark.parametrize(
