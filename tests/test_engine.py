@@ -342,7 +342,7 @@ def _interrupt_at(monkeypatch: pytest.MonkeyPatch, count: int) -> None:
 
     monkeypatch.setattr(Path, "rename", cut(Path.rename))
     monkeypatch.setattr(Path, "replace", cut(Path.replace))
-    monkeypatch.setattr(workspace_module, "_remove", cut(workspace_module._remove))
+    monkeypatch.setattr(workspace_module, "remove", cut(workspace_module.remove))
 
 
 @pytest.mark.parametrize("count", range(12))

@@ -247,17 +247,17 @@ class Workspace:
                 _replace(out, final, old)
             elif old.exists() and not final.exists():
                 old.rename(final)
-            _remove(old)
-            _remove(out)
+            remove(old)
+            remove(out)
 
     def begin(self, stage: str, fingerprint: str) -> tuple[Path, Path]:
         """An empty `out` folder, and the scratch folder, emptied unless it is of this fingerprint."""
         work = self.work_folder(stage)
         out, scratch, owner = work / "out", self.scratch_folder(stage), work / "scratch.json"
         with storage_errors(self.root, f"starting '{stage}'"):
-            _remove(out)
+            remove(out)
             if _scratch_owner(owner) != fingerprint:
-                _remove(scratch)
+                remove(scratch)
             scratch.mkdir(parents=True, exist_ok=True)
             write_own(owner, json.dumps({"fingerprint": fingerprint}))
             out.mkdir()
@@ -280,8 +280,8 @@ class Workspace:
             _sync_tree(out)
             write_own(out / MANIFEST, text)
             _replace(out, self.stage_folder(stage), old)
-            _remove(old)
-            _remove(self.scratch_folder(stage))
+            remove(old)
+            remove(self.scratch_folder(stage))
 
 
 # ---------------------------------------------------------------- errors of the storage below
@@ -483,14 +483,14 @@ def _is_whole(out: Path) -> bool:
 
 def _replace(out: Path, final: Path, old: Path) -> None:
     """Put `out` where `final` is; `final` waits in `old`. A folder cannot be renamed over a full one."""
-    _remove(old)
+    remove(old)
     if final.exists():
         final.rename(old)
     out.rename(final)
     sync(final.parent)
 
 
-def _remove(path: Path) -> None:
+def remove(path: Path) -> None:
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path)
     else:
