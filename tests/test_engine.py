@@ -361,13 +361,56 @@ def test_crash_between_any_two_steps_of_publishing_recovers(bench: Bench, count:
         try:
             workspace.publish("sfm", manifest)
         except KeyboardInterrupt:
-            assert count < 6
+            assert count < 7
     workspace.recover("sfm")
     found = load_manifest(bench.root / "sfm")
     assert found is not None
     assert found.numbers in (old.numbers, {"new": True})
     assert not (bench.root / ".work" / "sfm" / "old").exists()
     assert bench.ran(sets=("sfm.max_features=200",)) == {}
+
+
+def test_half_removed_scratch_is_not_used(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    workspace = bench.workspace
+    out, scratch = workspace.begin("sfm", "these settings")
+    (scratch / "count").write_text("2")
+    out.rmdir()
+
+    def cut_off(path: Path) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(shutil, "rmtree", cut_off)
+        with pytest.raises(KeyboardInterrupt):
+            workspace.begin("sfm", "others")
+    assert list(workspace.begin("sfm", "these settings")[1].iterdir()) == []
+
+
+def test_a_stage_that_is_asked_for_goes_on_from_no_scratch_of_what_is_published(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def cut_off(out: Path, *_: Path) -> None:
+        raise KeyboardInterrupt
+
+    sets = ("sfm.max_features=200",)
+    bench.run(until="ingest", sets=sets)
+    with monkeypatch.context() as patch:
+        patch.setattr(workspace_module, "_replace", cut_off)
+        with pytest.raises(KeyboardInterrupt):
+            bench.run(sets=sets)
+    outcomes = {outcome.name: outcome for outcome in bench.run(sets=sets, force=("sfm",))}
+    assert outcomes["sfm"].reason == "asked for by --force sfm"
+    assert outcomes["sfm"].numbers["started_at"] == 0
+    assert not list((bench.root / ".work").glob("*/scratch*"))
+
+
+@pytest.mark.parametrize("place", ["sfm/scratch", "sfm/out", "sfm/old", "sfm/scratch.json"])
+@pytest.mark.parametrize("is_folder", [False, True])
+def test_what_lies_in_the_way_of_a_stage_s_own_folders_is_removed(bench: Bench, place: str, is_folder: bool) -> None:
+    inside = bench.root / ".work" / place
+    inside.parent.mkdir(parents=True)
+    inside.mkdir() if is_folder else inside.write_text("x")
+    assert "sfm" in bench.ran()
 
 
 def test_failing_stage_keeps_its_last_publication(bench: Bench) -> None:
