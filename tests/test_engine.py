@@ -19,7 +19,9 @@ from toy_pipeline import LETTERS, MODEL, POSES, TOY, failing, text_artifact, wit
 
 from configs.load import load_config
 from configs.params import Config
+from stages.engine import damage as damage_module
 from stages.engine import manifest as manifest_module
+from stages.engine import status as status_module
 from stages.engine import workspace as workspace_module
 from stages.engine.fingerprint import SourceDigests, file_sha256
 from stages.engine.manifest import MANIFEST, Manifest, ManifestDamaged, OutputFile, load_manifest
@@ -181,7 +183,7 @@ def test_flipped_bits_are_found_in_small_files_at_once_and_in_large_ones_on_requ
     (bench.root / "ingest" / "letters.txt").write_text("abX")
     found = "output letters.txt damaged (contents changed)"
     assert bench.states()["ingest"] == f"missing: {found}"
-    monkeypatch.setattr(manifest_module, "CHEAP_BYTES", 2)
+    monkeypatch.setattr(status_module, "CHEAP_BYTES", 2)
     assert bench.states()["ingest"].startswith("fresh")
     assert bench.states(hashes=True)["ingest"] == f"missing: {found}"
     monkeypatch.undo()
@@ -213,6 +215,20 @@ def test_a_stage_that_fails_on_damaged_input_names_the_stage_to_run_again(
     assert caught.value.__cause__ is error
     bench.run(force=("sfm",))
     assert set(bench.states(hashes=True).values()) == {"fresh: nothing changed"}
+
+
+def test_a_stage_reads_nothing_that_is_damaged(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    bench.run()
+    DAMAGES["flipped"](bench.root / "sfm" / "model" / "poses.txt")
+    monkeypatch.setattr(status_module, "CHEAP_BYTES", 2)  # the file is a large one
+    pipeline = with_stage("undistort", run=failing(lambda: AssertionError("it was run")), version=2)
+    with pytest.raises(WorkspaceError, match=r"output model/poses\.txt damaged") as caught:
+        bench.run(pipeline)
+    assert caught.value.__cause__ is None
+    monkeypatch.setattr(damage_module, "ENOUGH_BYTES", 2)  # and of the largest
+    with pytest.raises(WorkspaceError, match=r"output model/poses\.txt damaged") as caught:
+        bench.run(pipeline)
+    assert str(caught.value.__cause__) == "it was run"
 
 
 @pytest.mark.parametrize("removed", [False, True])

@@ -21,7 +21,7 @@ from stages.engine.fingerprint import FileDigests, Identity, digest, file_sha256
 from stages.engine.system import installed_version
 
 MANIFEST = "manifest.json"
-CHEAP_BYTES = 1 << 24  # of a publication's smallest files are read back at each look: it takes a hundredth of a second
+CHEAP_BYTES = 1 << 24  # of a publication are read back at each look: it takes a hundredth of a second
 
 RECORDED_PACKAGES = (
     "hineus",
@@ -177,15 +177,15 @@ def load_manifest(folder: Path) -> Manifest | None:
     return Manifest.from_json(text)
 
 
-def output_problem(folder: Path, manifest: Manifest, hashes: bool = False) -> str | None:
+def output_problem(folder: Path, manifest: Manifest, most: int | None = CHEAP_BYTES) -> str | None:
     """The first output that is missing or not as published, in words; None where all are there.
 
     Args:
         folder: the published folder.
         manifest: its manifest.
-        hashes: read and hash every file; else only the smallest ones, CHEAP_BYTES in all, and of others the size.
+        most: bytes that are read back and hashed, of the smallest files first; None: all. The others' sizes count.
     """
-    left = None if hashes else CHEAP_BYTES
+    left = most
     for path, expected in sorted(manifest.outputs.items(), key=lambda output: output[1].size):
         if left is not None:
             left -= expected.size
