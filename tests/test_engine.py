@@ -23,6 +23,7 @@ from stages.engine import damage as damage_module
 from stages.engine import manifest as manifest_module
 from stages.engine import status as status_module
 from stages.engine import workspace as workspace_module
+from stages.engine.damage import damage_named
 from stages.engine.fingerprint import SourceDigests, file_sha256
 from stages.engine.manifest import MANIFEST, Manifest, ManifestDamaged, OutputFile, load_manifest
 from stages.engine.resources import ResourceMeter
@@ -229,6 +230,15 @@ def test_a_stage_reads_nothing_that_is_damaged(bench: Bench, monkeypatch: pytest
     with pytest.raises(WorkspaceError, match=r"output model/poses\.txt damaged") as caught:
         bench.run(pipeline)
     assert str(caught.value.__cause__) == "it was run"
+
+
+def test_damage_is_named_outside_of_runs_too(bench: Bench) -> None:
+    bench.run()
+    with pytest.raises(KeyError, match="what has nothing to do with it"), damage_named(bench.workspace, ["sfm"]):
+        raise KeyError("what has nothing to do with it")
+    DAMAGES["flipped"](bench.root / "sfm" / "model" / "poses.txt")
+    with pytest.raises(WorkspaceError, match="not as it was published"), damage_named(bench.workspace, ["sfm"]):
+        raise AssertionError("it was read")
 
 
 @pytest.mark.parametrize("removed", [False, True])
