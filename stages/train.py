@@ -186,7 +186,7 @@ class _Training:
             set_aside(path, str(damage))
             return None
         except ValidationError:
-            set_aside(path, "it is not of training")
+            set_aside(path, "it is not of this version of training")
             return None
         if saved is None:
             return None
