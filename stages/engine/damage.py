@@ -43,10 +43,11 @@ def _refuse_damage(
 
 
 def _problem(workspace: Workspace, stage: str, most: int | None) -> str | None:
+    folder = workspace.stage_folder(stage)
     try:
         manifest = workspace.published(stage)
     except ManifestDamaged as error:
         return f"manifest damaged ({error})"
     if manifest is None:
-        return "it is gone"
-    return output_problem(workspace.stage_folder(stage), manifest, most)
+        return None if folder.is_dir() else "it is gone"
+    return output_problem(folder, manifest, most)
