@@ -22,7 +22,6 @@ log = logging.getLogger(__name__)
 
 PROBE = bytes(1 << 22)  # all compiled code takes about 3 MB, and a full quota may still take some bytes
 TEMPORARY = "tmp-"  # so begin the names of folders of temporary files
-ENOUGH_TEMPORARY = 1 << 29  # bytes; a USDZ with the largest textures takes a third of it
 
 
 # ---------------------------------------------------------------- compiled code
@@ -109,18 +108,16 @@ def _user_id() -> int:
 # ---------------------------------------------------------------- temporary files
 @contextmanager
 def temporary_files(work: Path) -> Iterator[None]:
-    """While this lasts they lie in a new folder in `work`, if the system's place cannot be written or is small.
+    """While this lasts they lie in a new folder in `work`, emptied of what killed processes left there.
 
     `TMPDIR` says so to libraries and other processes.
     """
+    system_temporary()  # so that it is known still
     work.mkdir(parents=True, exist_ok=True)
-    usual = system_temporary()
-    if usual is not None and shutil.disk_usage(usual).free >= min(ENOUGH_TEMPORARY, shutil.disk_usage(work).free):
-        yield
-        return
+    for left in work.glob(f"{TEMPORARY}*"):
+        shutil.rmtree(left, ignore_errors=True)
     before = tempfile.tempdir, os.environ.get("TMPDIR")
     with tempfile.TemporaryDirectory(prefix=TEMPORARY, dir=work, ignore_cleanup_errors=True) as folder:
-        log.info("temporary files lie in the workspace: %s", f"{usual} is nearly full" if usual else "no TMPDIR")
         tempfile.tempdir = os.environ["TMPDIR"] = folder
         try:
             yield
@@ -129,6 +126,7 @@ def temporary_files(work: Path) -> Iterator[None]:
             _restore("TMPDIR", before[1])
 
 
+@cache
 def system_temporary() -> Path | None:
     """The system's folder for temporary files; None where Python would take the current one, as none can be written."""
     try:

@@ -183,8 +183,7 @@ def _by_patch_match(context: StageContext[HeldOutDensifyParams], photos: _Captur
             "Try `--set densify.method=auto`, or `pip install pycolmap-cuda12`.",
         )
     depths = [np.zeros(view.size[::-1], np.float32) for view in photos.views]
-    folder = context.scratch / "patch_match"
-    shutil.rmtree(folder, ignore_errors=True)
+    folder = context.empty_folder("patch_match")
     side = context.params.side
     for k, depth in patch_match_depths(photos.scene, photos.pictures, folder, side, context.progress):
         depths[k] = depth

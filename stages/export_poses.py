@@ -6,10 +6,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from stages.engine.damage import damage_named
 from stages.engine.status import replaced_inputs
 from stages.engine.workspace import Workspace, storage_errors
 from stages.errors import InputError, WorkspaceError
 from stages.place import PLACE
+from stages.sfm import SFM
 from stages.undistort import UNDISTORT
 
 Writer = Callable[[Path, Path, Path, Path], dict[str, Any]]
@@ -19,7 +21,8 @@ def export_poses(workspace: Path, out: Path, write: Writer) -> dict[str, Any]:
     """Write with `write`, one of `stages.posing.exporting`, into the empty or absent folder `out`.
 
     Raises:
-        WorkspaceError: there is no workspace, it has no undistorted photos, or they are of other poses.
+        WorkspaceError: there is no workspace, it has no undistorted photos, or they are of other poses, or
+            damaged.
         InputError: `out` holds something.
     """
     opened = Workspace.open(workspace)
@@ -30,7 +33,8 @@ def export_poses(workspace: Path, out: Path, write: Writer) -> dict[str, Any]:
             f"The workspace {opened.root} has no undistorted photos of its present poses.",
             f"Make them: `hineus undistort --workspace {opened.root}`.",
         )
-    with storage_errors(out, "writing the poses"):
+    stages = (UNDISTORT.name, SFM.name, PLACE.name)
+    with storage_errors(out, "writing the poses"), damage_named(opened, stages):
         out.mkdir(parents=True, exist_ok=True)
-        undistort, sfm, place = (opened.stage_folder(name) for name in ("undistort", "sfm", "place"))
+        undistort, sfm, place = map(opened.stage_folder, stages)
         return write(undistort, sfm, place, out)

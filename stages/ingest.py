@@ -154,14 +154,14 @@ class _Expansion:
         found: dict[str, Path] = {}
         damaged = []
         context = self._context
-        shutil.rmtree(context.scratch / "frames", ignore_errors=True)
+        frames_folder = context.empty_folder("frames")
         for done, (video, file) in enumerate(videos.items()):
 
             def tell(part: float, done: int = done, video: str = video) -> None:
                 context.progress(done + part, len(videos), f"frames of {video}")
 
             try:
-                folder = context.scratch / "frames" / str(done)  # a video's name may be too long
+                folder = frames_folder / str(done)  # a video's name may be too long
                 frames = extract_frames(file, folder, context.params.video_frames, tell)
             except UnusableError as reason:
                 damaged.append(SkippedImage(video, str(reason)))
@@ -177,8 +177,7 @@ class _Expansion:
     ) -> tuple[dict[str, Path], list[SkippedImage]]:
         """Of 360-degree pictures, named as frames of a video are: `pano.jpg/045.jpg`; and what cannot be read."""
         context, done = self._context, 0
-        folder = context.scratch / "views"
-        shutil.rmtree(folder, ignore_errors=True)
+        folder = context.empty_folder("views")
         numbers = {path: str(number) for number, path in enumerate(spheres)}  # names may be too long
 
         def split_one(path: str) -> dict[str, tuple[Path, View]] | SkippedImage:

@@ -11,7 +11,7 @@ from stages.capture.listing import list_captures
 from stages.capture.mask_names import set_masks_aside
 from stages.engine.fingerprint import FileDigests
 from stages.engine.manifest import ManifestDamaged
-from stages.engine.status import previous_to_continue
+from stages.engine.status import previous_to_continue, sound_publication
 from stages.engine.workspace import Workspace
 from stages.errors import WorkspaceError
 from stages.ingest import INGEST
@@ -38,7 +38,7 @@ def what_is_kept(
         forced: stages that run anew in any case.
     """
     try:
-        made = workspace.published(INGEST.name)
+        made = sound_publication(INGEST, workspace)
         before = made.identity.sources.get("photos") if made else None
         if not before or not now or source is None:  # photos that are nowhere to be found are not removed
             return ""

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Literal
 
 from stages import children
-from stages.caches import cache_folder, compiler_folder, system_temporary, why_unusable
+from stages.caches import cache_folder, compiler_folder, why_unusable
 from stages.capture.salient import INSTALL, PACKAGE
 from stages.engine.system import SYSTEM_LIBRARIES, apt_line, installed_version, missing_libraries
 from stages.limits import available_cores, available_memory, nearest_existing, total_memory
@@ -105,7 +105,6 @@ def examine(folder: Path) -> list[Finding]:
         _memory(),
         _disk(folder),
         _compiled_code(),
-        _temporary_files(),
         _names(),
     ]
 
@@ -188,13 +187,6 @@ def _compiled_code() -> Finding:
     if remark and usual in folder.parents:
         return Finding(what, "note", f"kept in {folder}, since {remark}", "set XDG_CACHE_HOME to keep it elsewhere")
     return Finding(what, "ok", f"kept in {folder}")
-
-
-def _temporary_files() -> Finding:
-    what, folder = "temporary files", system_temporary()
-    if folder is None:
-        return Finding(what, "note", "no folder for them can be written: they go to the workspace", "set TMPDIR")
-    return Finding(what, "ok", f"{shutil.disk_usage(folder).free / 1e9:.1f} GB free at {folder}")
 
 
 def _names() -> Finding:

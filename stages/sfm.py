@@ -594,10 +594,9 @@ def _working(context: StageContext[SfmParams]) -> Iterator[Path]:
     """An empty folder for COLMAP, which is seeded; its own log goes to files in there instead of the terminal."""
     import pycolmap
 
-    work = context.scratch / "colmap"
-    shutil.rmtree(work, ignore_errors=True)  # a killed run may have left half a database
+    work = context.empty_folder("colmap")  # a killed run may have left half a database
     folder = work / "log"
-    folder.mkdir(parents=True)
+    folder.mkdir()
     pycolmap.set_random_seed(context.params.seed)
     settings = pycolmap.logging
     before = settings.logtostderr, settings.alsologtostderr, settings.stderrthreshold

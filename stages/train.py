@@ -7,16 +7,15 @@ from __future__ import annotations
 
 import json
 import logging
-import os
 import shutil
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import takewhile
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, NonNegativeFloat, PositiveFloat, PositiveInt, ValidationError
 
 from configs.training import TrainParams
 from stages import artifacts
@@ -35,8 +34,10 @@ from stages.artifacts import (
     SILHOUETTES,
     Pictures,
 )
+from stages.engine.checkpoint import CheckpointDamaged, read_checkpoint, set_aside, write_checkpoint
 from stages.engine.manifest import load_manifest
 from stages.engine.stage import Stage, StageContext
+from stages.engine.workspace import remove
 from stages.errors import InputError, ReconstructionError
 from stages.geometry.cameras import PinholeCameras, PosedScene
 from stages.geometry.normalisation import regrown
@@ -125,6 +126,20 @@ class _Region(NamedTuple):
         return regrown(scene, np.array(self.center), self.radius)
 
 
+class _Saved(BaseModel):
+    """A checkpoint: see `_Training`. `trainer` is its `state`, `metrics` the lines so far."""
+
+    model_config = ConfigDict(allow_inf_nan=False)
+
+    trainer: dict[str, Any]
+    region: tuple[tuple[float, float, float], PositiveFloat] | None
+    looked: bool
+    head_start: float = Field(ge=0, le=1)
+    steps: PositiveInt | None
+    seconds: NonNegativeFloat
+    metrics: str
+
+
 @dataclass
 class _Training:
     """A trainer in a scene, and how much of the budget is spent.
@@ -149,21 +164,43 @@ class _Training:
 
     @classmethod
     def begun(cls, context: StageContext[TrainParams]) -> _Training:
-        """From the checkpoint where there is one, in the region that it is of; else from what was learned before."""
-        scene, saved = context.read(FIRST_SCENE), _checkpoint(context)
-        if saved is None:
+        """From the checkpoint where there is one that fits, in its region; else from what was learned before."""
+        scene = context.read(FIRST_SCENE)
+        training = cls._resumed(context, scene)
+        if training is None:
             training = cls._fresh(context, scene)
-            training.metrics.unlink(missing_ok=True)
-        else:
-            region = _Region(*saved["region"]) if saved["region"] else None
-            scene = region.of(scene) if region else scene
-            trainer = _make_trainer(context, scene)
-            kept = (saved["looked"], saved["head_start"], saved["steps"], saved["seconds"])
-            training = cls(context, scene, trainer, region, *kept)
-            trainer.load_state(saved["trainer"])
-            _cut_after(training.metrics, trainer.step_index)
-            log.info("training goes on from step %d", trainer.step_index)
+            for left in (training.metrics, artifacts.PREVIEWS.load(context.scratch)):
+                remove(left)
+            training.metrics.touch()
         training.started = time.monotonic()
+        return training
+
+    @classmethod
+    def _resumed(cls, context: StageContext[TrainParams], scene: PosedScene) -> _Training | None:
+        """Where the checkpoint ends; None where there is none, or one of no use, which is set aside."""
+        path = artifacts.checkpoint_path(context.scratch)
+        try:
+            state = read_checkpoint(path)
+            saved = None if state is None else _Saved.model_validate(state)
+        except CheckpointDamaged as damage:
+            set_aside(path, str(damage))
+            return None
+        except ValidationError:
+            set_aside(path, "it is not of this version of training")
+            return None
+        if saved is None:
+            return None
+        region = _Region(*saved.region) if saved.region else None
+        scene = region.of(scene) if region else scene
+        kept = (saved.looked, saved.head_start, saved.steps, saved.seconds)
+        training = cls(context, scene, _make_trainer(context, scene), region, *kept)
+        if not training.trainer.fits(saved.trainer):
+            set_aside(path, "it is of another training")
+            return None
+        training.trainer.load_state(saved.trainer)
+        remove(training.metrics)
+        training.metrics.write_text(saved.metrics, encoding="utf-8")
+        log.info("training goes on from step %d", training.trainer.step_index)
         return training
 
     @classmethod
@@ -231,18 +268,17 @@ class _Training:
         log.info("dense points cover %.0f %% of the surface: %d steps", 100 * covered, self.steps)
 
     def save(self) -> None:
-        """Write the checkpoint beside the old one, then take its place: a kill leaves one of the two whole."""
-        import torch
-
-        partial = self.checkpoint.with_suffix(".partial")
-        state = {"trainer": self.trainer.state(), "region": self.region and tuple(self.region), "looked": self.looked}
-        spent = {"head_start": self.head_start, "steps": self.steps, "seconds": self.seconds}
-        torch.save({**state, **spent}, partial)
-        os.replace(partial, self.checkpoint)
-
-    @property
-    def checkpoint(self) -> Path:
-        return artifacts.checkpoint_path(self.context.scratch)
+        """Write the checkpoint."""
+        saved = _Saved(
+            trainer=self.trainer.state(),
+            region=self.region,
+            looked=self.looked,
+            head_start=self.head_start,
+            steps=self.steps,
+            seconds=self.seconds,
+            metrics=self.metrics.read_text(encoding="utf-8"),
+        )
+        write_checkpoint(artifacts.checkpoint_path(self.context.scratch), dict(saved))
 
     @property
     def metrics(self) -> Path:
@@ -532,25 +568,6 @@ def _check(numbers: dict[str, float], step: int) -> None:
             "`--set train.losses.eikonal=1` holds them, `train.terms.eikonal` relaxes them",
             step, numbers["gradient_norm"], low, high,
         )  # fmt: skip
-
-
-def _checkpoint(context: StageContext[TrainParams]) -> dict[str, Any] | None:
-    """What `_Training.save` wrote; None where there is nothing to go on from."""
-    import torch
-
-    path = artifacts.checkpoint_path(context.scratch)
-    if not path.exists():
-        return None
-    saved: dict[str, Any] = torch.load(path, map_location=context.device, weights_only=True)
-    return saved
-
-
-def _cut_after(metrics: Path, step: int) -> None:
-    """Leave out the metric lines after a step: they will be written again."""
-    lines = metrics.read_text(encoding="utf-8").splitlines() if metrics.exists() else []
-    # The lines up to the checkpoint were flushed before it was written; a kill may have cut a later one in half.
-    known = takewhile(lambda line: line.endswith("}") and json.loads(line)["step"] <= step, lines)
-    metrics.write_text("".join(f"{line}\n" for line in known), encoding="utf-8")
 
 
 def _preview(trainer: Any, folder: Path, progress: float) -> None:

@@ -5,9 +5,11 @@ from __future__ import annotations
 import errno
 import json
 import os
+import shutil
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,7 +19,11 @@ from toy_pipeline import LETTERS, MODEL, POSES, TOY, failing, text_artifact, wit
 
 from configs.load import load_config
 from configs.params import Config
+from stages.engine import damage as damage_module
+from stages.engine import manifest as manifest_module
+from stages.engine import status as status_module
 from stages.engine import workspace as workspace_module
+from stages.engine.damage import damage_named
 from stages.engine.fingerprint import SourceDigests, file_sha256
 from stages.engine.manifest import MANIFEST, Manifest, ManifestDamaged, OutputFile, load_manifest
 from stages.engine.resources import ResourceMeter
@@ -25,7 +31,14 @@ from stages.engine.runner import StageOutcome, run_pipeline
 from stages.engine.stage import StageContext
 from stages.engine.status import Present, StageStatus, pipeline_status
 from stages.engine.workspace import FORMAT, Workspace
-from stages.errors import ConfigError, HineusError, InputError, SystemRequirementError, WorkspaceError
+from stages.errors import (
+    ConfigError,
+    HineusError,
+    InputError,
+    ReconstructionError,
+    SystemRequirementError,
+    WorkspaceError,
+)
 
 REPOSITORY = Path(__file__).parents[1]
 
@@ -164,11 +177,106 @@ def test_missing_and_truncated_outputs_are_made_again(bench: Bench) -> None:
     assert bench.ran() == {"ingest": "output letters.txt damaged (2 bytes, published with 3)"}
 
 
-def test_flipped_bit_is_found_by_hash(bench: Bench) -> None:
+def test_flipped_bits_are_found_in_small_files_at_once_and_in_large_ones_on_request(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
     bench.run()
     (bench.root / "ingest" / "letters.txt").write_text("abX")
+    found = "output letters.txt damaged (contents changed)"
+    assert bench.states()["ingest"] == f"missing: {found}"
+    monkeypatch.setattr(status_module, "CHEAP_BYTES", 2)
     assert bench.states()["ingest"].startswith("fresh")
-    assert bench.states(hashes=True)["ingest"] == "missing: output letters.txt damaged (contents changed)"
+    assert bench.states(hashes=True)["ingest"] == f"missing: {found}"
+    monkeypatch.undo()
+    assert bench.ran() == {"ingest": found}
+
+
+DAMAGES: dict[str, Callable[[Path], Any]] = {
+    "flipped": lambda file: file.write_text(file.read_text()[:-1] + "X"),
+    "truncated": lambda file: file.write_text(""),
+    "removed": lambda file: file.unlink(),
+    "a folder": lambda file: (file.unlink(), file.mkdir()),
+    "without manifest": lambda file: (file.parents[1] / MANIFEST).write_text("{"),
+    "gone": lambda file: shutil.rmtree(file.parents[1]),
+}
+
+
+@pytest.mark.parametrize("error", [KeyError("a raw error"), MemoryError(), ReconstructionError("too few", "take more")])
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_a_stage_that_fails_on_damaged_input_names_the_stage_to_run_again(
+    bench: Bench, damage: str, error: Exception
+) -> None:
+    def run(context: StageContext) -> dict[str, Any]:
+        DAMAGES[damage](bench.root / "sfm" / "model" / "poses.txt")  # large, or while the run goes on
+        raise error
+
+    with pytest.raises(WorkspaceError, match=f"{bench.root}/sfm is not as it was published: ") as caught:
+        bench.run(with_stage("undistort", run=run))
+    assert caught.value.hint == f"Make it again: `hineus run --workspace {bench.root} --force sfm`."
+    assert caught.value.__cause__ is error
+    bench.run(force=("sfm",))
+    assert set(bench.states(hashes=True).values()) == {"fresh: nothing changed"}
+
+
+def test_a_stage_reads_nothing_that_is_damaged(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    bench.run()
+    DAMAGES["flipped"](bench.root / "sfm" / "model" / "poses.txt")
+    monkeypatch.setattr(status_module, "CHEAP_BYTES", 2)  # the file is a large one
+    pipeline = with_stage("undistort", run=failing(lambda: AssertionError("it was run")), version=2)
+    with pytest.raises(WorkspaceError, match=r"output model/poses\.txt damaged") as caught:
+        bench.run(pipeline)
+    assert caught.value.__cause__ is None
+    monkeypatch.setattr(damage_module, "ENOUGH_BYTES", 2)  # and of the largest
+    with pytest.raises(WorkspaceError, match=r"output model/poses\.txt damaged") as caught:
+        bench.run(pipeline)
+    assert str(caught.value.__cause__) == "it was run"
+
+
+def test_damage_is_named_outside_of_runs_too(bench: Bench) -> None:
+    bench.run()
+    with pytest.raises(KeyError, match="what has nothing to do with it"), damage_named(bench.workspace, ["sfm"]):
+        raise KeyError("what has nothing to do with it")
+    DAMAGES["flipped"](bench.root / "sfm" / "model" / "poses.txt")
+    with pytest.raises(WorkspaceError, match="not as it was published"), damage_named(bench.workspace, ["sfm"]):
+        raise AssertionError("it was read")
+
+
+@pytest.mark.parametrize("removed", [False, True])
+def test_a_photo_that_changes_while_it_is_read_is_told(
+    bench: Bench, removed: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    photo = bench.photos / "IMG_1.jpg"
+
+    def run(context: StageContext) -> dict[str, Any]:
+        photo.unlink() if removed else photo.write_text("Blueberry")
+        return TOY[0].run(context)
+
+    def fail(context: StageContext) -> dict[str, Any]:
+        run(context)
+        raise ValueError("a raw error")
+
+    said = f"{photo} was {'removed' if removed else 'changed'} while stage ingest read it"
+    with pytest.raises(InputError, match=said):
+        bench.run(with_stage("ingest", run=fail))
+    photo.write_text("banana")
+    bench.run(with_stage("ingest", run=run))
+    assert f"{said}: the next run takes it in anew" in caplog.text
+    assert bench.ran()["ingest"] == f"photo IMG_1.jpg {'removed' if removed else 'changed'}"
+
+
+def test_looking_at_a_publication_that_is_replaced_this_instant_is_no_error(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench.run()
+    before = Manifest.from_json((bench.root / "sfm" / MANIFEST).read_text())
+    original = manifest_module.file_sha256
+
+    def vanishing(path: Path) -> str:
+        shutil.rmtree(bench.root / "sfm")
+        return original(path)
+
+    monkeypatch.setattr(manifest_module, "file_sha256", vanishing)
+    assert manifest_module.output_problem(bench.root / "sfm", before) == "output model/poses.txt missing"
 
 
 @pytest.mark.parametrize(
@@ -260,7 +368,7 @@ def _interrupt_at(monkeypatch: pytest.MonkeyPatch, count: int) -> None:
 
     monkeypatch.setattr(Path, "rename", cut(Path.rename))
     monkeypatch.setattr(Path, "replace", cut(Path.replace))
-    monkeypatch.setattr(workspace_module, "_remove", cut(workspace_module._remove))
+    monkeypatch.setattr(workspace_module, "remove", cut(workspace_module.remove))
 
 
 @pytest.mark.parametrize("count", range(12))
@@ -279,13 +387,56 @@ def test_crash_between_any_two_steps_of_publishing_recovers(bench: Bench, count:
         try:
             workspace.publish("sfm", manifest)
         except KeyboardInterrupt:
-            assert count < 6
+            assert count < 7
     workspace.recover("sfm")
     found = load_manifest(bench.root / "sfm")
     assert found is not None
     assert found.numbers in (old.numbers, {"new": True})
     assert not (bench.root / ".work" / "sfm" / "old").exists()
     assert bench.ran(sets=("sfm.max_features=200",)) == {}
+
+
+def test_half_removed_scratch_is_not_used(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    workspace = bench.workspace
+    out, scratch = workspace.begin("sfm", "these settings")
+    (scratch / "count").write_text("2")
+    out.rmdir()
+
+    def cut_off(path: Path) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(shutil, "rmtree", cut_off)
+        with pytest.raises(KeyboardInterrupt):
+            workspace.begin("sfm", "others")
+    assert list(workspace.begin("sfm", "these settings")[1].iterdir()) == []
+
+
+def test_a_stage_that_is_asked_for_goes_on_from_no_scratch_of_what_is_published(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def cut_off(out: Path, *_: Path) -> None:
+        raise KeyboardInterrupt
+
+    sets = ("sfm.max_features=200",)
+    bench.run(until="ingest", sets=sets)
+    with monkeypatch.context() as patch:
+        patch.setattr(workspace_module, "_replace", cut_off)
+        with pytest.raises(KeyboardInterrupt):
+            bench.run(sets=sets)
+    outcomes = {outcome.name: outcome for outcome in bench.run(sets=sets, force=("sfm",))}
+    assert outcomes["sfm"].reason == "asked for by --force sfm"
+    assert outcomes["sfm"].numbers["started_at"] == 0
+    assert not list((bench.root / ".work").glob("*/scratch*"))
+
+
+@pytest.mark.parametrize("place", ["sfm/scratch", "sfm/out", "sfm/old", "sfm/scratch.json"])
+@pytest.mark.parametrize("is_folder", [False, True])
+def test_what_lies_in_the_way_of_a_stage_s_own_folders_is_removed(bench: Bench, place: str, is_folder: bool) -> None:
+    inside = bench.root / ".work" / place
+    inside.parent.mkdir(parents=True)
+    inside.mkdir() if is_folder else inside.write_text("x")
+    assert "sfm" in bench.ran()
 
 
 def test_failing_stage_keeps_its_last_publication(bench: Bench) -> None:

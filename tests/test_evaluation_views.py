@@ -20,7 +20,7 @@ from hineus_cli.app import app
 from stages import artifacts
 from stages.artifacts import AtlasMesh
 from stages.engine.fingerprint import Identity, file_sha256
-from stages.engine.manifest import Manifest, OutputFile
+from stages.engine.manifest import MANIFEST, Manifest, OutputFile, describe_outputs, load_manifest
 from stages.engine.workspace import Workspace
 from stages.evaluation.photos import images
 from stages.evaluation.photos.images import find_lpips, score_image
@@ -237,12 +237,20 @@ def test_what_is_missing_or_stale_is_explained(workspace, tmp_path):
     assert code == 5
     assert "bake" in refused["error"]["message"]
     assert "another atlas" in refused["error"]["message"]
-    (workspace.stage_folder("train") / "held_out.json").write_text("[]")
+    train = workspace.stage_folder("train")
+    (train / "held_out.json").write_text("[]")
+    manifest = replace(load_manifest(train), outputs=describe_outputs(train))
+    (train / MANIFEST).write_text(manifest.to_json())
     gray = np.full((8, 8, 3), 128, np.uint8)
     publish(workspace, "bake", lambda out: artifacts.write_png(artifacts.BASE_COLOR.load(out), gray))
     code, refused = evaluate(workspace.root)
     assert code == 3
     assert "holds out no photos" in refused["error"]["message"]
     assert "--hold-out 8" in refused["error"]["hint"]
+    (train / "held_out.json").write_text("{}")
+    code, refused = evaluate(workspace.root)
+    assert code == 5
+    assert "output held_out.json damaged (contents changed)" in refused["error"]["message"]
+    assert refused["error"]["hint"].endswith("--force train`.")
     code, refused = evaluate(tmp_path)
     assert code == 5

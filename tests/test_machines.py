@@ -9,6 +9,7 @@ import subprocess
 import sys
 import tempfile
 from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -41,6 +42,13 @@ def no_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     caches.cache_folder.cache_clear()
     yield tmp_path / "temporary"
     caches.cache_folder.cache_clear()
+
+
+@pytest.fixture(autouse=True)
+def _forgotten() -> Iterator[None]:
+    caches.system_temporary.cache_clear()
+    yield
+    caches.system_temporary.cache_clear()
 
 
 # ---------------------------------------------------------------- a place for compiled code
@@ -142,36 +150,20 @@ def test_kernels_compile_for_a_user_who_can_write_neither_home_nor_program(cases
 
 
 # ---------------------------------------------------------------- temporary files
-def test_temporary_files_go_to_the_workspace_where_there_is_no_other_place(
+def test_temporary_files_lie_in_the_workspace_and_go_with_their_process(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(tempfile, "tempdir", None)
     monkeypatch.setattr(tempfile, "_candidate_tempdir_list", lambda: ["/proc/nowhere"])
-    with caches.temporary_files(tmp_path / ".work"):
+    work = tmp_path / ".work"
+    (work / "tmp-killed" / "atlas-x").mkdir(parents=True)
+    (work / "sfm").mkdir()
+    with caches.temporary_files(work):
         with tempfile.NamedTemporaryFile() as file:
-            assert Path(file.name).is_relative_to(tmp_path / ".work")
-        assert Path(os.environ["TMPDIR"]).is_relative_to(tmp_path / ".work")
-    assert list((tmp_path / ".work").iterdir()) == []
-    assert caches.system_temporary() is None
-    assert "they go to the workspace" in machine_check._temporary_files().found
-
-
-def test_temporary_files_go_to_the_workspace_where_the_other_place_is_full(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    small = str(tmp_path / "small")
-    Path(small).mkdir()
-    monkeypatch.setattr(tempfile, "tempdir", small)
-    monkeypatch.setattr(caches.shutil, "disk_usage", lambda path: SimpleNamespace(free=1 if str(path) == small else 9))
-    with caches.temporary_files(tmp_path / ".work"), tempfile.NamedTemporaryFile() as file:
-        assert Path(file.name).is_relative_to(tmp_path / ".work")
-    assert tempfile.gettempdir() == small
-
-
-def test_temporary_files_stay_where_they_are_otherwise(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    with caches.temporary_files(tmp_path / ".work"):
-        assert tempfile.gettempdir() == str(tmp_path)
+            assert Path(file.name).is_relative_to(work)
+        assert Path(os.environ["TMPDIR"]).is_relative_to(work)
+        assert caches.system_temporary() is None
+    assert os.listdir(work) == ["sfm"]
 
 
 # ---------------------------------------------------------------- disks

@@ -208,6 +208,7 @@ def test_a_lock_of_no_process_is_nobody_s(root: Path, pid: object) -> None:
 
 @pytest.mark.parametrize("name", ["workspace.json", ".lock", "sfm/manifest.json", ".work/sfm/scratch.json"])
 def test_a_huge_record_is_not_read(root: Path, name: str) -> None:
+    (root / name).touch()
     os.truncate(root / name, MOST_BYTES * 1000)  # takes no place on the disk
     code, said = invoke("status", root)
     assert (code, f"at most {MOST_BYTES:,} are read" in said) in ((5, True), (0, False))

@@ -318,6 +318,80 @@ def test_a_killed_run_goes_on_with_the_same_loss_curve(tmp_path, monkeypatch, se
     assert list(artifacts.PREVIEWS.load(whole.out).iterdir())
 
 
+def reshaped(state: dict) -> None:
+    state["trainer"]["optimizer"]["state"][0]["exp_avg"] = torch.zeros(3)
+
+
+def of_others(state: dict) -> None:
+    state["trainer"]["fields"] = make_trainer(changed(TINY, {"field.levels": 3})).fields.state_dict()
+
+
+def rewritten(change):
+    def damage(path: Path) -> None:
+        state = torch.load(path, weights_only=True)
+        change(state)
+        torch.save(state, path)
+
+    return damage
+
+
+def flipped(path: Path) -> None:
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 4
+    path.write_bytes(content)
+
+
+DAMAGES = {
+    "flipped": flipped,
+    "no state": rewritten(lambda state: state.update(trainer={})),
+    "of another shape": rewritten(of_others),
+    "moments of another shape": rewritten(reshaped),
+    "no steps": rewritten(lambda state: state.update(steps=0)),
+    "no number": rewritten(lambda state: state.update(seconds=float("nan"))),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_a_damaged_checkpoint_is_set_aside_and_training_starts_over(tmp_path, caplog, damage):
+    training = begun(tmp_path, 0)
+    training.trainer.step(0.0)
+    training.steps = 123
+    training.save()
+    training.metrics.write_text("a line of then")
+    path = artifacts.checkpoint_path(training.context.scratch)
+    aside = path.with_name("checkpoint.pt.damaged")
+    DAMAGES[damage](path)
+    anew = train._Training.begun(training.context)
+    assert (anew.trainer.step_index, anew.steps, anew.metrics.read_text()) == (0, None, "")
+    assert [record.message.split(" (")[0] for record in caplog.records] == ["the checkpoint is damaged"]
+    assert aside.exists()
+    assert not path.exists()
+
+
+def test_what_lies_beside_the_checkpoint_does_not_matter(tmp_path):
+    training = begun(tmp_path, 0)
+    training.metrics.write_text('{"step": 50}\n')
+    training.trainer.step(0.0)
+    training.save()
+    training.metrics.unlink()
+    training.metrics.mkdir()
+    artifacts.checkpoint_path(training.context.scratch).with_name("checkpoint.pt.tmp").mkdir()
+    resumed = train._Training.begun(training.context)
+    assert resumed.trainer.step_index == 1
+    assert resumed.metrics.read_text() == '{"step": 50}\n'
+    resumed.save()
+
+
+def test_a_checkpoint_of_another_device_goes_on_with_rays_of_its_own():
+    started, going_on = make_trainer(), make_trainer()
+    started.step(0.1)
+    state = started.state() | {"generator": torch.zeros(16, dtype=torch.uint8)}  # as CUDA's
+    assert going_on.fits(state)
+    going_on.load_state(state)
+    assert going_on.step_index == 1
+    assert torch.isfinite(going_on.step(0.2)["loss"])
+
+
 def test_the_published_field_answers_in_numpy(tmp_path):
     run_context = context(tmp_path, "out", changed(TINY, {"steps": 3}))
     train.run(run_context)

@@ -160,6 +160,7 @@ class SourceDigests:
         self._cache: dict[str, list[Any]] = _read_cache(cache)
         self._changed = False
         self._files: dict[str, FileDigests | None] = {}
+        self._looks: dict[Path, list[int]] = {}  # size and mtime of each file when it was hashed
 
     def available(self, name: str) -> bool:
         """False where the path was given but is not there (any more), or may not be looked at."""
@@ -189,17 +190,23 @@ class SourceDigests:
         return {readable(path.name): self._digest_file(path)}
 
     def _digest_file(self, path: Path) -> str:
-        stat = path.stat()
+        look = self._looks[path] = _look(path)
         key = str(path.absolute())
         known = self._cache.get(key)
-        if known and known[:2] == [stat.st_size, stat.st_mtime_ns]:
+        if known and known[:2] == look:
             return str(known[2])
         started_ns = time.time_ns()
         sha = file_sha256(path)
-        if stat.st_mtime_ns < started_ns - RACY_NS:
-            self._cache[key] = [stat.st_size, stat.st_mtime_ns, sha]
+        if look[1] < started_ns - RACY_NS:
+            self._cache[key] = [*look, sha]
             self._changed = True
         return sha
+
+    def changed_since(self, name: str) -> Path | None:
+        """A file of source `name` that has been written or removed since it was hashed, if there is one."""
+        root = self.sources.get(name)
+        hashed = [path for path in self._looks if root is not None and path.is_relative_to(root)]
+        return next((path for path in hashed if not path.exists() or _look(path) != self._looks[path]), None)
 
     def save(self) -> None:
         """Write the cache, if it learnt anything."""
@@ -208,6 +215,12 @@ class SourceDigests:
         self._cache_path.parent.mkdir(parents=True, exist_ok=True)
         write_own(self._cache_path, json.dumps(self._cache))
         self._changed = False
+
+
+def _look(path: Path) -> list[int]:
+    """Size and mtime."""
+    found = path.stat()
+    return [found.st_size, found.st_mtime_ns]
 
 
 def _read_cache(path: Path | None) -> dict[str, list[Any]]:

@@ -11,6 +11,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel
 
+from stages.engine.damage import damage_named
 from stages.engine.fingerprint import Identity, SourceDigests
 from stages.engine.manifest import Manifest, current_versions, describe_outputs, jsonable, now
 from stages.engine.resources import ResourceMeter
@@ -197,7 +198,9 @@ def _run_stage(
         previous=workspace.stage_folder(stage.name) if previous else None,
     )
     with ResourceMeter() as meter:
-        numbers = _call(stage, context, workspace, status)
+        numbers = _call(stage, context, present, status)
+    if changed := _changed_source(stage, digests):
+        log.warning("%s while stage %s read it: the next run takes it in anew", changed, stage.name)
     _tell_warnings(numbers, workspace.root)
     manifest = _describe(identity, out, numbers, meter, workspace)
     _check_outputs(stage, manifest)
@@ -205,12 +208,13 @@ def _run_stage(
     return manifest
 
 
-def _call(
-    stage: Stage[Any], context: StageContext[Any], workspace: Workspace, status: StageStatus
-) -> Mapping[str, Any]:
-    """Run the stage; tell of a full disk, a missing library or exhausted memory in the user's terms."""
+def _call(stage: Stage[Any], context: StageContext[Any], present: Present, status: StageStatus) -> Mapping[str, Any]:
+    """Run the stage; tell of damaged or changed input, a full disk, a missing library or memory in the user's terms."""
+    workspace = present.workspace
+    own = [stage.name] if context.previous else []
     try:
-        return stage.run(context) or {}
+        with damage_named(workspace, [*stage.needs, *own]):
+            return stage.run(context) or {}
     except HineusError:
         workspace.discard(stage.name)
         raise
@@ -224,9 +228,21 @@ def _call(
             # The last publication is the best guess at how much this one needs.
             needed = max(status.manifest.size - written if status.manifest else 0, written, 1)
             raise disk_full_error(workspace.root, f"running '{stage.name}'", error, needed) from error
+        if changed := _changed_source(stage, present.digests):
+            raise InputError(
+                f"{changed} while stage {stage.name} read it.", "Run the same command again when nothing writes there."
+            ) from error
         if wanted := requirement_error(error, f"Stage {stage.name}"):
             raise wanted from error
         raise
+
+
+def _changed_source(stage: Stage[Any], digests: SourceDigests) -> str:
+    """Which file of the stage's sources is not as it was when the run began, in words; empty where all are."""
+    for name in stage.sources:
+        if (path := digests.changed_since(name)) is not None:
+            return f"{path} was {'changed' if path.exists() else 'removed'}"
+    return ""
 
 
 def _tell_warnings(numbers: Mapping[str, Any], root: Path) -> None:

@@ -12,7 +12,7 @@ from pydantic import BaseModel
 from stages.artifacts.artifact import Artifact
 from stages.engine.fingerprint import FileDigests
 from stages.engine.manifest import Manifest
-from stages.engine.workspace import Record
+from stages.engine.workspace import Record, remove
 
 T = TypeVar("T")
 P = TypeVar("P")
@@ -82,6 +82,13 @@ class StageContext(Generic[P_co]):
     def write(self, artifact: Artifact[T], value: T) -> None:
         """Put an artifact of this stage into its folder."""
         artifact.save(self.out, value)
+
+    def empty_folder(self, name: str) -> Path:
+        """A folder in `scratch`, emptied of whatever a killed run left."""
+        folder = self.scratch / name
+        remove(folder)
+        folder.mkdir()
+        return folder
 
     def to_write(self, artifact: Artifact[T]) -> T:
         """An artifact of this stage whose value is a place: where to write its files."""

@@ -10,7 +10,7 @@ from pydantic import BaseModel
 
 from configs.renames import section_with_new_names
 from stages.engine.fingerprint import RUN_KEY, FileDigests, Identity, SourceDigests, digest, manifest_key
-from stages.engine.manifest import Manifest, ManifestDamaged, jsonable, output_problem
+from stages.engine.manifest import CHEAP_BYTES, Manifest, ManifestDamaged, jsonable, output_problem
 from stages.engine.stage import Stage
 from stages.engine.workspace import Workspace
 
@@ -60,7 +60,7 @@ def stage_status(
 
     Args:
         earlier: status of (at least) every stage that `stage` needs.
-        hashes: read every output back and compare its hash; sizes are always compared.
+        hashes: read every output back and compare its hash; those of small files are always compared, and sizes.
 
     Raises:
         InputError: a source cannot be read.
@@ -92,16 +92,22 @@ def previous_to_continue(
     """The publication that a run of the stage would go on from: whole, and of the same version and settings.
 
     Args:
-        hashes: read every output back and compare its hash; sizes are always compared.
+        hashes: read every output back and compare its hash; those of small files are always compared, and sizes.
     """
     if not stage.continues:
         return None
-    made, damage = _publication(stage, workspace, hashes)
-    if made is None or damage:
+    made = sound_publication(stage, workspace, hashes)
+    if made is None:
         return None
     before = made.identity
     alike = section_with_new_names(stage.name, before.params) == _params(stage, config)
     return made if alike and before.version == stage.version else None
+
+
+def sound_publication(stage: Stage[Any], workspace: Workspace, hashes: bool = False) -> Manifest | None:
+    """The manifest of what the stage published; None where there is nothing, or it is damaged."""
+    made, damage = _publication(stage, workspace, hashes)
+    return None if damage else made
 
 
 def pipeline_status(pipeline: Sequence[Stage[Any]], present: Present, hashes: bool = False) -> list[StageStatus]:
@@ -135,7 +141,8 @@ def _publication(stage: Stage[Any], workspace: Workspace, hashes: bool) -> tuple
         return None, f"manifest damaged ({error})"
     if manifest is None:
         return None, None
-    return manifest, output_problem(workspace.stage_folder(stage.name), manifest, hashes)
+    most = None if hashes else CHEAP_BYTES
+    return manifest, output_problem(workspace.stage_folder(stage.name), manifest, most)
 
 
 def _identity_now(

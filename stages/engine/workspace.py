@@ -8,8 +8,8 @@
     <root>/.work/<stage>/old      the publication that is being replaced, for an instant
     <root>/.work/<stage>/scratch  survives a kill; emptied on publication or when the fingerprint changes
 
-Publishing: outputs to disk, manifest to disk, old folder moved aside, `out` renamed into place, old folder
-removed. `recover` completes whichever of these steps a crash cut off.
+Publishing: outputs to disk, manifest to disk, `scratch` made nobody's, old folder moved aside, `out` renamed into
+place, old folder and `scratch` removed. `recover` completes whichever of these steps a crash cut off.
 """
 
 from __future__ import annotations
@@ -56,6 +56,7 @@ LOCK, WORK, LOG, CONFIG = ".lock", ".work", "hineus.log", "config.yaml"
 # What lies beside the stages' folders; of those in the first row the contents are changed where they lie.
 WRITTEN_IN_PLACE = (LOCK, LOG)
 OWN_FILES = (*WRITTEN_IN_PLACE, WORKSPACE_RECORD, CONFIG, f"{WORKSPACE_RECORD}.tmp", f"{CONFIG}.tmp")
+SCRATCH_OWNER = "scratch.json"
 WORKSPACE_SUFFIX = "_hineus"  # of the folder that is made beside photos
 
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
@@ -140,6 +141,10 @@ class Workspace:
         """What the stage keeps over a kill, such as checkpoints; may not exist."""
         return self.work_folder(stage) / "scratch"
 
+    def _scratch_owner(self, stage: str) -> Path:
+        """The file with the fingerprint that the scratch folder is of; without one that is nobody's."""
+        return self.work_folder(stage) / SCRATCH_OWNER
+
     @property
     def config_path(self) -> Path:
         return self.root / CONFIG
@@ -218,8 +223,8 @@ class Workspace:
         )
         header = f"# The settings of the last run (preset: {preset or 'none'}). Use them again with --config.\n"
         with storage_errors(self.root, "keeping the settings"):
-            write_own(self.root / WORKSPACE_RECORD, json.dumps(asdict(self.record), indent=1) + "\n")
             write_own(self.config_path, header + yaml.safe_dump(jsonable(config), sort_keys=False))
+            write_own(self.root / WORKSPACE_RECORD, json.dumps(asdict(self.record), indent=1) + "\n")
 
     def _root_of_sources(self, sources: Mapping[str, Path | None]) -> str:
         """The root beside which the sources lie, or lay: of those that are not found yet it is the last run's."""
@@ -244,20 +249,23 @@ class Workspace:
         out, old = work / "out", work / "old"
         with storage_errors(self.root, f"recovering '{stage}'"):
             if _is_whole(out):
+                remove(self._scratch_owner(stage))
                 _replace(out, final, old)
             elif old.exists() and not final.exists():
                 old.rename(final)
-            _remove(old)
-            _remove(out)
+            if _fingerprint_in(self._scratch_owner(stage)) is None:
+                remove(self.scratch_folder(stage))
+            for left in (old, out, work / f"{SCRATCH_OWNER}.tmp"):
+                remove(left)
 
     def begin(self, stage: str, fingerprint: str) -> tuple[Path, Path]:
         """An empty `out` folder, and the scratch folder, emptied unless it is of this fingerprint."""
-        work = self.work_folder(stage)
-        out, scratch, owner = work / "out", self.scratch_folder(stage), work / "scratch.json"
+        out, scratch, owner = self.work_folder(stage) / "out", self.scratch_folder(stage), self._scratch_owner(stage)
         with storage_errors(self.root, f"starting '{stage}'"):
-            _remove(out)
-            if _scratch_owner(owner) != fingerprint:
-                _remove(scratch)
+            remove(out)
+            if _fingerprint_in(owner) != fingerprint or not scratch.is_dir():
+                remove(owner)  # first: a kill may leave half of what it was of
+                remove(scratch)
             scratch.mkdir(parents=True, exist_ok=True)
             write_own(owner, json.dumps({"fingerprint": fingerprint}))
             out.mkdir()
@@ -279,9 +287,10 @@ class Workspace:
         with storage_errors(self.root, f"publishing '{stage}'", needed=len(text)):
             _sync_tree(out)
             write_own(out / MANIFEST, text)
+            remove(self._scratch_owner(stage))
             _replace(out, self.stage_folder(stage), old)
-            _remove(old)
-            _remove(self.scratch_folder(stage))
+            remove(old)
+            remove(self.scratch_folder(stage))
 
 
 # ---------------------------------------------------------------- errors of the storage below
@@ -483,14 +492,14 @@ def _is_whole(out: Path) -> bool:
 
 def _replace(out: Path, final: Path, old: Path) -> None:
     """Put `out` where `final` is; `final` waits in `old`. A folder cannot be renamed over a full one."""
-    _remove(old)
+    remove(old)
     if final.exists():
         final.rename(old)
     out.rename(final)
     sync(final.parent)
 
 
-def _remove(path: Path) -> None:
+def remove(path: Path) -> None:
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path)
     else:
@@ -504,8 +513,8 @@ def _sync_tree(folder: Path) -> None:
         sync(Path(parent))
 
 
-def _scratch_owner(path: Path) -> str | None:
+def _fingerprint_in(path: Path) -> str | None:
     try:
         return str(parse_json(read_own(path))["fingerprint"])
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, KeyError, TypeError, WorkspaceError):
         return None

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from stages import artifacts
+from stages.engine.damage import damage_named
 from stages.engine.workspace import Workspace
 from stages.errors import InputError, WorkspaceError
 from stages.evaluation.surfaces import Surface
@@ -77,11 +78,12 @@ def read_prediction(place: Path) -> tuple[Path, Surface]:
         InputError: it cannot be read.
     """
     path = mesh_path(place)
-    surface = read_surface(path)
     if not place.is_dir():
-        return path, surface
-    in_world = artifacts.WORLD_PLACE.load(Workspace.open(place).stage_folder("place"))
-    return path, surface.moved(in_world.world_from_poses.inverse().matrix())
+        return path, read_surface(path)
+    opened = Workspace.open(place)
+    with damage_named(opened, ["export", "place"]):
+        in_world = artifacts.WORLD_PLACE.load(opened.stage_folder("place"))
+        return path, read_surface(path).moved(in_world.world_from_poses.inverse().matrix())
 
 
 # ---------------------------------------------------------------- cameras
@@ -141,7 +143,8 @@ def workspace_cameras(workspace: Path) -> Cameras:
         raise WorkspaceError(
             f"{workspace} has no undistorted photos.", f"Make them: `hineus undistort --workspace {workspace}`."
         )
-    scene = artifacts.FIRST_SCENE.load(opened.stage_folder("undistort"))
+    with damage_named(opened, ["undistort"]):
+        scene = artifacts.FIRST_SCENE.load(opened.stage_folder("undistort"))
     return Cameras(str(workspace), into_frame(scene.cameras, scene.poses_from_scene.inverse()))
 
 

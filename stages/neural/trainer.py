@@ -349,6 +349,24 @@ class Trainer:
             "step_index": self.step_index,
         }
 
+    def fits(self, state: Any) -> bool:
+        """Whether a state is of networks, an optimiser and photos like these: `load_state` takes no other."""
+        own, groups = self.state(), self.optimizer.param_groups
+        parameters = [parameter for group in groups for parameter in group["params"]]
+        once = torch.zeros(())
+        moments = [{"step": once, "exp_avg": parameter, "exp_avg_sq": parameter} for parameter in parameters]
+        try:
+            counts = [len(group["params"]) for group in state["optimizer"]["param_groups"]]
+            learned = state["optimizer"]["state"].items()
+            return (
+                all(_alike(state[part], own[part]) for part in own.keys() - {"optimizer", "generator"})
+                and counts == [len(group["params"]) for group in groups]
+                and all(_alike(found, moments[i]) for i, found in learned)
+                and isinstance(state["generator"], Tensor)
+            )
+        except (LookupError, TypeError, AttributeError):
+            return False
+
     def load_state(self, state: dict[str, Any]) -> None:
         self.fields.load_state_dict(state["fields"])
         self.optimizer.load_state_dict(state["optimizer"])
@@ -356,5 +374,19 @@ class Trainer:
         self.cache.values.copy_(state["cache"])
         self.cache_step = state["cache_step"]
         self.needed.load_state(state["needed"])
-        self.generator.set_state(state["generator"].cpu())
         self.step_index = state["step_index"]
+        drawn = state["generator"].cpu()
+        if _alike(drawn, self.generator.get_state()) and drawn.dtype == torch.uint8:
+            self.generator.set_state(drawn)
+        else:  # that of a CPU means nothing to a GPU
+            self.generator.manual_seed(self.params.seed + self.step_index)
+
+
+def _alike(state: Any, own: Any) -> bool:
+    """Whether a state has the keys, types and shapes of our own."""
+    if isinstance(own, dict):
+        alike = isinstance(state, dict) and state.keys() == own.keys()
+        return alike and all(_alike(state[key], own[key]) for key in own)
+    if isinstance(own, Tensor):
+        return isinstance(state, Tensor) and state.shape == own.shape
+    return type(state) is type(own)

@@ -10,6 +10,7 @@ import numpy as np
 from stages import artifacts
 from stages.atlas import ATLAS
 from stages.bake import BAKE
+from stages.engine.damage import damage_named
 from stages.engine.status import replaced_inputs
 from stages.engine.workspace import Workspace
 from stages.errors import InputError, WorkspaceError
@@ -35,9 +36,14 @@ def evaluate_views(workspace: Path, renders: Path | None = None, device: str = "
 
     Raises:
         InputError: the workspace holds out no photos.
-        WorkspaceError: a stage is missing, or is of another run than those after it.
+        WorkspaceError: a stage is missing, damaged, or of another run than those after it.
     """
     opened = _whole(workspace)
+    with damage_named(opened, [stage.name for stage in DRAWN_FROM]):
+        return _scored(opened, workspace, renders, device)
+
+
+def _scored(opened: Workspace, workspace: Path, renders: Path | None, device: str) -> dict[str, Any]:
     undistort, train = opened.stage_folder("undistort"), opened.stage_folder("train")
     held_out = artifacts.HELD_OUT.load(train)
     if not held_out:
