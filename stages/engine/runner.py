@@ -12,8 +12,10 @@ from typing import Any, Literal
 from pydantic import BaseModel
 
 from stages.engine.fingerprint import Identity, SourceDigests
+from stages.engine.guard import allocations_end_at_the_limit
 from stages.engine.manifest import Manifest, current_versions, describe_outputs, jsonable, now
 from stages.engine.resources import ResourceMeter
+from stages.engine.shortage import ShortageError, shortage
 from stages.engine.stage import Stage, StageContext
 from stages.engine.status import Present, StageStatus, previous_to_continue, stage_status
 from stages.engine.system import requirement_error
@@ -196,13 +198,29 @@ def _run_stage(
         config=config if stage.reads_run else None,
         previous=workspace.stage_folder(stage.name) if previous else None,
     )
-    with ResourceMeter() as meter:
-        numbers = _call(stage, context, workspace, status)
+    with ResourceMeter() as meter, allocations_end_at_the_limit():
+        numbers = _call_with_less(stage, context, workspace, status)
     _tell_warnings(numbers, workspace.root)
     manifest = _describe(identity, out, numbers, meter, workspace)
     _check_outputs(stage, manifest)
     workspace.publish(stage.name, manifest)
     return manifest
+
+
+def _call_with_less(
+    stage: Stage[Any], context: StageContext[Any], workspace: Workspace, status: StageStatus
+) -> Mapping[str, Any]:
+    """Run the stage; where memory runs out, once more with one thread: each holds a photo or a block of its own."""
+    try:
+        return _call(stage, context, workspace, status)
+    except ShortageError as short:
+        if context.workers == 1:
+            raise
+        log.warning("%s It is tried once more with one thread in place of %d.", short.message, context.workers)
+    # Out here the error, and all that its frames held, is gone.
+    with storage_errors(workspace.root, f"starting '{stage.name}'"):
+        context.out.mkdir()
+    return _call(stage, replace(context, workers=1), workspace, status)
 
 
 def _call(
@@ -224,7 +242,8 @@ def _call(
             # The last publication is the best guess at how much this one needs.
             needed = max(status.manifest.size - written if status.manifest else 0, written, 1)
             raise disk_full_error(workspace.root, f"running '{stage.name}'", error, needed) from error
-        if wanted := requirement_error(error, f"Stage {stage.name}"):
+        who = f"Stage {stage.name}"
+        if wanted := requirement_error(error, who) or shortage(error, who):
             raise wanted from error
         raise
 
