@@ -12,17 +12,41 @@ HOME = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
 def main() -> None:
     """The `hineus` command."""
     leave_current_folder()
+    from hineus_cli.at_once import end_at_once_by_signals
+    from hineus_cli.supervising import supervised
+
+    end_at_once_by_signals()
+    supervised(_run)
+
+
+def _run() -> None:
     if other := shadowed(HOME):
         sys.exit(
             f"Error: {other!r} is found instead of our part of the same name.\n"
             "Leave that folder or PYTHONPATH, or install in an environment of its own: `uv tool install hineus`."
         )
-    try:
-        from hineus_cli.app import main as run
+    from hineus_cli.at_once import sent_by_ourselves, signals_wait
 
-        run()
-    except KeyboardInterrupt:  # before the commands, which say more, can take it
-        sys.exit(130)
+    _bound_threads()
+    with signals_wait():  # libraries start threads
+        from hineus_cli.app import main as run
+        from stages.engine.shortage import too_many_threads
+
+        if sent_by_ourselves():  # by OpenBLAS, where it gets no thread
+            short = too_many_threads("This command")
+            sys.stderr.write(f"Error: {short.message}\n{short.hint}\n")
+            sys.exit(short.exit_code)
+    run()
+
+
+def _bound_threads() -> None:
+    """Tell libraries of a container's quota of cores, before they start a thread for each core of the machine."""
+    from stages.limits import available_cores
+
+    cores = available_cores()
+    if cores < (os.cpu_count() or 1):
+        for variable in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS"):
+            os.environ.setdefault(variable, str(cores))
 
 
 def leave_current_folder() -> None:

@@ -16,6 +16,7 @@ from typing import Annotated, Any, NoReturn
 import typer
 from typer.core import TyperGroup
 
+from hineus_cli.at_once import Stopped
 from hineus_cli.commands.bench import bench
 from hineus_cli.commands.check import check
 from hineus_cli.commands.demo import demo
@@ -27,11 +28,13 @@ from hineus_cli.commands.settings import presets, show_config
 from hineus_cli.commands.status import status
 from hineus_cli.commands.view import view
 from hineus_cli.session import Session, print_json
-from hineus_cli.stopping import GOES_ON, Stopped, stopped_by_signals
+from hineus_cli.stopping import GOES_ON, stopped_by_signals
 from hineus_cli.streams import flush_output, is_output_error, mend_streams
 from stages.engine.run_log import where_traceback_is
+from stages.engine.shortage import shortage
 from stages.engine.stage import Stage
 from stages.engine.system import requirement_error
+from stages.engine.workspace import DISK_FULL
 from stages.errors import ConfigError, HineusError, WorkspaceError
 from stages.pipeline import PIPELINE
 
@@ -48,6 +51,10 @@ class HineusGroup(TyperGroup):
         try:
             with stopped_by_signals():
                 sys.exit(super().main(*args, **extra | {"obj": session, "standalone_mode": False}))
+        except Stopped as stop:
+            with suppress(OSError):  # the terminal may be gone
+                _tell(session, "Stopped", stop.message, GOES_ON, stop.exit_code)
+            sys.exit(stop.exit_code)
         except HineusError as error:
             _end(session, type(error).__name__, error)
         except Exception as error:
@@ -67,11 +74,8 @@ class HineusGroup(TyperGroup):
         try:
             _refuse_no_folder()
             return super().invoke(ctx)
-        except KeyboardInterrupt as interruption:
-            stop = interruption if isinstance(interruption, Stopped) else Stopped(signal.SIGINT)
-            with suppress(OSError):  # the terminal may be gone
-                _tell(ctx.obj, "Stopped", stop.message, GOES_ON, stop.exit_code)
-            raise typer.Exit(stop.exit_code) from None
+        except KeyboardInterrupt:  # where signals are not ours, as in a thread
+            raise Stopped(signal.SIGINT) from None
 
 
 def _refuse_no_folder() -> None:
@@ -91,7 +95,12 @@ def _in_our_terms(session: Session, error: Exception) -> HineusError:
         return ConfigError(" ".join(error.format_message().split()), f"See `{command} --help`.")
     if isinstance(error, typer.Abort) and isinstance(error.__cause__, EOFError):  # typer takes it for Ctrl-D
         error = error.__cause__
-    if lacking := requirement_error(error, "This command"):
+    if isinstance(error, OSError) and error.errno in DISK_FULL:
+        return WorkspaceError(
+            f"The disk is full: {error.filename} cannot be written ({error.strerror}).",
+            "Free some space and try again.",
+        )
+    if lacking := requirement_error(error, "This command") or shortage(error, "This command"):
         return lacking
     stage = session.progress.running if session.progress else None
     where = f" in stage {stage}" if stage else ""

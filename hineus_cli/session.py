@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from hineus_cli.stopping import end_children
+from hineus_cli.at_once import Stopped
+from hineus_cli.stopping import end_children, import_what_takes_signals
 from hineus_cli.streams import stdout_kept_clean
 from stages.engine.stage import Stage
 
@@ -40,19 +41,20 @@ class Session:
 
         set_up_logging(logging.DEBUG if verbose else logging.INFO)
         with stdout_kept_clean() if self.json else nullcontext():
-            yield
+            try:
+                yield
+            except (Stopped, KeyboardInterrupt):
+                end_children()
+                raise
 
     @contextmanager
     def running(self, verbose: bool = False) -> Iterator[ProgressDisplay]:
         """As `working`, with a progress bar for each stage."""
         from hineus_cli.console import ProgressDisplay
 
+        import_what_takes_signals()
         with self.working(verbose), ProgressDisplay() as self.progress:
-            try:
-                yield self.progress
-            except KeyboardInterrupt:
-                end_children()
-                raise
+            yield self.progress
 
 
 def as_argument(path: Path) -> str:

@@ -7,6 +7,7 @@ signal. Nothing is lost by that: stages are published whole, and a run goes on f
 
 from __future__ import annotations
 
+import importlib
 import importlib.util
 import logging
 import os
@@ -14,32 +15,21 @@ import signal
 import socket
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from importlib.machinery import ModuleSpec
 from types import FrameType, ModuleType
 from typing import Any
 
+from hineus_cli.at_once import CRASHES, SIGNALS, Stopped, signals_wait
 from stages.engine.run_log import TRACEBACKS
 
-SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
 TAKES_SIGTERM = "pycolmap"  # its import installs a handler that prints a C++ stack
 GRACE_S = 5.0  # for the main thread to end by itself; half of what `docker stop` and others give before they kill
+ECHO_S = 0.1  # a terminal's signal comes twice, from our parent, too
 TELLING_S = 2.0  # the most that telling of it may take, in a terminal that may be gone
 GOES_ON = "What was finished is kept: run the same command to go on from there."
-
-
-class Stopped(KeyboardInterrupt):
-    """A signal asked the program to end."""
-
-    def __init__(self, number: int) -> None:
-        self.by_ctrl_c = number == signal.SIGINT
-        self.exit_code = 128 + number
-        super().__init__("Ctrl-C" if self.by_ctrl_c else signal.Signals(number).name)
-
-    @property
-    def message(self) -> str:
-        return "Stopped." if self.by_ctrl_c else f"Stopped by {self}."
 
 
 @contextmanager
@@ -51,11 +41,18 @@ def stopped_by_signals() -> Iterator[None]:
     heard, told = socket.socketpair()
     told.setblocking(False)
     stopping = threading.Event()
+    waiting: list[int] = []
 
     def stop(number: int, frame: FrameType | None) -> None:
-        if not stopping.is_set():
+        if imports.under_way:
+            waiting.append(number)
+        elif not stopping.is_set():
             stopping.set()
             raise Stopped(number)
+
+    def imported() -> None:
+        if waiting:
+            stop(waiting[0], None)
 
     before = {number: signal.getsignal(number) for number in SIGNALS}
     ours = [number for number, handler in before.items() if handler != signal.SIG_IGN]
@@ -65,43 +62,87 @@ def stopped_by_signals() -> Iterator[None]:
             for number in ours:
                 signal.signal(number, stop)
 
+    def take_back() -> None:
+        take()
+        if threading.current_thread() is threading.main_thread():
+            for number in CRASHES:  # the handler prints a C++ stack
+                signal.signal(number, signal.SIG_DFL)
+
+    imports = _Imports(take_back, imported)
+    unraisable = sys.unraisablehook
+
+    def tell_unraisable(what: sys.UnraisableHookArgs) -> None:
+        if what.exc_type is not Stopped:  # else it was raised where nothing can be, and the watch ends the process
+            unraisable(what)
+
     take()
+    sys.unraisablehook = tell_unraisable
     former = signal.set_wakeup_fd(told.fileno(), warn_on_full_buffer=False)
-    finder = _TakingBack(take)
-    sys.meta_path.insert(0, finder)
+    sys.meta_path.insert(0, imports)
     threading.Thread(target=_watch, args=(heard, told), name="signals", daemon=True).start()
     try:
         yield
     finally:
         with suppress(ValueError):
-            sys.meta_path.remove(finder)
+            sys.meta_path.remove(imports)
         if not stopping.is_set():  # else the watch goes on: what is left to do at the end may take too long, too
+            sys.unraisablehook = unraisable
             signal.set_wakeup_fd(former)
             for number in ours:
                 signal.signal(number, before[number])
             told.close()
 
 
-class _TakingBack:
-    """Calls `take` once the module that takes a signal for itself was imported."""
+def import_what_takes_signals() -> None:
+    """Import it while there is no thread but ours, none of which can get a signal before it is taken back."""
+    with suppress(ImportError):  # which the stage that needs it tells
+        importlib.import_module(TAKES_SIGTERM)
 
-    def __init__(self, take: Callable[[], None]) -> None:
-        self._take = take
+
+class _Imports:
+    """Finds packages as the others do, and lets signals wait while one is imported in the main thread.
+
+    Some packages catch whatever is raised while they are imported, and go on without a part of theirs.
+
+    Attributes:
+        under_way: how many packages are being imported, each by the one before.
+    """
+
+    def __init__(self, take_back: Callable[[], None], done: Callable[[], None]) -> None:
+        self._take_back, self._done = take_back, done
+        self._looking = False
+        self.under_way = 0
 
     def find_spec(self, name: str, path: Any = None, target: ModuleType | None = None) -> ModuleSpec | None:
-        if name != TAKES_SIGTERM:
+        if path is not None or self._looking or threading.current_thread() is not threading.main_thread():
             return None
-        sys.meta_path.remove(self)
-        spec = importlib.util.find_spec(name)
-        if spec is not None and spec.loader is not None:
+        self._looking = True
+        try:
+            spec = importlib.util.find_spec(name)
+        finally:
+            self._looking = False
+        if spec is not None and spec.loader is not None and spec.has_location:  # others share their loader
             execute = spec.loader.exec_module
 
             def exec_module(module: ModuleType) -> None:
-                execute(module)
-                self._take()
+                self.under_way += 1
+                try:
+                    self._execute(name, execute, module)
+                finally:
+                    self.under_way -= 1
+                if not self.under_way:
+                    self._done()
 
             spec.loader.exec_module = exec_module  # type: ignore[method-assign]
         return spec
+
+    def _execute(self, name: str, execute: Callable[[ModuleType], None], module: ModuleType) -> None:
+        if name != TAKES_SIGTERM:
+            execute(module)
+            return
+        with signals_wait():
+            execute(module)
+            self._take_back()
 
 
 def _watch(heard: socket.socket, told: socket.socket) -> None:
@@ -109,10 +150,14 @@ def _watch(heard: socket.socket, told: socket.socket) -> None:
 
     `told` is held so that it is closed by nobody else than the end of `stopped_by_signals`.
     """
-    with heard:
+    with heard, signals_wait():
         first = heard.recv(1)
         if not first:
             return
+        time.sleep(ECHO_S)
+        heard.settimeout(0)
+        with suppress(BlockingIOError):
+            heard.recv(1)
         heard.settimeout(GRACE_S)
         with suppress(TimeoutError):
             heard.recv(1)

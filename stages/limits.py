@@ -1,11 +1,16 @@
-"""What this process may use: the cores and the memory of the machine, or the less that its container is given."""
+"""What this process may use: cores and memory of the machine, or the less that a container or `ulimit` gives it."""
 
 from __future__ import annotations
 
 import math
 import os
+import sys
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
+
+if sys.platform != "win32":
+    import resource
 
 CONTROL_GROUPS = Path("/sys/fs/cgroup")
 OWN_GROUPS = Path("/proc/self/cgroup")
@@ -18,23 +23,80 @@ def available_cores() -> int:
     return max(1, min([cores, *(math.ceil(quota) for quota in _cpu_quotas())]))
 
 
-def available_memory() -> int:
-    """Bytes of memory that can be taken: free on the machine, and left of its container (`docker run --memory`)."""
+@dataclass(frozen=True)
+class MemoryBound:
+    """One of the limits of the memory that this process may take.
+
+    Attributes:
+        name: of what has the limit, in words.
+        limit, used: bytes.
+        command: raises it; empty where none does.
+    """
+
+    name: str
+    limit: int
+    used: int
+    command: str = ""
+
+    @property
+    def left(self) -> int:
+        return max(0, self.limit - self.used)
+
+
+def memory_bounds() -> Iterator[MemoryBound]:
+    """Of the machine, of the groups (containers) around this process, and of `ulimit`."""
     import psutil
 
-    return max(0, min([psutil.virtual_memory().available, *(limit - used for limit, used in _memory_limits())]))
+    machine = psutil.virtual_memory()
+    yield MemoryBound("this machine", machine.total, machine.total - machine.available)
+    for limit, used in _memory_limits():
+        yield MemoryBound("this container", limit, used)
+    yield from _memory_ulimit()
+
+
+def available_memory() -> int:
+    """Bytes of memory that can be taken: free on the machine, and left of what this process is allowed."""
+    return min(bound.left for bound in memory_bounds())
 
 
 def total_memory() -> int:
-    """Bytes of memory of the machine, or the less that its container is given."""
+    """Bytes of memory of the machine, or the less that this process is allowed."""
+    return min(bound.limit for bound in memory_bounds())
+
+
+def container_memory_left() -> int | None:
+    """Bytes of memory left of this process's container; None where it has no limit below the machine's memory."""
     import psutil
 
-    return min([psutil.virtual_memory().total, *(limit for limit, _ in _memory_limits())])
+    total = psutil.virtual_memory().total
+    return min((max(0, limit - used) for limit, used in _memory_limits() if limit < total), default=None)
+
+
+def open_files() -> int:
+    """How many files this process may have open at once."""
+    return resource.getrlimit(resource.RLIMIT_NOFILE)[0] if sys.platform != "win32" else 8192
+
+
+def largest_file() -> int | None:
+    """Bytes that a file may have (`ulimit -f`); None where there is no limit."""
+    limit = resource.getrlimit(resource.RLIMIT_FSIZE)[0] if sys.platform != "win32" else -1
+    return None if limit < 0 or limit == resource.RLIM_INFINITY else limit
 
 
 def nearest_existing(folder: Path) -> Path:
     """The folder, or the one above it that is there: on the disk on which it will lie."""
     return next(place for place in (folder, *folder.parents) if place.exists())
+
+
+def _memory_ulimit() -> Iterator[MemoryBound]:
+    """The limit of address space, if one was set for this process: all that is mapped counts, used or not."""
+    if sys.platform != "linux":
+        return
+    import psutil
+
+    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+    if limit != resource.RLIM_INFINITY:
+        yield MemoryBound("`ulimit -v`", limit, psutil.Process().memory_info().vms, "ulimit -v unlimited")
 
 
 # ---------------------------------------------------------------- control groups of Linux, versions 1 and 2
@@ -51,18 +113,20 @@ def _cpu_quotas() -> Iterator[float]:
 
 
 def _memory_limits() -> Iterator[tuple[int, int]]:
-    """The bytes that each group around this process may use, and those it does use; files in memory do not count."""
-    names = (
-        ("memory.max", "memory.current", "inactive_file"),
-        ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),
-    )
+    """The bytes that each group around this process may use, and those it does use.
+
+    Files that were read do not count, as they are dropped for what needs their room; but libraries that run do.
+    """
+    names = (("memory.max", "memory.current", ""), ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_"))
     for folder in _groups("memory"):
-        for limit_file, used_file, droppable in names:
+        for limit_file, used_file, prefix in names:
             limit, used = _words(folder / limit_file), _words(folder / used_file)
             if limit and used and limit[0].isdecimal():
                 statistics = _words(folder / "memory.stat")
-                counts = dict(zip(statistics[::2], statistics[1::2], strict=False))
-                yield int(limit[0]), int(used[0]) - int(counts.get(droppable, 0))
+                counts = {name: int(count) for name, count in zip(statistics[::2], statistics[1::2], strict=False)}
+                files = [counts.get(f"{prefix}{kind}_file", 0) for kind in ("inactive", "active")]
+                mapped = counts.get("total_mapped_file" if prefix else "file_mapped", 0)
+                yield int(limit[0]), int(used[0]) - max(0, sum(files) - mapped)
 
 
 def _groups(controller: str) -> Iterator[Path]:

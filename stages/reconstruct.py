@@ -22,7 +22,7 @@ from stages.engine.photos_since import PhotosSince
 from stages.engine.run_log import log_to_file
 from stages.engine.runner import Listener, StageOutcome, naming_command, run_pipeline, source_option
 from stages.engine.stage import Stage
-from stages.engine.workspace import Workspace
+from stages.engine.workspace import Workspace, storage_errors
 from stages.errors import ConfigError, InputError, SystemRequirementError, WorkspaceError
 from stages.inputs.folders import is_workspace
 from stages.kept import what_is_kept
@@ -84,7 +84,8 @@ def reconstruct(request: Request, pipeline: Sequence[Stage], listener: Listener 
     preset, config = choose_config(request, workspace, digests)
     device = choose_device(request.device)
     with workspace.lock(), log_to_file(workspace.log_path), temporary_files(workspace.root / ".work"):
-        digests.save()
+        with storage_errors(workspace.root, "keeping the photos' digests"):
+            digests.save()
         _tell_sources(request, workspace, sources)
         photos = sources["photos"]
         now = (digests.files("photos") if digests.available("photos") else None) or {}

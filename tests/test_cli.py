@@ -293,7 +293,7 @@ UNFORESEEN = [
     (EOFError("too short"), 1, "Unexpected error{}: EOFError: too short."),
     (OSError(5, "Input/output error"), 1, "Unexpected error{}: OSError: [Errno 5] Input/output error."),
     (UnicodeDecodeError("utf-8", b"\xff", 0, 1, "no"), 1, "Unexpected error{}: UnicodeDecodeError: 'utf-8' codec"),
-    (MemoryError(), 6, "ran out of memory: an allocation failed."),
+    (MemoryError(), 6, "ran out of memory: an allocation failed, and "),
     (ModuleNotFoundError("No module named 'laspy'", name="laspy"), 6, "needs the Python package laspy"),
 ]
 

@@ -18,8 +18,9 @@ import psutil
 import pytest
 
 import hineus_cli.__main__
-from hineus_cli.__main__ import leave_current_folder, shadowed
+from hineus_cli.__main__ import _bound_threads, leave_current_folder, shadowed
 from stages import caches, children, limits, machine_check
+from stages.engine import guard, run_log, workspace
 from stages.engine.locking import take
 from stages.engine.system import SYSTEM_LIBRARIES, missing_libraries
 from stages.engine.workspace import storage_errors
@@ -180,8 +181,39 @@ def test_a_quota_is_told_from_a_full_disk(tmp_path: Path, monkeypatch: pytest.Mo
     ):
         raise OSError(errno.EDQUOT, "Disk quota exceeded")
     monkeypatch.setattr(caches.shutil, "disk_usage", lambda path: SimpleNamespace(free=9))
+    with (
+        pytest.raises(WorkspaceError, match="A file became too large while writing"),
+        storage_errors(tmp_path, "writing"),
+    ):
+        raise OSError(errno.EFBIG, "File too large")
     with pytest.raises(WorkspaceError, match="The disk is full"), storage_errors(tmp_path, "writing", needed=10):
         raise OSError(errno.ENOSPC, "No space left on device")
+
+
+def test_a_limit_of_files_sizes_counts_as_a_full_disk_where_a_library_hides_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hidden = RuntimeError("No registered database factory succeeded.")
+    (tmp_path / ".work").mkdir()
+    (tmp_path / ".work" / "database").write_bytes(bytes(2_000_000))
+    monkeypatch.setattr(workspace, "largest_file", lambda: 9_000_000)
+    assert not workspace.is_disk_full(hidden, tmp_path)
+    for limit in (2_001_000, 4096):
+        monkeypatch.setattr(workspace, "largest_file", lambda limit=limit: limit)
+        assert workspace.is_disk_full(hidden, tmp_path)
+        assert "ulimit -f" in workspace.disk_full_error(tmp_path, "running 'sfm'", hidden).hint
+
+
+def test_a_log_that_cannot_be_written_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(path: str, flags: int) -> int:
+        raise PermissionError(errno.EPERM, "Operation not permitted", path)
+
+    monkeypatch.setattr(run_log, "open_own", refuse)
+    with (
+        pytest.raises(WorkspaceError, match="cannot be written while opening its log"),
+        run_log.log_to_file(tmp_path / "hineus.log"),
+    ):
+        pass
 
 
 # ---------------------------------------------------------------- containers' limits
@@ -194,7 +226,7 @@ LIMITED = {
             "box/memory.current": "5\n",
             "memory.max": "4000\n",
             "memory.current": "3000\n",
-            "memory.stat": "anon 2000\ninactive_file 500\n",
+            "memory.stat": "anon 2000\ninactive_file 500\nactive_file 200\nfile_mapped 200\n",
         },
     ),
     "version 1, of a path that only the host sees": (
@@ -252,6 +284,39 @@ def test_without_affinity_all_cores_count(tmp_path: Path, monkeypatch: pytest.Mo
     monkeypatch.delattr(os, "sched_getaffinity")
     monkeypatch.setattr(os, "cpu_count", lambda: 3)
     assert limits.available_cores() == 3
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="limits of address space are told on Linux")
+def test_ulimit_counts(tmp_path: Path) -> None:
+    program = (
+        "import resource; from stages import limits; resource.setrlimit(resource.RLIMIT_AS, (1 << 30, 1 << 30));"
+        "print(limits.total_memory() == 1 << 30, 0 < limits.available_memory() < 1 << 30)"
+    )
+    command = [sys.executable, "-c", program]
+    ended = subprocess.run(command, capture_output=True, text=True, cwd=REPOSITORY, check=True)
+    assert ended.stdout == "True True\n"
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="control groups are Linux'")
+def test_what_a_container_has_not_left_is_not_given(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(guard, "container_memory_left", lambda: 200_000_000)
+    with guard.allocations_end_at_the_limit():
+        np.empty(50_000_000, np.uint8)
+        with pytest.raises(MemoryError):
+            np.empty(2_000_000_000, np.uint8)
+    np.empty(2_000_000_000, np.uint8)
+    monkeypatch.setattr(guard, "container_memory_left", lambda: None)
+    with guard.allocations_end_at_the_limit():
+        np.empty(2_000_000_000, np.uint8)
+
+
+def test_libraries_start_no_more_threads_than_the_container_has_cores(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(limits, "available_cores", lambda: 1)
+    monkeypatch.setattr(os, "cpu_count", lambda: 64)
+    monkeypatch.setenv("OMP_NUM_THREADS", "2")  # somebody's own choice stays
+    monkeypatch.delenv("NUMBA_NUM_THREADS", raising=False)
+    _bound_threads()
+    assert (os.environ["OMP_NUM_THREADS"], os.environ["NUMBA_NUM_THREADS"]) == ("2", "1")
 
 
 # ---------------------------------------------------------------- other systems

@@ -167,6 +167,170 @@ def test_pycolmap_does_not_keep_sigterm_for_itself(tmp_path) -> None:
     assert seconds < 4
 
 
+def run_python(program: str, number: signal.Signals, again: bool = False) -> tuple[int, str]:
+    """Exit code and stderr of a program that is sent a signal, or two at once, when it has printed a line."""
+    environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
+    process = subprocess.Popen(
+        [sys.executable, "-c", textwrap.dedent(program)],
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=lambda: signal.signal(number, signal.SIG_DFL),
+    )
+    assert process.stdout is not None
+    process.stdout.readline()
+    process.send_signal(number)
+    if again:  # as a terminal's, which the supervising parent passes on
+        process.send_signal(number)
+    _, said = process.communicate(timeout=30)
+    return process.returncode, said
+
+
+@pytest.mark.parametrize(
+    ("number", "sentence"),
+    [(signal.SIGTERM, "Stopped by SIGTERM."), (signal.SIGHUP, "Stopped by SIGHUP."), (signal.SIGINT, "Stopped.")],
+)
+def test_a_signal_before_the_command_starts(number, sentence) -> None:
+    program = """
+        from hineus_cli.at_once import end_at_once_by_signals
+        end_at_once_by_signals()
+        import time
+        print("on", flush=True)
+        time.sleep(60)
+    """
+    assert run_python(program, number) == (128 + number, f"Error: {sentence}\n")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_while_arguments_are_read(number) -> None:
+    program = """
+        import sys, time
+        from hineus_cli.app import HineusGroup, build_app
+
+        def parse_args(self, context, arguments):
+            print("on", flush=True)
+            time.sleep(60)
+
+        HineusGroup.parse_args = parse_args
+        build_app()(["status"])
+    """
+    code, said = run_python(program, number)
+    assert code == 128 + number
+    assert said.count("Error: Stopped") == 1
+    assert "Traceback" not in said
+
+
+@pytest.mark.slow
+def test_a_signal_that_comes_twice_is_one() -> None:
+    program = """
+        import sys, time
+        from hineus_cli.app import HineusGroup, build_app
+
+        def parse_args(self, context, arguments):
+            try:
+                print("on", flush=True)
+                time.sleep(60)
+            finally:
+                time.sleep(0.5)
+                print("put in order", file=sys.stderr)
+
+        HineusGroup.parse_args = parse_args
+        build_app()(["status"])
+    """
+    code, said = run_python(program, signal.SIGINT, again=True)
+    assert code == 130
+    assert said.startswith("put in order\nError: Stopped.")
+
+
+@pytest.mark.slow
+def test_a_signal_where_no_exception_can_go_shows_none() -> None:
+    program = """
+        import time
+        from hineus_cli.app import HineusGroup, build_app
+
+        class Slow:
+            def __del__(self):
+                print("on", flush=True)
+                time.sleep(60)
+
+        def parse_args(self, context, arguments):
+            Slow()
+            time.sleep(60)
+
+        HineusGroup.parse_args = parse_args
+        build_app()(["status"])
+    """
+    code, said = run_python(program, signal.SIGTERM)
+    assert code == 143
+    assert "Exception ignored" not in said
+    assert said.count("Error: Stopped by SIGTERM.") == 1
+
+
+def test_signals_wait_for_an_import() -> None:
+    program = """
+        import time
+        from hineus_cli.at_once import end_at_once_by_signals, sent_by_ourselves, signals_wait
+        end_at_once_by_signals()
+        with signals_wait():
+            print("on", flush=True)
+            time.sleep(0.3)
+            assert not sent_by_ourselves()
+            print("imported", file=__import__("sys").stderr)
+        time.sleep(60)
+    """
+    assert run_python(program, signal.SIGTERM) == (143, "imported\nError: Stopped by SIGTERM.\n")
+
+
+@pytest.mark.slow
+def test_a_package_that_catches_everything_while_it_is_imported_keeps_nothing_from_ending(tmp_path) -> None:
+    (tmp_path / "catching.py").write_text(
+        "import time\ntry:\n    print('on', flush=True)\n    time.sleep(1)\nexcept BaseException:\n    pass\n"
+    )
+    program = f"""
+        import sys, time
+        from hineus_cli.app import HineusGroup, build_app
+        sys.path.insert(0, {str(tmp_path)!r})
+
+        def parse_args(self, context, arguments):
+            import catching
+            sys.exit(0)
+
+        HineusGroup.parse_args = parse_args
+        build_app()(["status"])
+    """
+    code, said = run_python(program, signal.SIGTERM)
+    assert (code, said.count("Error: Stopped by SIGTERM.")) == (143, 1)
+
+
+def test_a_library_that_stops_us_is_told_from_a_signal() -> None:
+    program = """
+        import os, signal
+        from hineus_cli.at_once import sent_by_ourselves, signals_wait
+        with signals_wait():
+            signal.raise_signal(signal.SIGINT)  # as OpenBLAS does where it gets no thread
+            assert sent_by_ourselves()
+        os._exit(6)
+    """
+    ended = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(program)],
+        env={**os.environ, "PYTHONPATH": str(REPOSITORY)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (ended.returncode, ended.stderr) == (6, "")
+
+
+@pytest.mark.slow
+def test_a_crash_shows_no_cpp_stack(tmp_path) -> None:
+    run = Run(tmp_path, "lambda context: (__import__('pycolmap'), __import__('os').abort())")
+    code, said, _ = run.end()
+    assert code == -signal.SIGABRT
+    assert "stack trace" not in said
+
+
 @pytest.mark.slow
 def test_the_answer_is_json_too(tmp_path) -> None:
     run = Run(tmp_path, "in_python", "--json")

@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
+from hineus_cli.at_once import Stopped
 from hineus_cli.options import OfWorkspace
-from hineus_cli.stopping import Stopped
 
 
 def view(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import threading
 import time
+from contextlib import suppress
 from types import TracebackType
 
 import psutil
@@ -56,7 +57,8 @@ class ResourceMeter:
     def _watch(self) -> None:
         count = 0
         while not self._stop.wait(INTERVAL_S):
-            self._sample(count)
+            with suppress(MemoryError):  # which is for what is measured to tell
+                self._sample(count)
             count += 1
 
     def _sample(self, count: int) -> None:

@@ -12,6 +12,7 @@ from io import TextIOWrapper
 from pathlib import Path
 
 from stages.artifacts.own_files import open_own
+from stages.engine.workspace import storage_errors
 
 TRACEBACKS = "stages.tracebacks"  # the logger whose records go to the log file only
 TRACEBACK_IS = "The full traceback is"
@@ -66,22 +67,27 @@ class _LogFile(logging.FileHandler):
 
 @contextlib.contextmanager
 def log_to_file(path: Path) -> Iterator[None]:
-    """Everything that is logged inside goes to `path`, too, and the traceback of what is raised."""
-    handler = _LogFile(path, encoding="utf-8", errors="backslashreplace")
+    """Everything that is logged inside goes to `path`, too, and the traceback of what is raised.
+
+    Raises:
+        WorkspaceError: it cannot be written.
+    """
+    with storage_errors(path.parent, "opening its log"):
+        handler = _LogFile(path, encoding="utf-8", errors="backslashreplace")
     handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
     root = logging.getLogger()
     root.addHandler(handler)
     try:
         yield
-    except KeyboardInterrupt as stop:
-        logging.getLogger(TRACEBACKS).warning("stopped by %s", str(stop) or "Ctrl-C")
-        raise
     except SystemExit:  # the console's answer to a pipe that is closed, as by `| head`
         logging.getLogger(TRACEBACKS).warning("stopped, since nobody reads what is printed any more")
         raise
     except Exception as error:
         logging.getLogger(TRACEBACKS).error("the run failed", exc_info=True)
         error.add_note(f"{TRACEBACK_IS} at the end of {path}.")
+        raise
+    except BaseException as stop:  # Ctrl-C, or another signal
+        logging.getLogger(TRACEBACKS).warning("stopped by %s", str(stop) or "Ctrl-C")
         raise
     finally:
         root.removeHandler(handler)

@@ -13,8 +13,10 @@ from pydantic import BaseModel
 
 from stages.engine.damage import damage_named
 from stages.engine.fingerprint import Identity, SourceDigests
+from stages.engine.guard import allocations_end_at_the_limit
 from stages.engine.manifest import Manifest, current_versions, describe_outputs, jsonable, now
 from stages.engine.resources import ResourceMeter
+from stages.engine.shortage import ShortageError, shortage
 from stages.engine.stage import Stage, StageContext
 from stages.engine.status import Present, StageStatus, previous_to_continue, stage_status
 from stages.engine.system import requirement_error
@@ -197,8 +199,8 @@ def _run_stage(
         config=config if stage.reads_run else None,
         previous=workspace.stage_folder(stage.name) if previous else None,
     )
-    with ResourceMeter() as meter:
-        numbers = _call(stage, context, present, status)
+    with ResourceMeter() as meter, allocations_end_at_the_limit():
+        numbers = _call_with_less(stage, context, present, status)
     if changed := _changed_source(stage, digests):
         log.warning("%s while stage %s read it: the next run takes it in anew", changed, stage.name)
     _tell_warnings(numbers, workspace.root)
@@ -206,6 +208,22 @@ def _run_stage(
     _check_outputs(stage, manifest)
     workspace.publish(stage.name, manifest)
     return manifest
+
+
+def _call_with_less(
+    stage: Stage[Any], context: StageContext[Any], present: Present, status: StageStatus
+) -> Mapping[str, Any]:
+    """Run the stage; where memory runs out, once more with one thread: each holds a photo or a block of its own."""
+    try:
+        return _call(stage, context, present, status)
+    except ShortageError as short:
+        if context.workers == 1:
+            raise
+        log.warning("%s It is tried once more with one thread in place of %d.", short.message, context.workers)
+    # Out here the error, and all that its frames held, is gone.
+    with storage_errors(present.workspace.root, f"starting '{stage.name}'"):
+        context.out.mkdir()
+    return _call(stage, replace(context, workers=1), present, status)
 
 
 def _call(stage: Stage[Any], context: StageContext[Any], present: Present, status: StageStatus) -> Mapping[str, Any]:
@@ -232,7 +250,8 @@ def _call(stage: Stage[Any], context: StageContext[Any], present: Present, statu
             raise InputError(
                 f"{changed} while stage {stage.name} read it.", "Run the same command again when nothing writes there."
             ) from error
-        if wanted := requirement_error(error, f"Stage {stage.name}"):
+        who = f"Stage {stage.name}"
+        if wanted := requirement_error(error, who) or shortage(error, who):
             raise wanted from error
         raise
 

@@ -68,9 +68,4 @@ def requirement_error(error: BaseException, who: str) -> SystemRequirementError 
             f"{who} needs the Python package {package}, which is not installed.",
             "Run `pip install hineus` again in this environment, then `hineus doctor`.",
         )
-    if isinstance(error, MemoryError):
-        return SystemRequirementError(
-            f"{who} ran out of memory: {str(error) or 'an allocation failed'}.",
-            "Close other programs, or choose a smaller preset with `--preset tiny`.",
-        )
     return None

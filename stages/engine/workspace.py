@@ -50,6 +50,7 @@ from stages.engine.manifest import (
 from stages.engine.system import installed_version
 from stages.errors import WorkspaceError
 from stages.inputs.folders import WORKSPACE_RECORD, is_workspace, readable
+from stages.limits import largest_file
 
 FORMAT = 1
 LOCK, WORK, LOG, CONFIG = ".lock", ".work", "hineus.log", "config.yaml"
@@ -59,11 +60,12 @@ OWN_FILES = (*WRITTEN_IN_PLACE, WORKSPACE_RECORD, CONFIG, f"{WORKSPACE_RECORD}.t
 SCRATCH_OWNER = "scratch.json"
 WORKSPACE_SUFFIX = "_hineus"  # of the folder that is made beside photos
 
-DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
-NOT_WRITABLE = (errno.EROFS, errno.EACCES, errno.EPERM, errno.ENOTDIR, errno.ENOENT)
+DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+NOT_OF_THE_DISK = (errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.EAGAIN)  # told as what ran out
 MOST_PID = 1 << 31
 LOCKS_UNSUPPORTED = (errno.ENOLCK, errno.ENOTSUP, errno.ENOSYS)
 
+DATABASE_PAGE = 4096
 NEARLY_FULL_BYTES = 1 << 20  # libraries hide "disk full" in errors of their own; less free than this gives it away
 
 
@@ -172,6 +174,7 @@ class Workspace:
         with storage_errors(self.root, "opening the workspace"):
             self.root.mkdir(parents=True, exist_ok=True)
             _refuse_foreign_files(self.root, in_place=True)
+            (self.root / WORK).mkdir(exist_ok=True)
             descriptor = open_own(self.root / LOCK, os.O_RDWR | os.O_CREAT)
         try:
             self._take(descriptor)
@@ -308,7 +311,7 @@ def storage_errors(root: Path, doing: str, needed: int | None = None) -> Iterato
     except OSError as error:
         if error.errno in DISK_FULL:
             raise disk_full_error(root, doing, error, needed) from error
-        if error.errno in NOT_WRITABLE:
+        if error.errno is not None and error.errno not in NOT_OF_THE_DISK:
             raise WorkspaceError(
                 f"The workspace {root} cannot be written while {doing}: {error.strerror} ({error.filename}).",
                 "Make the folder writable, or choose another one with `--workspace DIR`.",
@@ -323,6 +326,12 @@ def disk_full_error(root: Path, doing: str, error: BaseException, needed: int | 
             f"Your quota is used up while {doing}, though the disk at {root} has {show_bytes(free)} free.",
             "Nothing published is lost: free some of yours (`quota -s`) and run the same command again to go on.",
         )
+    if (isinstance(error, OSError) and error.errno == errno.EFBIG) or _has_largest_file(root):
+        return WorkspaceError(
+            f"A file became too large while {doing}, though the disk at {root} has {show_bytes(free)} free.",
+            "Nothing published is lost: allow more with `ulimit -f unlimited`, or, where the file system has no larger "
+            "files, move the workspace; then run the same command again to go on.",
+        )
     least = f"at least {show_bytes(needed)} more needed" if needed else "more is needed"
     return WorkspaceError(
         f"The disk is full while {doing}: {show_bytes(free)} free at {root}, {least}.",
@@ -334,7 +343,16 @@ def is_disk_full(error: BaseException, root: Path) -> bool:
     """Whether a stage failed because the disk is full, also where a library hides that in its own error."""
     if isinstance(error, OSError) and error.errno in DISK_FULL:
         return True
-    return free_bytes(root) < NEARLY_FULL_BYTES
+    return free_bytes(root) < NEARLY_FULL_BYTES or _has_largest_file(root)
+
+
+def _has_largest_file(root: Path) -> bool:
+    """Whether what is being made holds a file as large as is allowed (`ulimit -f`), or next to nothing is allowed."""
+    limit = largest_file()
+    if limit is None or limit < NEARLY_FULL_BYTES:
+        return limit is not None
+    sizes = (path.stat().st_size for path in (root / ".work").rglob("*") if path.is_file())
+    return max(sizes, default=0) > limit - DATABASE_PAGE
 
 
 def free_bytes(root: Path) -> int:
