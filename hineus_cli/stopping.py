@@ -8,7 +8,6 @@ signal. Nothing is lost by that: stages are published whole, and a run goes on f
 from __future__ import annotations
 
 import importlib
-import importlib.util
 import logging
 import os
 import signal
@@ -18,7 +17,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from importlib.machinery import ModuleSpec
+from importlib.machinery import ModuleSpec, PathFinder
 from types import FrameType, ModuleType
 from typing import Any
 
@@ -78,7 +77,7 @@ def stopped_by_signals() -> Iterator[None]:
     take()
     sys.unraisablehook = tell_unraisable
     former = signal.set_wakeup_fd(told.fileno(), warn_on_full_buffer=False)
-    sys.meta_path.insert(0, imports)
+    sys.meta_path.insert(sys.meta_path.index(PathFinder) if PathFinder in sys.meta_path else 0, imports)
     threading.Thread(target=_watch, args=(heard, told), name="signals", daemon=True).start()
     try:
         yield
@@ -100,28 +99,23 @@ def import_what_takes_signals() -> None:
 
 
 class _Imports:
-    """Finds packages as the others do, and lets signals wait while one is imported in the main thread.
+    """Finds modules as `PathFinder` does, and lets signals wait while one is imported in the main thread.
 
-    Some packages catch whatever is raised while they are imported, and go on without a part of theirs.
+    Some modules catch whatever is raised while they are imported, and go on without a part of theirs.
 
     Attributes:
-        under_way: how many packages are being imported, each by the one before.
+        under_way: how many modules are being imported, each by the one before.
     """
 
     def __init__(self, take_back: Callable[[], None], done: Callable[[], None]) -> None:
         self._take_back, self._done = take_back, done
-        self._looking = False
         self.under_way = 0
 
     def find_spec(self, name: str, path: Any = None, target: ModuleType | None = None) -> ModuleSpec | None:
-        if path is not None or self._looking or threading.current_thread() is not threading.main_thread():
+        if threading.current_thread() is not threading.main_thread():
             return None
-        self._looking = True
-        try:
-            spec = importlib.util.find_spec(name)
-        finally:
-            self._looking = False
-        if spec is not None and spec.loader is not None and spec.has_location:  # others share their loader
+        spec = PathFinder.find_spec(name, path, target)
+        if spec is not None and spec.loader is not None and spec.has_location:
             execute = spec.loader.exec_module
 
             def exec_module(module: ModuleType) -> None:
