@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import errno
+import io
+import os
+import stat
+import struct
 import warnings
 from enum import Enum, auto
-from functools import lru_cache
+from functools import lru_cache, wraps
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +27,12 @@ VIDEO_SUFFIXES |= {".mpg", ".mpeg", ".wmv", ".ogv"}
 CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts,mpeg,asf,flv,ogg"
 
 HEAD_BYTES = 512
+# A large picture of fewer bytes is none: it is damaged, or made to fill the memory. JPEG has a byte for some 50 pixels at
+# worst; smaller pictures, as masks and drawings, may well have next to none.
+PIXELS_PER_BYTE, LARGE_PIXELS = 100, 1 << 25
+# Tags of EXIF and TIFF may all stand for the same bytes; together they may stand for so many times those of the file.
+MOST_SHARED = 16
+TAG_BYTES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, 13: 4, 16: 8}  # a value, by type
 TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 RAW = (b"IIU\0", b"IIRO", b"IIRS", b"MMOR", b"FUJIFILMCCD-RAW")  # Panasonic, Olympus, Fujifilm
 HEIF_BRANDS = frozenset({"heic", "heix", "heim", "heis", "hevc", "hevx", "hevm", "hevs", "mif1", "mif2", "msf1"})
@@ -111,21 +122,46 @@ def in_words(head: bytes) -> str:
     return next((words for magic, words in known.items() if head.startswith(magic)), "damaged, or another format")
 
 
+def check_regular(file: Path) -> None:
+    """Pipes would keep us waiting, devices may have no end.
+
+    Raises:
+        OSError: `file` is no regular file, or is not there.
+    """
+    if not stat.S_ISREG(file.stat().st_mode):
+        raise OSError(errno.EINVAL, "a folder, a pipe, a socket or a device", str(file))
+
+
 def read_head_bytes(file: Path) -> bytes:
+    """
+    Raises:
+        OSError: it cannot be read, or is no regular file.
+    """
+    check_regular(file)
     with file.open("rb") as stream:
         return stream.read(HEAD_BYTES)
 
 
-def open_image(file: Any) -> Any:
-    """A picture of a user's (a path, or a stream of bytes) as Pillow's image; nothing is decoded yet.
+def open_image(file: Path | io.BytesIO, expected: int = LARGE_PIXELS) -> Any:
+    """A picture of a user's as Pillow's image; nothing is decoded yet.
+
+    Args:
+        expected: pixels that it may have, however small its file is.
 
     Raises:
-        OSError: it cannot be read, or is of none of `PHOTO_FORMATS`. Damaged files raise nearly anything.
+        OSError: it cannot be read, is of none of `PHOTO_FORMATS`, or claims more pixels than its bytes can stand for.
+            Damaged files raise nearly anything.
     """
     from PIL import Image
 
     register_formats()
+    if isinstance(file, Path):
+        check_regular(file)
     image = Image.open(file, formats=PHOTO_FORMATS)
+    num_bytes = file.stat().st_size if isinstance(file, Path) else file.getbuffer().nbytes
+    if image.width * image.height > max(expected, LARGE_PIXELS, PIXELS_PER_BYTE * num_bytes):
+        image.close()
+        raise OSError(f"it claims {image.width} x {image.height} pixels, which its {num_bytes} bytes cannot be")
     if image.format == "TIFF":
         image.filename = ""  # or Pillow maps the file, and shuffles pixels that EXIF turns by 90 degrees
     return image
@@ -133,10 +169,46 @@ def open_image(file: Any) -> Any:
 
 @lru_cache
 def register_formats() -> None:
-    """Teach Pillow HEIF (it has AVIF and WebP built in), and let readers judge sizes by the memory that is there."""
-    from PIL import Image
+    """Teach Pillow HEIF (it has AVIF and WebP built in), and what not to believe.
+
+    Readers judge sizes by the memory that is there, see `stages.capture.photo_reading`; no limit is fixed.
+    """
+    from PIL import EpsImagePlugin, Image, TiffImagePlugin
     from pillow_heif import register_heif_opener
 
     register_heif_opener()
-    Image.MAX_IMAGE_PIXELS = None  # a fixed limit refuses what phones take; see `stages.capture.photo_reading`
+    Image.MAX_IMAGE_PIXELS = None  # a fixed limit refuses what phones take
+    EpsImagePlugin.gs_binary = False  # no Ghostscript where another library opens a picture, as the texture of a mesh
+    load = TiffImagePlugin.ImageFileDirectory_v2.load
+
+    @wraps(load)
+    def load_checked(directory: Any, stream: Any) -> None:
+        _check_tags(stream, "<" if directory.prefix == b"II" else ">", directory._bigtiff)
+        load(directory, stream)
+
+    TiffImagePlugin.ImageFileDirectory_v2.load = load_checked  # type: ignore[method-assign]
     warnings.filterwarnings("ignore", category=UserWarning, module=r"PIL\.")  # odd EXIF is no news to users
+
+
+def _check_tags(stream: Any, order: str, is_big: bool) -> None:
+    """Hold the bytes that the tags from here on in a TIFF or EXIF claim against those that there are.
+
+    Raises:
+        SyntaxError: they claim far more, see `MOST_SHARED`; Pillow's own error for files that make no sense.
+    """
+    start = stream.tell()
+    total = stream.seek(0, os.SEEK_END)
+    stream.seek(start)
+    count, entry = (struct.Struct(order + form) for form in (("Q", "HHQ8x") if is_big else ("H", "HHL4x")))
+    entries = stream.read(count.size)
+    number = min(count.unpack(entries)[0], total // entry.size) if len(entries) == count.size else 0
+    claimed = 0
+    for _ in range(number):
+        data = stream.read(entry.size)
+        if len(data) < entry.size:
+            break
+        _, kind, values = entry.unpack(data)
+        claimed += min(values * TAG_BYTES.get(kind, 0), total)
+        if claimed > MOST_SHARED * total:
+            raise SyntaxError(f"tags of more than {MOST_SHARED} times its {total} bytes")
+    stream.seek(start)
