@@ -11,13 +11,21 @@ from typing import Any
 import numpy as np
 
 from stages.artifacts import SkippedImage
-from stages.capture.exif import ORIENTATION
 from stages.capture.listing import name_some
 from stages.capture.mask_doubts import MaskLook, is_black_and_white, look
 from stages.capture.mask_fit import outline_fit
 from stages.capture.mask_names import is_mask_folder, pair
-from stages.capture.photo_reading import Photo, PhotoFile, UnusableError, bytes_to_read, memory_for, turned
+from stages.capture.photo_reading import (
+    Photo,
+    PhotoFile,
+    UnusableError,
+    bytes_to_read,
+    memory_for,
+    orientation_of,
+    turned,
+)
 from stages.errors import InputError
+from stages.inputs.bounded import reason
 from stages.inputs.depth import DEPTH, read_depth
 from stages.inputs.folders import named_files, readable
 from stages.inputs.formats import PHOTO_SUFFIXES, open_image
@@ -25,6 +33,7 @@ from stages.inputs.formats import PHOTO_SUFFIXES, open_image
 # A mask's edges may be soft: this much of its range from black or white counts as neither, and as many such pixels as
 # are black (or white) are a photo, a depth map or labels. Masks of the development sets have 0 to 0.02 of them.
 SOFT, MAX_UNCLEAR = 0.1, 0.5
+LARGER = 4  # times its photo's pixels that a mask may have, however well it was packed
 JPEG_NOISE = 8  # a black picture may have values up to this in a JPEG
 MIN_CONTRAST = 0.25  # of the brightest value: less is a picture of one value, and its noise
 ASIDE = "masks among the photos"
@@ -206,7 +215,7 @@ def load_mask(
     if file.name.endswith(DEPTH):
         return _near(file, photo, size)
     try:
-        with open_image(file) as stored, memory_for(stored, max(stored.size)):
+        with open_image(file) as stored, memory_for(stored, file, max(stored.size), LARGER * size[0] * size[1]):
             return _judged(stored, file, photo, size, orientation, black_keeps, pixels)
     except InputError:
         raise
@@ -215,7 +224,9 @@ def load_mask(
             f"The mask {file} cannot be read: {error}.", "Write it smaller: its shape is enough."
         ) from error
     except Exception as error:  # Pillow's decoders raise nearly anything on a damaged file
-        raise InputError(f"The mask {file} cannot be read ({error}).", "Write it again as an 8-bit PNG.") from error
+        raise InputError(
+            f"The mask {file} cannot be read ({reason(error)}).", "Write it again as an 8-bit PNG."
+        ) from error
 
 
 def _judged(
@@ -231,7 +242,7 @@ def _judged(
     from PIL import Image
 
     stored.load()
-    own_orientation = stored.getexif().get(ORIENTATION, 1)
+    own_orientation = orientation_of(stored)
     image = Image.fromarray(_grey(stored))
     candidates = [turned(image, own_orientation), image, turned(image, orientation)]
     fitting = [found for found in candidates if found.size == size]
@@ -240,7 +251,7 @@ def _judged(
     kept = _black_and_white(np.asarray(fitting[0]), stored.format == "JPEG", file, photo)
     if black_keeps:
         np.logical_not(kept, out=kept)
-    if own_orientation in (None, 0, 1) and len(fitting) > 2 and pixels is not None:  # as large either way
+    if own_orientation == 1 and len(fitting) > 2 and pixels is not None:  # as large either way
         kept = _better_turned(kept, turned(Image.fromarray(kept), orientation), pixels)
     found = kept.shape[1], kept.shape[0]
     return Mask(kept if found == size else resized(kept, size), found)

@@ -145,7 +145,7 @@ def _glance(file: Path) -> tuple[tuple[int, int], bytes, np.ndarray | None]:
     with telling_damage(), open_image(file) as stored:
         size, xmp, grey = stored.size, _xmp(stored), None
         if abs(size[0] / size[1] / 2 - 1) <= STRETCH:
-            with memory_for(stored, PREVIEW_SIDE):
+            with memory_for(stored, file, PREVIEW_SIDE):
                 stored.draft("L", (PREVIEW_SIDE, PREVIEW_SIDE // 2))
                 grey = np.asarray(stored.convert("L").reduce(max(1, stored.height // (PREVIEW_SIDE // 2))))
     return size, xmp, grey

@@ -15,7 +15,8 @@ import numpy as np
 
 from stages.capture.colour import Colours, colours_of, in_srgb
 from stages.capture.exif import EXIF_IFD, NO_GPS, ORIENTATION, Gps, camera_key, focal_px, read_gps
-from stages.inputs.formats import TIFF, Kind, kind_of_head, open_image, read_head_bytes
+from stages.inputs.bounded import reason
+from stages.inputs.formats import TIFF, Kind, check_png, kind_of_head, open_image, read_head_bytes
 from stages.limits import available_memory
 
 # What COLMAP's reader takes as it is, with the suffixes that it knows; the rest is re-encoded.
@@ -30,11 +31,12 @@ COLMAP_COMPRESSIONS = frozenset({"raw", "tiff_lzw", "tiff_adobe_deflate"})  # of
 LOSSY_FORMATS = frozenset({"JPEG", "MPO", "WEBP", "HEIF", "AVIF"})
 ANIMATED_FORMATS = frozenset({"WEBP", "AVIF"})  # a HEIF of several pictures is a burst; its first one counts
 
+ORIENTATIONS = range(1, 9)
 TURNED, RAW_TURNED = (5, 6, 7, 8), (5, 6)  # EXIF orientations, and LibRaw's flips, that swap width and height
 TIFF_WIDTH, TIFF_HEIGHT, DNG_VERSION = 256, 257, 50706
 PREVIEW_SIDE = 1000  # pictures are reduced to whole parts not below this; blur that matters still shows
 MIN_SIDE = 64  # a picture smaller than this is an icon or a thumbnail, not a photo
-THINNEST = 16  # nor is a line
+THINNEST, LONGEST = 16, 50  # nor is a line, or a strip: pixels, and times the shorter side
 GREY_16_BIT = ("I;16", "I;16B", "I;16L", "I")
 WITH_ALPHA = ("RGBA", "LA", "PA", "RGBa", "La")
 
@@ -44,6 +46,9 @@ PROGRESSIVE_BYTES = 6  # libjpeg keeps all coefficients of a progressive JPEG, a
 JPEG_MOST_REDUCED = 8
 LARGE_BYTES = 1 << 29  # pictures that take more are read one at a time
 GIB = 1 << 30
+# A picture that takes more memory than this is refused where its file is too small for that: it is damaged, or was made
+# to fill the memory. Photos have a byte for some 50 pixels at worst; drawings and masks have next to none.
+MOST_OF_ANY, MOST_PER_BYTE = GIB, 100 * BYTES_PER_PIXEL
 _large = threading.Lock()
 
 
@@ -123,7 +128,7 @@ def read_photo(file: Path, max_side: int) -> Photo:
     """
     with telling_damage():
         photo = _develop(file, max_side) if _is_raw(file) else _decode(file, max_side)
-    _check_side(photo.size)
+    check_size(photo.size)
     return photo
 
 
@@ -149,8 +154,8 @@ def read_head(file: Path, source: str, max_side: int) -> PhotoFile:
                 stored_size, size = _sizes(stored, exif)
                 needed = bytes_to_read(stored, max_side)
                 colours = colours_of(stored.info, exif, _flat_mode(stored.mode))
-    _check_side(size)
-    _check_memory(size, needed)
+    check_size(size)
+    _check_memory(size, needed, file)
     return PhotoFile(
         source=source,
         width=size[0],
@@ -160,7 +165,7 @@ def read_head(file: Path, source: str, max_side: int) -> PhotoFile:
         bytes_to_read=needed,
         colours=colours,
         gps=read_gps(exif),
-        orientation=exif.get(ORIENTATION) or 1,
+        orientation=_orientation(exif),
     )
 
 
@@ -170,20 +175,26 @@ def read_preview(file: Path) -> tuple[np.ndarray, np.ndarray | None]:
     Raises:
         UnusableError: it cannot be decoded, or is a raw file without rawpy.
     """
-    from PIL import Image, ImageOps
+    from PIL import Image
 
     with telling_damage():
         if _is_raw(file):  # half a second each; the previews in raw files have any size, or are not there
             return np.asarray(_develop(file, PREVIEW_SIDE).rgb), None
-        with open_image(file) as stored, memory_for(stored, PREVIEW_SIDE):
+        with open_image(file) as stored, memory_for(stored, file, PREVIEW_SIDE):
             stored.draft(None, (PREVIEW_SIDE, PREVIEW_SIDE))
             image, alpha = _flat_and_alpha(stored)
             image = in_srgb(image.reduce(max(1, min(image.size) // PREVIEW_SIDE)), Colours())
             if stored.format == "TIFF":  # Pillow has turned it already
                 return np.asarray(image), alpha
+            orientation = orientation_of(stored)
             if alpha is not None:
-                alpha = np.asarray(turned(Image.fromarray(alpha), _exif_of(stored.getexif).get(ORIENTATION)))
-            return np.asarray(ImageOps.exif_transpose(image)), alpha
+                alpha = np.asarray(turned(Image.fromarray(alpha), orientation))
+            return np.asarray(turned(image, orientation)), alpha
+
+
+def orientation_of(stored: Any) -> int:
+    """EXIF's, of a picture that Pillow opened; 1, which is upright, where it says none."""
+    return _orientation(_exif_of(stored.getexif))
 
 
 def turned(image: Any, orientation: int | None) -> Any:
@@ -210,8 +221,9 @@ def _is_raw(file: Path) -> bool:
         return DNG_VERSION in stored.tag_v2  # under another name
 
 
-def _check_side(size: tuple[int, int]) -> None:
-    if max(size) < MIN_SIDE or min(size) < THINNEST:
+def check_size(size: tuple[int, int]) -> None:
+    """Raises UnusableError where a picture of this width and height is no photo."""
+    if max(size) < MIN_SIDE or min(size) < THINNEST or max(size) > LONGEST * min(size):
         raise UnusableError(f"only {size[0]} x {size[1]} pixels")
 
 
@@ -222,27 +234,27 @@ def telling_damage() -> Iterator[None]:
 
     try:
         yield
-    except (UnusableError, MemoryError):
+    except UnusableError:
         raise
     except UnidentifiedImageError as error:
         raise UnusableError("no image, whatever its name says (empty, damaged, or another format)") from error
     except Exception as error:  # decoders raise nearly anything on a damaged file
-        raise UnusableError(f"cannot be read ({error})") from error
+        raise UnusableError(f"cannot be read ({reason(error)})") from error
 
 
 def _decode(file: Path, max_side: int) -> Photo:
     from PIL import Image, ImageOps
 
-    with open_image(file) as stored, memory_for(stored, max_side):
-        if getattr(stored, "n_frames", 1) > 1 and stored.format in ANIMATED_FORMATS:
+    with open_image(file) as stored, memory_for(stored, file, max_side):
+        if stored.format in ANIMATED_FORMATS and getattr(stored, "n_frames", 1) > 1:
             raise UnusableError("an animation")
         if stored.format == "JPEG":
             _check_end(file)
         exif = _exif_of(stored.getexif)  # a PNG's may stand behind its pixels
-        orientation = exif.get(ORIENTATION) or 1  # before `load`, which turns TIFF
+        orientation = _orientation(exif)  # before `load`, which turns TIFF
         stored_size, size = _sizes(stored, exif)
         scale = min(1.0, max_side / max(size))
-        as_is = _colmap_suffixes(stored) if orientation == 1 and scale == 1 else ()
+        as_is = _colmap_suffixes(stored, file) if orientation == 1 and scale == 1 else ()
         colours = colours_of(stored.info, exif, _flat_mode(stored.mode))
         stored.draft(None, (max(1, int(stored.width * scale)), max(1, int(stored.height * scale))))
         stored.load()
@@ -276,19 +288,29 @@ def _exif_of(read: Callable[[], Any]) -> Any:
     return exif
 
 
+def _orientation(exif: Any) -> int:
+    found = exif.get(ORIENTATION)
+    return found if found in ORIENTATIONS else 1
+
+
 def _sizes(stored: Any, exif: Any) -> tuple[tuple[int, int], tuple[int, int]]:
     """Width and height as they are stored, and upright; Pillow gives the latter of a TIFF, and the former of others."""
     size = stored.size
     if stored.format == "TIFF":
         size = stored.tag_v2[TIFF_WIDTH], stored.tag_v2[TIFF_HEIGHT]
-    return size, size[::-1] if exif.get(ORIENTATION) in TURNED else size
+    return size, size[::-1] if _orientation(exif) in TURNED else size
 
 
-def _colmap_suffixes(stored: Any) -> tuple[str, ...]:
-    """The suffixes under which COLMAP reads these pixels, 8-bit RGB, from the file itself."""
+def _colmap_suffixes(stored: Any, file: Path) -> tuple[str, ...]:
+    """The suffixes under which COLMAP, and OpenCV, read these pixels, 8-bit RGB, from the file itself."""
     if stored.mode != "RGB" or (stored.tile and "16" in str(stored.tile[0][3])):
         return ()
-    if stored.format == "TIFF" and (stored.n_frames > 1 or stored.info.get("compression") not in COLMAP_COMPRESSIONS):
+    if stored.format == "PNG":
+        try:
+            check_png(file)
+        except ValueError:  # behind the pixels
+            return ()
+    if stored.format == "TIFF" and (stored.is_animated or stored.info.get("compression") not in COLMAP_COMPRESSIONS):
         return ()
     return COLMAP_SUFFIXES.get(stored.format, ())
 
@@ -320,18 +342,21 @@ def _flat_and_alpha(image: Any) -> tuple[Any, np.ndarray | None]:
 
 # ---------------------------------------------------------------- memory
 @contextmanager
-def memory_for(stored: Any, max_side: int) -> Iterator[None]:
+def memory_for(stored: Any, file: Path, max_side: int, expected: int = 0) -> Iterator[None]:
     """While a picture that Pillow opened is read: large ones take turns.
 
+    Args:
+        expected: pixels that it may have, however few bytes its `file` has.
+
     Raises:
-        UnusableError: the memory that is free is not enough.
+        UnusableError: the memory that is free is not enough, or more than its bytes can stand for.
     """
     needed = bytes_to_read(stored, max_side)
     if needed < LARGE_BYTES:
         yield
         return
     with _large:
-        _check_memory(stored.size, needed)
+        _check_memory(stored.size, needed, file, expected)
         yield
 
 
@@ -348,12 +373,15 @@ def _bytes_of(size: tuple[int, int]) -> int:
     return BYTES_PER_PIXEL * size[0] * size[1]
 
 
-def _check_memory(size: tuple[int, int], needed: int) -> None:
-    """Raises UnusableError where reading a picture of `size` takes more memory than is free."""
+def _check_memory(size: tuple[int, int], needed: int, file: Path, expected: int = 0) -> None:
+    """Raises UnusableError where reading a picture of `size` takes more memory than is free, or than it may."""
     if needed >= LARGE_BYTES and needed > (free := available_memory()):
         raise UnusableError(
             f"{size[0]} x {size[1]} pixels take {needed / GIB:.1f} GiB of memory to read, {free / GIB:.1f} are free"
         )
+    num_bytes = file.stat().st_size
+    if needed > max(MOST_OF_ANY, MOST_PER_BYTE * num_bytes, BYTES_PER_PIXEL * expected):
+        raise UnusableError(f"{size[0]} x {size[1]} pixels, which its {num_bytes} bytes cannot be")
 
 
 def _check_end(file: Path) -> None:
@@ -371,6 +399,7 @@ def _develop(file: Path, max_side: int) -> Photo:
     from PIL import Image
 
     with import_rawpy().imread(str(file)) as raw:
+        _check_memory((raw.sizes.width, raw.sizes.height), _bytes_of((raw.sizes.width, raw.sizes.height)), file)
         exif = _raw_exif(file, raw)
         rgb = Image.fromarray(raw.postprocess(use_camera_wb=True, no_auto_bright=True, output_bps=8))
     size = rgb.size

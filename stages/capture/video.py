@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from stages.capture.photo_reading import UnusableError
+from stages.capture.photo_reading import UnusableError, check_size, telling_damage
 from stages.inputs.folders import readable
 from stages.inputs.formats import CONTAINERS, Kind, kind_of
 
@@ -36,6 +36,11 @@ LOST = 0.25  # nothing could be followed: the view changed by a good part of the
 JPEG_QUALITY = 97
 STAMP_SLACK_MS = 5.0  # stamps are rounded, to whole milliseconds in WebM
 UNSTAMPED_MS = 1000 / 30  # a frame lasts so long where its stamp is missing or before the last one's
+
+# No camera makes frames of more pixels. The work is held against the bytes of the file: so many pixels are decoded of
+# each, after those that are decoded of any file; smaller frames take as long as those of so many pixels.
+LARGEST_FRAME = 1 << 27
+PIXELS_PER_BYTE, PIXELS_OF_ANY, LEAST_WORK = 2000, 2e9, 3e5
 
 # A file that is given as a video must not make FFmpeg read other files, or from the network, as playlists do.
 FFMPEG_OPTIONS = f"protocol_whitelist;file|format_whitelist;{CONTAINERS}"
@@ -66,7 +71,8 @@ def extract_frames(
     Raises:
         UnusableError: it cannot be read as a video.
     """
-    looks = list(_look(video, lambda part: progress(0.7 * part)))
+    with telling_damage():
+        looks = list(_look(video, lambda part: progress(0.7 * part)))
     if not looks:
         raise UnusableError("no frame of this video can be read")
     return _write(video, folder, choose_frames(looks, count), lambda part: progress(0.7 + 0.3 * part))
@@ -78,12 +84,11 @@ def video_size(video: Path) -> tuple[int, int, int]:
     Raises:
         UnusableError: it cannot be read as a video.
     """
-    capture = _open(video)
-    import cv2
-
-    width, height = (int(capture.get(key)) for key in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
-    capture.release()
-    return _count(video), width, height
+    with telling_damage():
+        capture = _open(video)
+        width, height = _frame_size(capture)
+        capture.release()
+        return _count(video), width, height
 
 
 def choose_frames(looks: list[Look], count: int) -> list[int]:
@@ -106,7 +111,7 @@ def _look(video: Path, progress: Callable[[float], None]) -> Iterator[Look]:
         grey = cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY)
         small = _reduced(grey, TRACK_SIDE)
         sharpness = float(cv2.Laplacian(_reduced(grey, SHARP_SIDE), cv2.CV_32F).var())
-        moved = 0.0 if before is None else motion(before, small)
+        moved = 0.0 if before is None else motion(before, small) if before.shape == small.shape else LOST
         before = small
         yield Look(frame, sharpness, moved)
 
@@ -129,8 +134,10 @@ def motion(before: np.ndarray, after: np.ndarray) -> float:
 def _reduced(grey: np.ndarray, side: int) -> np.ndarray:
     import cv2
 
-    scale = side / max(grey.shape)
-    return cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else grey
+    height, width = grey.shape
+    scale = side / max(height, width)
+    size = (max(1, round(width * scale)), max(1, round(height * scale)))
+    return cv2.resize(grey, size, interpolation=cv2.INTER_AREA) if scale < 1 else grey
 
 
 def _write(video: Path, folder: Path, chosen: list[int], progress: Callable[[float], None]) -> list[Path]:
@@ -153,10 +160,13 @@ def _frames(
     capture = _open(video)
     import cv2
 
+    most = _most_frames(video, _frame_size(capture))
     last = max(wanted, default=-1) if wanted is not None else None
     frame, now_ms, due_ms = 0, -math.inf, -math.inf
     try:
         while (last is None or frame <= last) and capture.grab():
+            if frame > most:
+                raise UnusableError(f"a video of more than {most} frames in {video.stat().st_size} bytes")
             stamp_ms = capture.get(cv2.CAP_PROP_POS_MSEC)
             now_ms = stamp_ms if stamp_ms > now_ms else now_ms + UNSTAMPED_MS
             if frame in wanted if wanted is not None else now_ms + STAMP_SLACK_MS >= due_ms:
@@ -175,7 +185,7 @@ def _count(video: Path) -> int:
     capture = _open(video)
     import cv2
 
-    frames = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
+    frames = _number(capture, cv2.CAP_PROP_FRAME_COUNT)
     if frames <= 0 and capture.set(cv2.CAP_PROP_FORMAT, -1):
         frames = 0
         while capture.grab():
@@ -184,7 +194,30 @@ def _count(video: Path) -> int:
     return max(0, frames)
 
 
+def _number(capture: Any, key: int) -> int:
+    """A property of a video as a whole number, 0 where it is none."""
+    value = capture.get(key)
+    return int(value) if math.isfinite(value) else 0
+
+
+def _frame_size(capture: Any) -> tuple[int, int]:
+    """Upright width and height."""
+    import cv2
+
+    return _number(capture, cv2.CAP_PROP_FRAME_WIDTH), _number(capture, cv2.CAP_PROP_FRAME_HEIGHT)
+
+
+def _most_frames(video: Path, size: tuple[int, int]) -> int:
+    """So many frames are decoded; a video of more has next to nothing in each."""
+    pixels = PIXELS_OF_ANY + PIXELS_PER_BYTE * video.stat().st_size
+    return int(pixels / max(size[0] * size[1], LEAST_WORK))
+
+
 def _open(video: Path) -> Any:
+    """
+    Raises:
+        UnusableError: it cannot be read as a video, or its frames are no photos by their size.
+    """
     import cv2
 
     if kind_of(video) is not Kind.VIDEO:
@@ -199,6 +232,10 @@ def _open(video: Path) -> Any:
         cv2.utils.logging.setLogLevel(level)
     if not capture.isOpened():
         raise UnusableError("cannot be read as a video (damaged, or a codec that FFmpeg does not have)")
+    size = _frame_size(capture)
+    check_size(size)
+    if size[0] * size[1] > LARGEST_FRAME:
+        raise UnusableError(f"a video of {size[0]} x {size[1]} pixels")
     return capture
 
 

@@ -13,6 +13,8 @@ from functools import lru_cache, wraps
 from pathlib import Path
 from typing import Any
 
+from stages.inputs.bounded import reason
+
 # By Pillow's names; MPO is read as JPEG. Pillow knows more, some of which start other programs (EPS: Ghostscript).
 PHOTO_FORMATS = ("JPEG", "PNG", "TIFF", "BMP", "WEBP", "HEIF", "AVIF")
 HEIF_SUFFIXES = frozenset({".heic", ".heif", ".hif", ".heics", ".heifs"})
@@ -27,12 +29,25 @@ VIDEO_SUFFIXES |= {".mpg", ".mpeg", ".wmv", ".ogv"}
 CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts,mpeg,asf,flv,ogg"
 
 HEAD_BYTES = 512
-# A large picture of fewer bytes is none: it is damaged, or made to fill the memory. JPEG has a byte for some 50 pixels at
-# worst; smaller pictures, as masks and drawings, may well have next to none.
-PIXELS_PER_BYTE, LARGE_PIXELS = 100, 1 << 25
+JPEG_PIXELS_PER_BYTE = 1000  # it takes two bits or more for 64 pixels
 # Tags of EXIF and TIFF may all stand for the same bytes; together they may stand for so many times those of the file.
 MOST_SHARED = 16
-TAG_BYTES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, 13: 4, 16: 8}  # a value, by type
+TAG_BYTES = {
+    1: 1,
+    2: 1,
+    3: 2,
+    4: 4,
+    5: 8,
+    6: 1,
+    7: 1,
+    8: 2,
+    9: 4,
+    10: 8,
+    11: 4,
+    12: 8,
+    13: 4,
+    16: 8,
+}  # a value, by type
 TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 RAW = (b"IIU\0", b"IIRO", b"IIRS", b"MMOR", b"FUJIFILMCCD-RAW")  # Panasonic, Olympus, Fujifilm
 HEIF_BRANDS = frozenset({"heic", "heix", "heim", "heis", "hevc", "hevx", "hevm", "hevs", "mif1", "mif2", "msf1"})
@@ -142,15 +157,11 @@ def read_head_bytes(file: Path) -> bytes:
         return stream.read(HEAD_BYTES)
 
 
-def open_image(file: Path | io.BytesIO, expected: int = LARGE_PIXELS) -> Any:
+def open_image(file: Path | io.BytesIO) -> Any:
     """A picture of a user's as Pillow's image; nothing is decoded yet.
 
-    Args:
-        expected: pixels that it may have, however small its file is.
-
     Raises:
-        OSError: it cannot be read, is of none of `PHOTO_FORMATS`, or claims more pixels than its bytes can stand for.
-            Damaged files raise nearly anything.
+        OSError: it cannot be read, is of none of `PHOTO_FORMATS`, or a JPEG that is cut off. Damaged files raise nearly anything.
     """
     from PIL import Image
 
@@ -159,12 +170,27 @@ def open_image(file: Path | io.BytesIO, expected: int = LARGE_PIXELS) -> Any:
         check_regular(file)
     image = Image.open(file, formats=PHOTO_FORMATS)
     num_bytes = file.stat().st_size if isinstance(file, Path) else file.getbuffer().nbytes
-    if image.width * image.height > max(expected, LARGE_PIXELS, PIXELS_PER_BYTE * num_bytes):
+    if image.format in ("JPEG", "MPO") and image.width * image.height > JPEG_PIXELS_PER_BYTE * num_bytes:
         image.close()
-        raise OSError(f"it claims {image.width} x {image.height} pixels, which its {num_bytes} bytes cannot be")
+        raise OSError(f"{num_bytes} bytes are too few for {image.width} x {image.height} pixels")
     if image.format == "TIFF":
         image.filename = ""  # or Pillow maps the file, and shuffles pixels that EXIF turns by 90 degrees
     return image
+
+
+def check_png(file: Path | io.BytesIO) -> None:
+    """Hold what the chunks of a PNG claim against the bytes that are there: OpenCV takes memory for all of it.
+
+    Raises:
+        ValueError: it is damaged, or no PNG.
+    """
+    try:
+        with open_image(file) as image:
+            if image.format != "PNG":
+                raise ValueError("it is no PNG")
+            image.verify()
+    except Exception as error:  # Pillow raises nearly anything on a damaged file
+        raise ValueError(reason(error)) from error
 
 
 @lru_cache
@@ -173,12 +199,11 @@ def register_formats() -> None:
 
     Readers judge sizes by the memory that is there, see `stages.capture.photo_reading`; no limit is fixed.
     """
-    from PIL import EpsImagePlugin, Image, TiffImagePlugin
+    from PIL import Image, TiffImagePlugin
     from pillow_heif import register_heif_opener
 
     register_heif_opener()
     Image.MAX_IMAGE_PIXELS = None  # a fixed limit refuses what phones take
-    EpsImagePlugin.gs_binary = False  # no Ghostscript where another library opens a picture, as the texture of a mesh
     load = TiffImagePlugin.ImageFileDirectory_v2.load
 
     @wraps(load)

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from stages.inputs.formats import open_image
 from stages.posing.corners import find_corners
 from stages.posing.xfeat import XFeat, describe_points, mutual_best, mutual_matches
 
@@ -148,7 +149,5 @@ def likely_pairs(descriptors: Descriptors, all_up_to: int) -> list[tuple[int, in
 
 def _grey(path: Path) -> np.ndarray:
     """[H, W] float32, 0 to 255."""
-    from PIL import Image
-
-    with Image.open(path) as image:
+    with open_image(path) as image:
         return np.asarray(image.convert("L"), dtype=np.float32)
