@@ -24,6 +24,7 @@ from stages.engine.runner import Listener, StageOutcome, naming_command, run_pip
 from stages.engine.stage import Stage
 from stages.engine.workspace import Workspace, storage_errors
 from stages.errors import ConfigError, InputError, SystemRequirementError, WorkspaceError
+from stages.inputs.bounded import reason
 from stages.inputs.folders import is_workspace
 from stages.kept import what_is_kept
 from stages.limits import available_cores
@@ -153,7 +154,9 @@ def choose_folder(request: Request) -> Path:
 
     Raises:
         ConfigError: nothing says which.
+        InputError: a path that is given cannot be followed.
     """
+    _check_paths(request)
     if request.workspace is not None:
         return request.workspace
     if request.photos is not None:
@@ -166,6 +169,20 @@ def choose_folder(request: Request) -> Path:
     )
 
 
+def _check_paths(request: Request) -> None:
+    """
+    Raises:
+        InputError: a path that is given leads nowhere: it is too long, a link in a circle, or may not be looked at.
+    """
+    for path in (request.photos, request.masks, request.poses, request.control, request.workspace):
+        try:
+            if path is not None:
+                path.exists()
+                path.resolve()
+        except (OSError, RuntimeError) as error:
+            raise InputError(f"{path} cannot be read ({reason(error)}).", "Check the path with `ls`.") from error
+
+
 def choose_photos(request: Request, workspace: Workspace) -> Path:
     """The photos given, else those the workspace was last run with, which may be gone: results stay without them.
 
@@ -176,7 +193,7 @@ def choose_photos(request: Request, workspace: Workspace) -> Path:
     given = request.photos.resolve() if request.photos else None
     if given is not None and not (given.exists() or given == known):
         raise InputError(f"There is no photos folder {request.photos}.", "Check the path with `ls`.")
-    if given is not None and given.is_file() and not is_video(given):
+    if given is not None and given.exists() and not (given.is_dir() or is_video(given)):
         raise InputError(
             f"{request.photos} is a file; a folder of photos or a video is needed.",
             f"Name the folder it is in: {given.parent}",

@@ -33,7 +33,7 @@ Files = dict[str, Path]
 
 def is_video(path: Path) -> bool:
     """Whether a file is a video, by its name or its content."""
-    return path.suffix.lower() in VIDEO_SUFFIXES or (path.is_file() and _kind(path)[0] is Kind.VIDEO)
+    return path.is_file() and (path.suffix.lower() in VIDEO_SUFFIXES or _kind(path)[0] is Kind.VIDEO)
 
 
 def list_captures(
@@ -49,7 +49,7 @@ def list_captures(
     """
     if not source.exists():
         raise InputError(f"The photo folder {source} does not exist.", "Check the path: hineus run PHOTOS")
-    if source.is_file() and is_video(source):
+    if is_video(source):
         return {}, {readable(source.name): source}, []
     if not source.is_dir():
         raise InputError(f"{source} is a file; a folder of photos or a video is needed.", f"hineus run {source.parent}")

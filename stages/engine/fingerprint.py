@@ -15,6 +15,7 @@ from configs.dotted import flatten
 from stages.artifacts.own_files import parse_json, read_own, write_own
 from stages.errors import InputError, WorkspaceError
 from stages.inputs.folders import named_files, readable
+from stages.inputs.formats import check_regular
 
 CHUNK_BYTES = 1 << 20
 
@@ -187,6 +188,7 @@ class SourceDigests:
     def _digest_tree(self, path: Path) -> FileDigests:
         if path.is_dir():
             return {name: self._digest_file(file) for name, file in named_files(path)[0].items()}
+        check_regular(path)
         return {readable(path.name): self._digest_file(path)}
 
     def _digest_file(self, path: Path) -> str:

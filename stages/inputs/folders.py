@@ -57,6 +57,7 @@ UNFINISHED_FILES = {
     "*.download": "half-downloaded",
 }
 SMALL_VIDEOS = ("m4root", "sub")  # where Sony's cameras keep small copies of videos
+MOST_DEPTH = 64  # folders in each other that are looked into
 MOST_BYTES = 200  # of a name that we give, less its suffix: file systems take 255, and more suffixes are added
 MOST_SUFFIX, HASH = 8, 8  # characters, the dot among them; digits
 
@@ -154,11 +155,11 @@ def _walk(folder: Path, root: Path, seen: set[tuple[int, int]], top: Path, left:
             continue
         if stat.S_ISDIR(mode):
             try:
-                if (why := _why_not_into(path, root)) is None:
+                if (why := _why_not_into(path, root, top)) is None:
                     yield from _walk(path, root, seen, top, left)
                 elif why:
                     left.append(LeftOut(name, why))
-            except PermissionError:
+            except OSError:
                 left.append(LeftOut(name, "a folder that may not be read", missed=True))
         elif (reason := _match(UNFINISHED_FILES, path)) is not None:
             left.append(LeftOut(name, reason, missed=True))
@@ -178,7 +179,7 @@ def _match(patterns: Mapping[str, str], path: Path) -> str | None:
     return next((meaning for pattern, meaning in patterns.items() if fnmatchcase(name, pattern)), None)
 
 
-def _why_not_into(path: Path, root: Path) -> str | None:
+def _why_not_into(path: Path, root: Path, top: Path) -> str | None:
     """Why a folder is not looked into, None where it is; empty where that is no news."""
     if (reason := _match(COMPANION_FOLDERS, path)) is not None:
         return reason
@@ -188,6 +189,8 @@ def _why_not_into(path: Path, root: Path) -> str | None:
         return "small copies of videos"
     if is_workspace(path):
         return "a workspace of hineus"
+    if len(path.relative_to(top).parts) > MOST_DEPTH:
+        return f"more than {MOST_DEPTH} folders deep"
     if path.is_symlink():
         target = path.resolve()
         if root in target.parents:

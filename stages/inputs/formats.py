@@ -161,7 +161,8 @@ def open_image(file: Path | io.BytesIO) -> Any:
     """A picture of a user's as Pillow's image; nothing is decoded yet.
 
     Raises:
-        OSError: it cannot be read, is of none of `PHOTO_FORMATS`, or a JPEG that is cut off. Damaged files raise nearly anything.
+        OSError: it cannot be read, is of none of `PHOTO_FORMATS`, or a JPEG that is cut off. Damaged files raise nearly
+            anything.
     """
     from PIL import Image
 
@@ -211,7 +212,7 @@ def register_formats() -> None:
         _check_tags(stream, "<" if directory.prefix == b"II" else ">", directory._bigtiff)
         load(directory, stream)
 
-    TiffImagePlugin.ImageFileDirectory_v2.load = load_checked  # type: ignore[method-assign]
+    TiffImagePlugin.ImageFileDirectory_v2.load = load_checked  # type: ignore[assignment,method-assign]
     warnings.filterwarnings("ignore", category=UserWarning, module=r"PIL\.")  # odd EXIF is no news to users
 
 
