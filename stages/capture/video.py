@@ -39,7 +39,7 @@ UNSTAMPED_MS = 1000 / 30  # a frame lasts so long where its stamp is missing or 
 
 # No camera makes frames of more pixels. The work is held against the bytes of the file: so many pixels are decoded of
 # each, after those that are decoded of any file; smaller frames take as long as those of so many pixels.
-LARGEST_FRAME = 1 << 27
+LARGEST_FRAME = 80_000_000
 PIXELS_PER_BYTE, PIXELS_OF_ANY, LEAST_WORK = 2000, 2e9, 3e5
 
 # A file that is given as a video must not make FFmpeg read other files, or from the network, as playlists do.

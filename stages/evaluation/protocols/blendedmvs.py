@@ -6,6 +6,7 @@ are parts of the true surface's extent, as its scenes have no unit.
 
 from __future__ import annotations
 
+import re
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -16,11 +17,14 @@ from stages.errors import InputError
 from stages.evaluation.reading import read_surface
 from stages.evaluation.surfaces import Sampling, Surface, SurfaceScores, measure
 from stages.evaluation.thinning import one_a_cube
+from stages.inputs.bounded import read_bytes, reason
 from stages.posing import mvsnet
 
 DEPTHS = "rendered_depth_maps"
 THRESHOLDS = (0.005, 0.01, 0.02)  # of the truth's extent
 STRIDE = 2  # of the pixels that are looked at: all of them would be tens of millions
+PFM = re.compile(rb"Pf\s(\d{1,6})\s(\d{1,6})\s(-?)[\d.]+\s")  # width, height; minus: little-endian
+MOST_BYTES = 1 << 30
 SPACING = 0.002  # of the extent: near views are not to outvote far ones
 
 
@@ -73,9 +77,20 @@ def _points(depth: np.ndarray, params: np.ndarray, cam_from_world: np.ndarray, s
 
 
 def _read(file: Path) -> np.ndarray:
-    import cv2
+    """A depth map [H, W] float32.
 
-    depth = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
-    if depth is None or depth.ndim != 2:
-        raise InputError(f"The depth map {file} cannot be read.", "It needs to be a PFM of one channel.")
-    return depth
+    Raises:
+        InputError: it is no PFM of one channel, or has fewer bytes than it says.
+    """
+    try:
+        data = read_bytes(file, MOST_BYTES)
+        head = PFM.match(data)
+        if head is None:
+            raise ValueError("it is no PFM of one channel")
+        width, height, kind = int(head[1]), int(head[2]), "<f4" if head[3] else ">f4"
+        if not 0 < 4 * width * height <= len(data) - head.end():
+            raise ValueError(f"it has {len(data) - head.end()} bytes for {width} x {height} numbers")
+    except (OSError, ValueError) as error:
+        raise InputError(f"The depth map {file} cannot be read ({reason(error)}).", "Copy it again.") from error
+    depth = np.frombuffer(data, kind, width * height, head.end()).reshape(height, width)
+    return depth[::-1].astype(np.float32)  # its first row is the lowest
