@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import struct
 from pathlib import Path
 from typing import ClassVar
@@ -168,6 +169,9 @@ def test_frames_are_looked_at_by_their_time_whatever_rate_the_file_notes(tmp_pat
 @pytest.mark.parametrize("text", [
     "#EXTM3U\n#EXT-X-TARGETDURATION:1\n#EXTINF:1,\n{secret}\n#EXT-X-ENDLIST\n",
     "ffconcat version 1.0\nfile {secret}\n",
+    "v=0\no=- 0 0 IN IP4 127.0.0.1\ns=x\nc=IN IP4 127.0.0.1\nt=0 0\nm=video 5004 RTP/AVP 96\n",
+    '<?xml version="1.0"?><MPD xmlns="urn:mpeg:dash:schema:mpd:2011"><BaseURL>{secret}</BaseURL></MPD>',
+    "<ASX><ENTRY><REF HREF={secret}></ENTRY></ASX>",
 ])  # fmt: skip
 def test_a_list_of_other_files_is_no_video(tmp_path: Path, text: str):
     secret = write_video(tmp_path / "secret.mp4", [5.0 * i for i in range(30)])
@@ -184,6 +188,53 @@ def test_ffmpeg_itself_may_read_only_this_file(tmp_path: Path, monkeypatch):
     monkeypatch.setattr("stages.capture.video.kind_of", lambda file: Kind.VIDEO)
     with pytest.raises(UnusableError):
         extract_frames(tmp_path / "clip.mp4", tmp_path / "frames", 5)
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -1e300])
+def test_counts_and_stamps_that_are_no_numbers(tmp_path: Path, monkeypatch, value: float):
+    video = write_video(tmp_path / "clip.mp4", [5.0 * i for i in range(30)])
+    opened = cv2.VideoCapture
+
+    class Odd:
+        def __init__(self, *arguments: object) -> None:
+            self.capture = opened(*arguments)
+
+        def get(self, key: int) -> float:
+            stated = (cv2.CAP_PROP_FRAME_COUNT, cv2.CAP_PROP_FPS, cv2.CAP_PROP_POS_MSEC)
+            return value if key in stated else self.capture.get(key)
+
+        def __getattr__(self, name: str) -> object:
+            return getattr(self.capture, name)
+
+    monkeypatch.setattr(cv2, "VideoCapture", Odd)
+    assert video_size(video) == (30, *SIZE)
+    assert extract_frames(video, tmp_path / "frames", 5)
+
+
+def test_a_video_of_far_more_frames_than_bytes_is_not_decoded_to_its_end(tmp_path: Path, monkeypatch):
+    video = write_video(tmp_path / "clip.mp4", [0.0] * 60)
+    monkeypatch.setattr("stages.capture.video.PIXELS_OF_ANY", 0)
+    monkeypatch.setattr("stages.capture.video.PIXELS_PER_BYTE", 40 * 3e5 / video.stat().st_size)
+    with pytest.raises(UnusableError, match="a video of more than 40 frames in"):
+        extract_frames(video, tmp_path / "frames", 5)
+
+
+@pytest.mark.parametrize(("size", "words"), [((2000, 16), "only 2000 x 16 pixels"), ((320, 240), "of 320 x 240 pix")])
+def test_frames_of_sizes_that_no_camera_has(tmp_path: Path, monkeypatch, size: tuple[int, int], words: str):
+    writer = cv2.VideoWriter(str(tmp_path / "x.avi"), cv2.VideoWriter_fourcc(*"MJPG"), FPS, size)
+    for _ in range(3):
+        writer.write(np.zeros((*size[::-1], 3), np.uint8))
+    writer.release()
+    monkeypatch.setattr("stages.capture.video.LARGEST_FRAME", 320 * 240 - 1)
+    for read in (video_size, lambda file: extract_frames(file, tmp_path / "frames", 5)):
+        with pytest.raises(UnusableError, match=words):
+            read(tmp_path / "x.avi")
+
+
+def test_a_pipe_is_no_video(tmp_path: Path):
+    os.mkfifo(tmp_path / "x.mp4")
+    with pytest.raises(UnusableError, match="a pipe"):
+        extract_frames(tmp_path / "x.mp4", tmp_path / "frames", 5)
 
 
 @pytest.mark.parametrize("name", ["clip", "clip.jpg", "CLIP.MOV", "%03d.mp4", "http:x.mp4", "f\udcfcr.mp4", "-i.mp4"])

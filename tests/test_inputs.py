@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import shutil
+import struct
+import tracemalloc
 import unicodedata
+import zlib
+from contextlib import nullcontext, suppress
 from pathlib import Path
 
 import numpy as np
@@ -16,16 +21,19 @@ from typer.testing import CliRunner
 
 from hineus_cli.app import app
 from stages.artifacts import Pictures
+from stages.capture import photo_reading
 from stages.capture.listing import list_captures
-from stages.capture.masks import unused_folder
+from stages.capture.masks import load_mask, unused_folder
+from stages.capture.photo_reading import UnusableError, read_head, read_photo, read_preview
 from stages.capture.video import extract_frames
 from stages.engine.fingerprint import SourceDigests
 from stages.errors import InputError
 from stages.inputs.bounded import read_bytes, reason
 from stages.inputs.depth import read_depth
-from stages.inputs.folders import MOST_BYTES, named_files, readable, short_name, unique_name
+from stages.inputs.folders import MOST_BYTES, MOST_DEPTH, named_files, readable, short_name, unique_name
 from stages.inputs.formats import Kind, kind_of, kind_of_head, open_image, register_formats
 from stages.inputs.texts import read_json, read_text
+from stages.posing.learned import corners_of
 
 
 @pytest.fixture
@@ -174,6 +182,45 @@ def test_a_pipe_does_not_hold_anything_up(photos: Path):
     assert "p.jpg" not in SourceDigests({"photos": photos}).files("photos")
 
 
+@pytest.mark.parametrize("read", [open_image, kind_of, lambda file: SourceDigests({"photos": file}).files("photos"),
+                                  lambda file: list_captures(file), lambda file: read_depth(file)])  # fmt: skip
+@pytest.mark.parametrize("target", ["pipe", "/dev/zero", "/dev/random", "nowhere"])
+def test_what_is_no_file_is_not_waited_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, read, target: str):
+    monkeypatch.chdir(tmp_path)
+    os.mkfifo("pipe")
+    Path("x.mp4").symlink_to(target)
+    with pytest.raises((OSError, ValueError, InputError)):
+        read(Path("x.mp4"))
+
+
+@pytest.mark.parametrize("given", ["loop", "a" * 300, "pipe", "pipe.mp4", "zero", "p --masks loop", "p --masks zero",
+                                   "p --masks pipe", f"p --masks {'a' * 300}"])  # fmt: skip
+def test_paths_that_lead_nowhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, given: str):
+    monkeypatch.chdir(tmp_path)
+    Path("loop").symlink_to("loop")
+    Path("zero").symlink_to("/dev/zero")
+    Path("p").mkdir()
+    for name in ("pipe", "pipe.mp4"):
+        os.mkfifo(name)
+    result = CliRunner().invoke(app, ["run", *given.split(), "--until", "ingest"])
+    assert result.exit_code == InputError.exit_code
+    assert "Unexpected" not in result.output
+
+
+def test_folders_are_looked_into_as_deep_as_people_go(photos: Path):
+    write_photos(photos)
+    deep = photos / Path(*"a" * 60)
+    deep.mkdir(parents=True)
+    picture(8).save(deep / "x.jpg")
+    deeper = str(photos)
+    for _ in range(1050):  # deeper than Python calls itself
+        deeper += "/b"
+        os.mkdir(deeper)
+    images, _, _ = ingest(photos)
+    assert len(images.images) == 5
+    assert list(reasons(images).values()) == [f"more than {MOST_DEPTH} folders deep"]
+
+
 def test_what_is_missing_is_said_aloud(photos: Path):
     write_photos(photos)
     for name in (".IMG_9.heic.icloud", "IMG_8.jpg.part", "IMG_7.jpg.crdownload"):
@@ -266,7 +313,14 @@ def test_nothing_but_photo_formats_is_opened(photos: Path, tmp_path: Path, monke
     write_photos(photos)
     (photos / "x.jpg").write_bytes(b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 96 72\n%%EndComments\nshowpage\n")
     assert "PostScript" in reasons(ingest(photos)[0])["x.jpg"]
+    with pytest.raises(OSError, match="cannot identify"):
+        corners_of(photos / "x.jpg", None, None)  # type: ignore[arg-type]
     assert not (tmp_path / "started").exists()
+
+
+def test_pictures_are_opened_in_one_place():
+    sources = [file for top in ("stages", "hineus_cli") for file in (Path(__file__).parents[1] / top).rglob("*.py")]
+    assert [file.name for file in sources if "Image.open(" in file.read_text(encoding="utf-8")] == ["formats.py"]
 
 
 @pytest.mark.parametrize(("data", "words"), [
@@ -312,6 +366,136 @@ def test_damaged_exif_is_no_reason_to_lose_a_photo(photos: Path):
     write_photos(photos)
     picture(9).save(photos / "x.jpg", exif=b"Exif\0\0II*\0\xff\xff\xff\x7f" + b"\xff" * 40)
     assert "x.jpg" in {record.source for record in ingest(photos)[0].images}
+
+
+# ---------------------------------------------------------------- claims are held against the bytes that are there
+def tags(count: int, size: int) -> bytes:
+    """A TIFF of a grey picture, with further tags that all stand for the same bytes: `count` times `size` in all."""
+    width, height = 96, 72
+    known = {256: width, 257: height, 258: 8, 259: 1, 262: 1, 273: 8, 277: 1, 278: height, 279: width * height}
+    entries = [struct.pack("<HHLL", tag, 4, 1, value) for tag, value in known.items()]
+    entries += [struct.pack("<HHLL", 1000 + i, 7, size, 8) for i in range(count)]
+    pixels = bytes(max(size, width * height))
+    return b"".join([b"II*\0", struct.pack("<L", 8 + len(pixels)), pixels, struct.pack("<H", len(entries)), *entries])
+
+
+def chunk(kind: bytes, data: bytes, length: int | None = None) -> bytes:
+    """Of a PNG; it claims to be `length` bytes long."""
+    stated = struct.pack(">L", len(data) if length is None else length)
+    return stated + kind + data + struct.pack(">L", zlib.crc32(kind + data))
+
+
+def encoded(image: Image.Image, kind: str, **options: object) -> bytes:
+    stream = io.BytesIO()
+    image.save(stream, kind, **options)
+    return stream.getvalue()
+
+
+def half() -> Image.Image:
+    """Black and white, as a mask is."""
+    return Image.fromarray(np.repeat(np.repeat(np.array([[0, 255]], np.uint8), 72, 0), 48, 1))
+
+
+def crowded(kind: str) -> bytes:
+    """A picture of 140 kB or less with tags of 200 MB."""
+    exif = tags(2000, 100_000)
+    if kind == "tif":
+        return exif
+    whole = encoded(half(), {"jpg": "JPEG", "png": "PNG"}[kind])
+    if kind == "png":
+        return whole[:33] + chunk(b"eXIf", exif) + whole[33:]
+    parts = [b"Exif\0\0" + exif[at : at + 60_000] for at in range(0, len(exif), 60_000)]
+    return whole[:2] + b"".join(b"\xff\xe1" + struct.pack(">H", 2 + len(part)) + part for part in parts) + whole[2:]
+
+
+@pytest.mark.parametrize("kind", ["tif", "jpg", "png"])
+def test_tags_of_more_bytes_than_the_file_has_take_no_memory(tmp_path: Path, kind: str):
+    file, size = tmp_path / f"x.{kind}", (96, 72)
+    file.write_bytes(crowded(kind))
+    tracemalloc.start()
+    for read in (lambda: read_head(file, "x", 1000), lambda: read_preview(file), lambda: read_photo(file, 1000),
+                 lambda: load_mask(file, "x", size, size, 1)):  # fmt: skip
+        with suppress(UnusableError, InputError) if kind == "tif" else nullcontext():  # of others EXIF alone is lost
+            read()
+    assert tracemalloc.get_traced_memory()[1] < 20e6
+    tracemalloc.stop()
+
+
+@pytest.mark.parametrize("progressive", [False, True])
+def test_a_jpeg_of_next_to_no_bytes_is_cut_off(photos: Path, progressive: bool):
+    write_photos(photos)
+    data = bytearray(encoded(picture(0), "JPEG", progressive=progressive))
+    at = data.index(b"\xff\xc2" if progressive else b"\xff\xc0")
+    data[at + 5 : at + 9] = struct.pack(">HH", 65500, 65500)
+    (photos / "x.jpg").write_bytes(data)
+    assert "too few for 65500 x 65500 pixels" in reasons(ingest(photos)[0])["x.jpg"]
+
+
+def test_pictures_made_to_fill_the_memory_are_refused_however_much_is_free(tmp_path: Path, monkeypatch):
+    monkeypatch.setattr(photo_reading, "available_memory", lambda: 1 << 50)
+    blank = chunk(b"IHDR", struct.pack(">LLBBBBB", 60_000, 60_000, 1, 0, 0, 0, 0)) + chunk(b"IDAT", b"")
+    (tmp_path / "x.png").write_bytes(b"\x89PNG\r\n\x1a\n" + blank + chunk(b"IEND", b""))
+    for read in (lambda file: read_head(file, "x", 1000), read_preview, lambda file: read_photo(file, 1000)):
+        with pytest.raises(UnusableError, match="60000 x 60000 pixels, which its 57 bytes cannot be"):
+            read(tmp_path / "x.png")
+    with pytest.raises(InputError, match="60000 x 60000 pixels"):
+        load_mask(tmp_path / "x.png", "photo", (160, 120), (160, 120), 1)
+
+
+@pytest.mark.parametrize("size", [(16, 60_000), (60_000, 16), (1, 20_000), (20_000, 1)])
+def test_strips_are_no_photos(photos: Path, size: tuple[int, int]):
+    write_photos(photos)
+    Image.new("RGB", size).save(photos / "x.png")
+    assert reasons(ingest(photos)[0])["x.png"] == f"only {size[0]} x {size[1]} pixels"
+
+
+def test_pages_of_a_tiff_are_not_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """There may be a hundred thousand, and Pillow looks through all of them for each."""
+    from PIL.TiffImagePlugin import TiffImageFile
+
+    def count(image: TiffImageFile) -> int:
+        raise AssertionError("counted")
+
+    picture(0).save(tmp_path / "x.tif", save_all=True, append_images=[picture(1)])
+    monkeypatch.setattr(TiffImageFile, "n_frames", property(count))
+    assert read_photo(tmp_path / "x.tif", 1000).as_is == ()
+
+
+def test_a_png_whose_end_lies_is_encoded_anew(photos: Path):
+    """OpenCV would take 4 GB for it."""
+    write_photos(photos)
+    whole = encoded(picture(9), "PNG")
+    (photos / "x.png").write_bytes(whole[:-12] + chunk(b"tEXt", b"a", 0x7FFFFFFF))
+    images, out, _ = ingest(photos)
+    written = Pictures(out).path(images.images[-1].name)
+    assert images.images[-1].source == "x.png"
+    assert written.read_bytes() != (photos / "x.png").read_bytes()
+    assert (np.asarray(Image.open(written)) == np.asarray(picture(9))).all()
+
+
+def test_depth_whose_chunks_lie_is_not_given_to_opencv(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    import cv2
+
+    whole = encoded(Image.fromarray(np.full((72, 96), 20_000, np.uint16)), "PNG")
+    (tmp_path / "x-depth.png").write_bytes(whole)
+    assert read_depth(tmp_path / "x-depth.png").shape == (72, 96)
+    at = whole.index(b"IDAT") - 4
+    (tmp_path / "x-depth.png").write_bytes(whole[:at] + struct.pack(">L", 0x7FFFFFFF) + whole[at + 4 :])
+    monkeypatch.setattr(cv2, "imdecode", lambda *arguments: pytest.fail("read"))
+    with pytest.raises(ValueError, match="no 16-bit depth image"):
+        read_depth(tmp_path / "x-depth.png")
+
+
+def test_a_picture_for_which_a_decoder_finds_no_memory_is_left_out(photos: Path, monkeypatch: pytest.MonkeyPatch):
+    def refuse(image: Image.Image) -> None:
+        raise MemoryError
+
+    write_photos(photos)
+    picture(9).save(photos / "x.bmp")
+    from PIL.BmpImagePlugin import BmpImageFile
+
+    monkeypatch.setattr(BmpImageFile, "load", refuse)
+    assert "more memory than there is" in reasons(ingest(photos)[0])["x.bmp"]
 
 
 def test_case_17(cases_dir: Path, tmp_path: Path):
