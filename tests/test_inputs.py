@@ -27,7 +27,7 @@ from stages.capture.masks import load_mask, unused_folder
 from stages.capture.photo_reading import UnusableError, read_head, read_photo, read_preview
 from stages.capture.video import extract_frames
 from stages.engine.fingerprint import SourceDigests
-from stages.errors import InputError
+from stages.errors import InputError, WorkspaceError
 from stages.inputs.bounded import read_bytes, reason
 from stages.inputs.depth import read_depth
 from stages.inputs.folders import MOST_BYTES, MOST_DEPTH, named_files, readable, short_name, unique_name
@@ -221,6 +221,17 @@ def test_folders_are_looked_into_as_deep_as_people_go(photos: Path):
     assert list(reasons(images).values()) == [f"more than {MOST_DEPTH} folders deep"]
 
 
+def test_a_file_that_is_all_hole_is_not_read_to_its_end(photos: Path):
+    names = write_photos(photos)
+    for name in ("x.jpg", "x.bin", "x.mp4"):
+        shutil.copy(photos / names[0], photos / name)
+        os.truncate(photos / name, 1 << 40)
+    assert all("next to none" in reason for reason in reasons(ingest(photos)[0]).values())
+    assert SourceDigests({"photos": photos}).files("photos").keys() == set(names)
+    with pytest.raises(InputError, match="next to none"):
+        SourceDigests({"photos": photos / "x.mp4"}).files("photos")
+
+
 def test_what_is_missing_is_said_aloud(photos: Path):
     write_photos(photos)
     for name in (".IMG_9.heic.icloud", "IMG_8.jpg.part", "IMG_7.jpg.crdownload"):
@@ -406,6 +417,30 @@ def crowded(kind: str) -> bytes:
         return whole[:33] + chunk(b"eXIf", exif) + whole[33:]
     parts = [b"Exif\0\0" + exif[at : at + 60_000] for at in range(0, len(exif), 60_000)]
     return whole[:2] + b"".join(b"\xff\xe1" + struct.pack(">H", 2 + len(part)) + part for part in parts) + whole[2:]
+
+
+def test_a_camera_with_an_endless_name(photos: Path):
+    write_photos(photos)
+    exif = Image.Exif()
+    exif[0x0110] = "x" * 50_000
+    picture(9).save(photos / "x.jpg", exif=exif)
+    images, _, _ = ingest(photos)
+    assert len(images.images) == 5
+    assert max(len(record.camera) for record in images.images) < 200
+
+
+def test_a_damaged_picture_of_a_workspace_is_not_given_to_opencv(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    import cv2
+
+    (tmp_path / "images").mkdir()
+    whole = encoded(half(), "PNG")
+    (tmp_path / "images" / "x.png").write_bytes(whole)
+    assert Pictures(tmp_path).image("x.png").shape == (72, 96, 3)
+    at = whole.index(b"IDAT") - 4
+    (tmp_path / "images" / "x.png").write_bytes(whole[:at] + struct.pack(">L", 0x7FFFFFFF) + whole[at + 4 :])
+    monkeypatch.setattr(cv2, "imread", lambda *arguments: pytest.fail("read"))
+    with pytest.raises(WorkspaceError, match=r"x\.png cannot be read"):
+        Pictures(tmp_path).image("x.png")
 
 
 @pytest.mark.parametrize("kind", ["tif", "jpg", "png"])

@@ -113,6 +113,29 @@ def test_what_pictures_say_of_themselves_and_what_most_of_a_size_show(tmp_path: 
     assert "cylindrical" in others["sweep.jpg"]
 
 
+MANY = "9" * 400
+
+
+@pytest.mark.parametrize(
+    ("width", "cropped", "left"),
+    [
+        ("0", "0", "0"),
+        ("0", "640", MANY),
+        (MANY, "640", "0"),
+        ("640", MANY, "0"),
+        ("640", "640", MANY),
+        ("9", "640", "0"),
+    ],
+)
+def test_numbers_of_a_panorama_that_contradict_each_other(tmp_path: Path, width: str, cropped: str, left: str):
+    tags = {"CroppedAreaImageWidthPixels": cropped, "CroppedAreaLeftPixels": left, "CroppedAreaTopPixels": left}
+    xmp = gpano(ProjectionType="equirectangular", FullPanoWidthPixels=width, **tags)
+    Image.new("RGB", (640, 320)).save(tmp_path / "x.jpg", xmp=xmp)
+    spheres, others = find_spheres({"x": tmp_path / "x.jpg"}, "auto")
+    assert not spheres
+    assert "cannot be" in others["x"]
+
+
 def test_files_that_only_their_makers_stitch_are_named(tmp_path: Path):
     for name in ("IMG_1.insp", "VID_1.insv", "GS01.360"):
         (tmp_path / name).touch()

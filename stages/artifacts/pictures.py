@@ -5,6 +5,7 @@ The mask of `images/NAME` is `masks/NAME.png`, 255 on the object, of the same si
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,6 +14,7 @@ import numpy as np
 from stages.artifacts.artifact import Artifact, in_folder
 from stages.artifacts.own_files import inside
 from stages.errors import WorkspaceError
+from stages.inputs.formats import check_png
 
 IMAGES, MASKS = "images", "masks"
 
@@ -76,7 +78,11 @@ class Pictures:
     def _read(self, what: str, path: Path, flags: int) -> np.ndarray:
         import cv2
 
-        pixels = cv2.imread(str(path), flags)
+        pixels = None
+        with suppress(ValueError):
+            if path.suffix.lower() == ".png":
+                check_png(path)
+            pixels = cv2.imread(str(path), flags)
         if pixels is None:
             raise WorkspaceError(
                 f"The {what} {path} cannot be read.", f"Make it again: `hineus run PHOTOS --force {self.folder.name}`."

@@ -17,6 +17,7 @@ GPS_IFD = 0x8825
 LATITUDE_REF, LATITUDE, LONGITUDE_REF, LONGITUDE, ALTITUDE_REF, ALTITUDE = range(1, 7)
 # below sea level, and since EXIF 3.0 below the ellipsoid; Pillow gives bytes, or numbers of damaged files
 BELOW = (1, 3, b"\x01", b"\x03")
+MOST_NAME = 80  # characters of a camera's name; damaged files have thousands
 NO_FIX_DEG = 1e-6  # 0, 0 is what cameras write that have no fix
 FOCAL_PLANE_UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 
@@ -123,7 +124,7 @@ def camera_key(exif: Any, size: tuple[int, int], source: str) -> str:
     """
     tags = exif.get_ifd(EXIF_IFD)
     named = [exif.get(MAKE), exif.get(MODEL), tags.get(LENS_MODEL)]
-    text = [str(value).replace("\0", "").strip() for value in named if value]
+    text = [str(value).replace("\0", "").strip()[:MOST_NAME] for value in named if value]
     if not any(text):
         text = [f"folder {PurePosixPath(source).parent}"]
     # a phone's digital zoom changes the 35 mm equivalent only

@@ -39,6 +39,8 @@ UNSTITCHED = {
 }
 STITCH = "stitch it and export it as a 360-degree picture or video (equirectangular) with the camera's own program"
 
+LEAST_AROUND, MOST_AROUND = 0.9, 100.0  # times a picture's width that the whole turn may have
+
 _PROJECTION = re.compile(rb"ProjectionType\s*(?:=\s*[\"']|>)\s*([A-Za-z]+)")
 
 
@@ -163,14 +165,17 @@ def _stated(size: tuple[int, int], xmp: bytes, projection: str) -> Sphere:
 
     def number(name: str, default: float) -> float:
         found = re.search(rb"%s\s*(?:=\s*[\"']|>)\s*(\d+)" % name.encode(), xmp)
-        return float(found[1]) if found else default
+        return min(float(found[1]), 1e9) if found else default
 
     stored_width = number("CroppedAreaImageWidthPixels", size[0]) or size[0]
     scale = size[0] / stored_width
     width = number("FullPanoWidthPixels", stored_width)
     middle = (width / 2 - size[1] / scale) / 2  # of the height
     left, top = number("CroppedAreaLeftPixels", 0), number("CroppedAreaTopPixels", max(middle, 0))
-    return Sphere(size, width * scale, left * scale, top * scale)
+    sphere = Sphere(size, width * scale, left * scale, top * scale)
+    if not LEAST_AROUND <= sphere.width / size[0] <= MOST_AROUND or max(sphere.left, sphere.top) > sphere.width:
+        raise UnusableError("a panorama that says of itself what cannot be (FullPanoWidthPixels and the like)")
+    return sphere
 
 
 def _too_little(sphere: Sphere) -> str:

@@ -14,8 +14,8 @@ from typing import Any
 from configs.dotted import flatten
 from stages.artifacts.own_files import parse_json, read_own, write_own
 from stages.errors import InputError, WorkspaceError
+from stages.inputs.bounded import check_regular
 from stages.inputs.folders import named_files, readable
-from stages.inputs.formats import check_regular
 
 CHUNK_BYTES = 1 << 20
 

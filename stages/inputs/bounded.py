@@ -5,8 +5,10 @@ What a header says is held against the bytes that are there before memory is tak
 
 from __future__ import annotations
 
+import errno
 import io
 import math
+import os
 import stat
 import zipfile
 from pathlib import Path
@@ -15,6 +17,7 @@ import numpy as np
 
 MOST_TEXT = 1 << 30  # bytes; the largest poses known, of 100 000 photos, have a tenth of it
 MOST_ARRAYS = 1 << 26  # bytes unpacked, of all arrays in a file of poses
+LARGE, HOLLOW = 1 << 34, 1000  # bytes of a file, and times those that it takes of its disk
 SHORT = 200  # characters of a reason that is told
 
 
@@ -32,6 +35,24 @@ def read_bytes(file: Path, most: int) -> bytes:
         raise ValueError(f"it has {found.st_size} bytes, at most {most} are read")
     with file.open("rb") as stream:
         return stream.read(found.st_size)
+
+
+def check_regular(file: Path) -> None:
+    """
+    Raises:
+        OSError: `file` is not there; or it is a pipe, which would keep us waiting, or a device or a file that is all
+            hole, which have no end.
+    """
+    found = file.stat()
+    if not stat.S_ISREG(found.st_mode):
+        raise OSError(errno.EINVAL, "a folder, a pipe, a socket or a device", str(file))
+    if is_hole(found):
+        raise OSError(errno.EINVAL, f"it claims {found.st_size} bytes and has next to none", str(file))
+
+
+def is_hole(found: os.stat_result) -> bool:
+    """Whether a file claims to be larger than videos are, and takes next to nothing of its disk."""
+    return found.st_size > LARGE and getattr(found, "st_blocks", LARGE) * 512 * HOLLOW < found.st_size
 
 
 def read_arrays(file: Path) -> dict[str, np.ndarray]:

@@ -10,6 +10,8 @@ from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path, PurePosixPath
 
+from stages.inputs.bounded import is_hole
+
 WORKSPACE_RECORD = "workspace.json"  # a folder with this file is a workspace of ours
 
 # What is left out by name alone, in lower case: patterns, and what they are in words.
@@ -147,13 +149,13 @@ def _walk(folder: Path, root: Path, seen: set[tuple[int, int]], top: Path, left:
     for path in sorted(folder.iterdir()):
         name = readable(path.relative_to(top).as_posix())
         try:
-            mode = path.stat().st_mode
+            found = path.stat()
         except OSError:
             if not path.name.startswith("."):
                 what = "a link to nothing" if path.is_symlink() else "may not be read"
                 left.append(LeftOut(name, what, missed=True))
             continue
-        if stat.S_ISDIR(mode):
+        if stat.S_ISDIR(found.st_mode):
             try:
                 if (why := _why_not_into(path, root, top)) is None:
                     yield from _walk(path, root, seen, top, left)
@@ -167,7 +169,9 @@ def _walk(folder: Path, root: Path, seen: set[tuple[int, int]], top: Path, left:
             continue
         elif (reason := _match(COMPANION_FILES, path)) is not None:
             left.append(LeftOut(name, reason))
-        elif stat.S_ISREG(mode):
+        elif is_hole(found):
+            left.append(LeftOut(name, f"it claims {found.st_size} bytes and has next to none", missed=True))
+        elif stat.S_ISREG(found.st_mode):
             yield path
         else:
             left.append(LeftOut(name, "no file but a pipe, a socket or a device"))

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import errno
 import io
 import os
-import stat
 import struct
 import warnings
 from enum import Enum, auto
@@ -13,7 +11,7 @@ from functools import lru_cache, wraps
 from pathlib import Path
 from typing import Any
 
-from stages.inputs.bounded import reason
+from stages.inputs.bounded import check_regular, reason
 
 # By Pillow's names; MPO is read as JPEG. Pillow knows more, some of which start other programs (EPS: Ghostscript).
 PHOTO_FORMATS = ("JPEG", "PNG", "TIFF", "BMP", "WEBP", "HEIF", "AVIF")
@@ -135,16 +133,6 @@ def in_words(head: bytes) -> str:
         return "empty"
     known = {**STRANGE, **UNREAD}
     return next((words for magic, words in known.items() if head.startswith(magic)), "damaged, or another format")
-
-
-def check_regular(file: Path) -> None:
-    """Pipes would keep us waiting, devices may have no end.
-
-    Raises:
-        OSError: `file` is no regular file, or is not there.
-    """
-    if not stat.S_ISREG(file.stat().st_mode):
-        raise OSError(errno.EINVAL, "a folder, a pipe, a socket or a device", str(file))
 
 
 def read_head_bytes(file: Path) -> bytes:
