@@ -36,7 +36,7 @@ def mend_streams() -> None:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
-    if isinstance(sys.stderr, io.TextIOWrapper):
+    if isinstance(sys.stderr, io.TextIOWrapper) and sys.stderr is sys.__stderr__:  # not one that somebody put there
         sys.stderr = _ForPeople(sys.stderr)
     for name in SIZES:  # programs read numbers there: "junk", "0" or a width of a million columns would end in errors
         if not re.fullmatch("[1-9][0-9]{0,3}", os.environ.get(name, "1")):

@@ -87,7 +87,7 @@ class StageContext(Generic[P_co]):
         """A folder in `scratch`, emptied of whatever a killed run left."""
         folder = self.scratch / name
         remove(folder)
-        folder.mkdir()
+        folder.mkdir(parents=True)
         return folder
 
     def to_write(self, artifact: Artifact[T]) -> T:
