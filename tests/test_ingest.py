@@ -333,7 +333,7 @@ def test_large_photos_are_reduced_and_the_focal_prior_with_them(photos: Path):
 
 
 def available(monkeypatch: pytest.MonkeyPatch, megabytes: float) -> None:
-    monkeypatch.setattr(psutil, "virtual_memory", lambda: SimpleNamespace(available=megabytes * 1e6))
+    monkeypatch.setattr(psutil, "virtual_memory", lambda: SimpleNamespace(available=megabytes * 1e6, total=24e9))
 
 
 @pytest.mark.slow
