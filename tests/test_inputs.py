@@ -209,16 +209,13 @@ def test_paths_that_lead_nowhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 
 def test_folders_are_looked_into_as_deep_as_people_go(photos: Path):
     write_photos(photos)
-    deep = photos / Path(*"a" * 60)
-    deep.mkdir(parents=True)
-    picture(8).save(deep / "x.jpg")
-    deeper = str(photos)
-    for _ in range(1050):  # deeper than Python calls itself
-        deeper += "/b"
-        os.mkdir(deeper)
+    for i, (name, depth) in enumerate((("a", MOST_DEPTH), ("b", MOST_DEPTH + 1), ("c", 200))):
+        folder = photos / Path(*name * depth)
+        folder.mkdir(parents=True)
+        picture(8 + i).save(folder / "x.jpg")
     images, _, _ = ingest(photos)
     assert len(images.images) == 5
-    assert list(reasons(images).values()) == [f"more than {MOST_DEPTH} folders deep"]
+    assert list(reasons(images).values()) == [f"more than {MOST_DEPTH} folders deep"] * 2
 
 
 def test_a_file_that_is_all_hole_is_not_read_to_its_end(photos: Path):

@@ -308,6 +308,12 @@ def test_large_masks_are_read_within_the_memory_that_is_free(tmp_path: Path, mon
     tracemalloc.stop()
 
 
+def test_sizes_of_poses_that_would_fill_the_memory(tmp_path: Path):
+    Image.new("L", (100, 100)).save(tmp_path / "x.png")
+    with pytest.raises(InputError, match="100000 x 100000 pixels, too many for a mask"):
+        load_mask(tmp_path / "x.png", "photo", (100_000, 100_000), (100_000, 100_000), 1)
+
+
 @pytest.mark.slow
 def test_the_largest_mask_counts_among_the_needs(tmp_path: Path):
     photos = write_set(tmp_path, "masks/{stem}.png")

@@ -33,7 +33,9 @@ from stages.inputs.formats import PHOTO_SUFFIXES, open_image
 # A mask's edges may be soft: this much of its range from black or white counts as neither, and as many such pixels as
 # are black (or white) are a photo, a depth map or labels. Masks of the development sets have 0 to 0.02 of them.
 SOFT, MAX_UNCLEAR = 0.1, 0.5
-LARGER = 4  # times its photo's pixels that a mask may have, however well it was packed
+# Pixels that a mask may have, however well it was packed: as many as its photo, or times those up to this many; and
+# that a photo may have for which it is scaled, which may be known from poses alone.
+LARGER, LARGE_MASK, LARGEST = 4, 1 << 26, 1 << 28
 JPEG_NOISE = 8  # a black picture may have values up to this in a JPEG
 MIN_CONTRAST = 0.25  # of the brightest value: less is a picture of one value, and its noise
 ASIDE = "masks among the photos"
@@ -212,10 +214,12 @@ def load_mask(
         InputError: it cannot be read, or not with the memory that is free, has another shape than the photo, or is not
             black and white.
     """
+    if size[0] * size[1] > LARGEST:
+        raise InputError(f"{photo} is {size[0]} x {size[1]} pixels, too many for a mask.", "Reduce the photos.")
     if file.name.endswith(DEPTH):
         return _near(file, photo, size)
     try:
-        with open_image(file) as stored, memory_for(stored, file, max(stored.size), LARGER * size[0] * size[1]):
+        with open_image(file) as stored, memory_for(stored, file, max(stored.size), _expected(size)):
             return _judged(stored, file, photo, size, orientation, black_keeps, pixels)
     except InputError:
         raise
@@ -227,6 +231,12 @@ def load_mask(
         raise InputError(
             f"The mask {file} cannot be read ({reason(error)}).", "Write it again as an 8-bit PNG."
         ) from error
+
+
+def _expected(size: tuple[int, int]) -> int:
+    """Pixels that the mask of a photo of this size may have."""
+    pixels = size[0] * size[1]
+    return max(pixels, min(LARGER * pixels, LARGE_MASK))
 
 
 def _judged(
