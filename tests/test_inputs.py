@@ -505,6 +505,19 @@ def test_a_png_whose_end_lies_is_encoded_anew(photos: Path):
     assert (np.asarray(Image.open(written)) == np.asarray(picture(9))).all()
 
 
+def test_a_tiff_that_others_cannot_read_is_encoded_anew(photos: Path):
+    write_photos(photos)
+    data = bytearray(encoded(picture(9), "TIFF"))
+    directory = struct.unpack_from("<L", data, 4)[0]
+    tags_of = [struct.unpack_from("<H", data, directory + 2 + 12 * i)[0] for i in range(data[directory])]
+    at = directory + 2 + 12 * tags_of.index(278)  # rows of a strip
+    data[at + 4 : at + 8] = struct.pack("<L", 0)
+    (photos / "x.tif").write_bytes(data)
+    images, out, _ = ingest(photos)
+    assert images.images[-1].source == "x.tif"
+    assert Pictures(out).image(images.images[-1].name).shape == (72, 96, 3)
+
+
 def test_depth_whose_chunks_lie_is_not_given_to_opencv(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     import cv2
 

@@ -27,6 +27,7 @@ COLMAP_SUFFIXES = {
     "TIFF": (".tif", ".tiff"),
     "BMP": (".bmp",),
 }
+DAMAGED_UNSEEN = ("TIFF", "BMP")  # where these are damaged, readers differ in what they make of it
 COLMAP_COMPRESSIONS = frozenset({"raw", "tiff_lzw", "tiff_adobe_deflate"})  # of TIFF
 LOSSY_FORMATS = frozenset({"JPEG", "MPO", "WEBP", "HEIF", "AVIF"})
 ANIMATED_FORMATS = frozenset({"WEBP", "AVIF"})  # a HEIF of several pictures is a burst; its first one counts
@@ -263,6 +264,8 @@ def _decode(file: Path, max_side: int) -> Photo:
         if scale < 1:
             flat = flat.resize([max(1, round(side * scale)) for side in size], Image.Resampling.LANCZOS)
         rgb = in_srgb(flat, colours)
+        if rgb is not stored or (stored.format in DAMAGED_UNSEEN and not _is_alike(file, rgb)):
+            as_is = ()
         return Photo(
             rgb=rgb,
             alpha=alpha,
@@ -271,7 +274,7 @@ def _decode(file: Path, max_side: int) -> Photo:
             stored_size=stored_size,
             orientation=orientation,
             lossy=stored.format in LOSSY_FORMATS,
-            as_is=as_is if rgb is stored else (),
+            as_is=as_is,
             colours=colours,
         )
 
@@ -313,6 +316,15 @@ def _colmap_suffixes(stored: Any, file: Path) -> tuple[str, ...]:
     if stored.format == "TIFF" and (stored.is_animated or stored.info.get("compression") not in COLMAP_COMPRESSIONS):
         return ()
     return COLMAP_SUFFIXES.get(stored.format, ())
+
+
+def _is_alike(file: Path, rgb: Any) -> bool:
+    """Whether OpenCV reads the same pixels from a file as Pillow did."""
+    import cv2
+
+    flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+    pixels = cv2.imdecode(np.fromfile(file, np.uint8), flags)
+    return pixels is not None and np.array_equal(pixels[..., ::-1], np.asarray(rgb))
 
 
 def _flat_mode(mode: str) -> str:
