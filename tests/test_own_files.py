@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import os
 import shutil
 import socket
@@ -191,8 +192,11 @@ def test_a_workspace_s_record_with_other_types_is_told(root: Path, changes: dict
         assert invoke(*command)[0] == 5
 
 
-@pytest.mark.parametrize("place", ["/\ud800", "/" + "a" * 5000, "/dev/null/photos"])
-def test_photos_that_cannot_be_anywhere_are_gone(root: Path, place: str) -> None:
+@pytest.mark.parametrize(
+    "place", ["/\ud800", "/" + "a" * 5000, "/dev/null/photos"], ids=["surrogate", "long", "below a device"]
+)
+def test_photos_that_cannot_be_anywhere_are_gone(root: Path, place: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(logging.root.manager, "disable", logging.CRITICAL)  # xdist cannot send a log with such names
     path = root / "workspace.json"
     path.write_text(json.dumps({**json.loads(path.read_text()), "sources": {"photos": place}}))
     assert invoke("status", root)[0] == 0
