@@ -20,6 +20,12 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--whole", action="store_true", help="all of tests/trust, not the share of it that CI runs")
 
 
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """`tests/trust` forks, so it has a process of its own: see `test_trust.py`."""
+    alone = any("trust" in argument for argument in config.args)
+    return True if collection_path.name == "trust" and collection_path.is_dir() and not alone else None
+
+
 def pytest_configure(config: pytest.Config) -> None:
     """Before any test imports what is checked."""
     if config.getoption("--check-shapes"):

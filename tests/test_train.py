@@ -363,7 +363,8 @@ def test_a_damaged_checkpoint_is_set_aside_and_training_starts_over(tmp_path, ca
     DAMAGES[damage](path)
     anew = train._Training.begun(training.context)
     assert (anew.trainer.step_index, anew.steps, anew.metrics.read_text()) == (0, None, "")
-    assert [record.message.split(" (")[0] for record in caplog.records] == ["the checkpoint is damaged"]
+    warnings = [record.message for record in caplog.records if record.levelname == "WARNING"]
+    assert [message.split(" (")[0] for message in warnings] == ["the checkpoint is damaged"]
     assert aside.exists()
     assert not path.exists()
 
@@ -408,7 +409,7 @@ def test_the_published_field_answers_in_numpy(tmp_path):
 
 @pytest.mark.slow
 def test_a_budget_in_minutes_ends_on_time_whatever_the_steps(tmp_path):
-    numbers = train.run(context(tmp_path, "out", changed(TINY, {"steps": 10**9, "minutes": 0.02})))
+    numbers = train.run(context(tmp_path, "out", changed(TINY, {"steps": 10**8, "minutes": 0.02})))
     assert numbers["train_seconds"] < 60  # the first step may have to compile the kernels
 
 
