@@ -29,7 +29,7 @@ from benchmarks.ablate import score_clean_mesh
 from benchmarks.pages import NOT_MEASURED, markdown_table, write_tables
 from benchmarks.run_sets import OUT, RESULTS, ROOT, find_sets, known_cameras, machine, photos_of, run_hineus
 from stages import artifacts
-from stages.errors import InputError, ReconstructionError
+from stages.errors import InputError, ReconstructionError, WorkspaceError
 from stages.posing.neus import read_neus
 
 ROWS = RESULTS / "poses"
@@ -415,7 +415,7 @@ def _failure(answer: dict[str, Any]) -> dict[str, str]:
 def _count(workspace: Path, photos: Path) -> int:
     try:
         return len(artifacts.IMAGE_SET.load(workspace / "ingest").images)
-    except OSError:
+    except WorkspaceError:
         return sum(1 for _ in photos.iterdir())
 
 
