@@ -6,7 +6,9 @@ the last model, poses of the others stay (`stages.posing.adding`).
 
 from __future__ import annotations
 
+import errno
 import logging
+import os
 import shutil
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -39,6 +41,7 @@ from stages.capture.salient import INSTALL, find_weights
 from stages.engine.fingerprint import digest, file_sha256
 from stages.engine.photos_since import compare_photos
 from stages.engine.stage import Stage, StageContext
+from stages.engine.workspace import disk_full_error, free_bytes
 from stages.errors import InputError, ReconstructionError
 from stages.posing.adding import STAYED, KnownPhotos, known_lenses, put_back
 from stages.posing.adjustment import LastAdjustment, adjust_last
@@ -62,6 +65,8 @@ SECOND_PASS = 0.25  # part of the photos: a model of so many beside the largest 
 FLAT_RELIEF = 0.01
 # Of the focal length. Of flat things it was 0.02 % seen at many angles, 4 % and more (and wrong by 21 %) straight on.
 DOUBTFUL_FOCAL_ERROR = 0.01
+# Of a feature in COLMAP's database: a descriptor of 128 bytes, a place of 24; as much again for matches and affine ones.
+FEATURE_BYTES = 2 * 152
 FEATURES_EXTRA = "pip install 'hineus[features]'"
 
 
@@ -73,12 +78,14 @@ def run(context: StageContext[SfmParams]) -> dict[str, Any]:
     Raises:
         InputError: the photos lack what a setting needs.
         ReconstructionError: too few photos could be placed.
+        WorkspaceError: the disk has no room for the features.
     """
     if "poses" in context.sources:
         return _from_known_poses(context)
 
     photos, image_set = context.read(PHOTOS), context.read(IMAGE_SET)
     _check_masks(image_set, context.params)
+    _check_disk(context, len(image_set.images))
     contents = _contents(photos, [record.name for record in image_set.images])
     known = _known_photos(context, contents, image_set)
     with _working(context) as work:
@@ -587,6 +594,14 @@ def _check_masks(image_set: ImageSet, params: SfmParams) -> None:
             "Give `--masks FOLDER` with one mask a photo, or have them made: `--set ingest.auto_mask=object`. "
             "If the object was not moved, try `--set sfm.masks=auto`.",
         )
+
+
+def _check_disk(context: StageContext[SfmParams], photos: int) -> None:
+    """COLMAP ends the process, and not with an error, where its database cannot grow."""
+    needed = photos * context.params.max_features * FEATURE_BYTES
+    if (free := free_bytes(context.scratch)) < needed:
+        full = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        raise disk_full_error(context.scratch, "looking for features", full, needed - free)
 
 
 @contextmanager
