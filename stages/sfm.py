@@ -65,7 +65,7 @@ SECOND_PASS = 0.25  # part of the photos: a model of so many beside the largest 
 FLAT_RELIEF = 0.01
 # Of the focal length. Of flat things it was 0.02 % seen at many angles, 4 % and more (and wrong by 21 %) straight on.
 DOUBTFUL_FOCAL_ERROR = 0.01
-# Of a feature in COLMAP's database: a descriptor of 128 bytes, a place of 24; as much again for matches and other forms.
+# Of a feature in COLMAP's database: a descriptor of 128 bytes, a place of 24; as much again for matches and the like.
 FEATURE_BYTES = 2 * 152
 FEATURES_EXTRA = "pip install 'hineus[features]'"
 
