@@ -18,8 +18,9 @@ from pydantic import (
 )
 
 from stages.artifacts.artifact import Artifact
-from stages.artifacts.own_files import parse_json, read_own, stays_inside
+from stages.artifacts.own_files import read_own, stays_inside
 from stages.errors import WorkspaceError
+from stages.inputs.texts import parse_json
 
 
 def _numbers(value: Any) -> np.ndarray:
@@ -110,4 +111,4 @@ def read_json(path: Path) -> Any:
         OSError: it is not there, or cannot be read.
         ValueError: it is no JSON.
     """
-    return parse_json(path.read_bytes())
+    return parse_json(path.read_text(encoding="utf-8"))

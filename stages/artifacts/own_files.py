@@ -7,13 +7,11 @@ may be reached through links, and so may photos.
 from __future__ import annotations
 
 import errno
-import json
-import math
 import os
 import shlex
 import stat
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from stages.errors import WorkspaceError
 from stages.inputs.folders import readable
@@ -110,24 +108,6 @@ def read_own(path: Path) -> bytes:
                 f"It is no file of ours: remove it with `rm {shlex.quote(str(path))}`, and run again.",
             )
         return file.read(size)
-
-
-def parse_json(data: bytes) -> Any:
-    """JSON as Python's own types.
-
-    Raises:
-        ValueError: it is none, or nested too deep, or holds NaN or infinity.
-    """
-    try:
-        return json.loads(data.decode("utf-8"), parse_constant=_finite, parse_float=_finite)
-    except RecursionError as error:
-        raise ValueError("nested too deep") from error
-
-
-def _finite(text: str) -> float:
-    if not math.isfinite(number := float(text)):
-        raise ValueError(f"{text} is no finite number")
-    return number
 
 
 def write_own(path: Path, text: str) -> None:

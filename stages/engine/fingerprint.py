@@ -12,10 +12,11 @@ from pathlib import Path
 from typing import Any
 
 from configs.dotted import flatten
-from stages.artifacts.own_files import parse_json, read_own, write_own
+from stages.artifacts.own_files import read_own, write_own
 from stages.errors import InputError, WorkspaceError
 from stages.inputs.bounded import check_regular
 from stages.inputs.folders import named_files, readable
+from stages.inputs.texts import parse_json
 
 CHUNK_BYTES = 1 << 20
 
@@ -228,7 +229,7 @@ def _look(path: Path) -> list[int]:
 def _read_cache(path: Path | None) -> dict[str, list[Any]]:
     # A cache that cannot be read is only slow, never wrong.
     try:
-        cache = parse_json(read_own(path)) if path else {}
+        cache = parse_json(read_own(path).decode()) if path else {}
     except (OSError, ValueError, WorkspaceError):
         return {}
     valid = isinstance(cache, dict) and all(isinstance(row, list) and len(row) == 3 for row in cache.values())

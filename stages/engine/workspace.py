@@ -30,7 +30,6 @@ import psutil
 
 from stages.artifacts.own_files import (
     open_own,
-    parse_json,
     read_own,
     refuse_foreign,
     sync,
@@ -50,6 +49,7 @@ from stages.engine.manifest import (
 from stages.engine.system import installed_version
 from stages.errors import WorkspaceError
 from stages.inputs.folders import WORKSPACE_RECORD, is_workspace, readable
+from stages.inputs.texts import parse_json
 from stages.limits import largest_file
 
 FORMAT = 1
@@ -380,7 +380,7 @@ class _Holder:
 def _lock_holder(root: Path) -> _Holder | None:
     """None where the lock says nothing: nobody has it, or what is written there is no lock of ours."""
     try:
-        data = parse_json(read_own(root / LOCK))
+        data = parse_json(read_own(root / LOCK).decode())
         pid = int(data["pid"])
         return _Holder(pid, str(data["host"]), str(data["since"])) if 0 < pid < MOST_PID else None
     except (OSError, ValueError, KeyError, TypeError):
@@ -462,7 +462,7 @@ def _is_own(path: Path) -> bool:
 
 def _parse_record(text: bytes, path: Path) -> Record:
     try:
-        data = parse_json(text)
+        data = parse_json(text.decode())
         found = int(data["format"])
         if found > FORMAT:
             raise WorkspaceError(
@@ -533,6 +533,6 @@ def _sync_tree(folder: Path) -> None:
 
 def _fingerprint_in(path: Path) -> str | None:
     try:
-        return str(parse_json(read_own(path))["fingerprint"])
+        return str(parse_json(read_own(path).decode())["fingerprint"])
     except (OSError, ValueError, KeyError, TypeError, WorkspaceError):
         return None

@@ -35,15 +35,17 @@ def read_json(file: Path) -> Any:
 
     Raises:
         OSError: it cannot be read.
-        ValueError: it is no JSON, or has NaN, infinite or too large numbers.
-        RecursionError: it is nested too deeply.
+        ValueError: it is no JSON, is nested too deeply, or has NaN, infinite or too large numbers.
     """
     return parse_json(read_text(file))
 
 
 def parse_json(text: str) -> Any:
     """The same of a text."""
-    return json.loads(text, parse_float=_finite, parse_int=_whole, parse_constant=_finite)
+    try:
+        return json.loads(text, parse_float=_finite, parse_int=_whole, parse_constant=_finite)
+    except RecursionError as error:
+        raise ValueError("it is nested too deeply") from error
 
 
 def _whole(digits: str) -> int | float:
