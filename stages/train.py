@@ -34,10 +34,10 @@ from stages.artifacts import (
     SILHOUETTES,
     Pictures,
 )
+from stages.artifacts.own_files import remove
 from stages.engine.checkpoint import CheckpointDamaged, read_checkpoint, set_aside, write_checkpoint
 from stages.engine.manifest import load_manifest
 from stages.engine.stage import Stage, StageContext
-from stages.engine.workspace import remove
 from stages.errors import InputError, ReconstructionError
 from stages.geometry.cameras import PinholeCameras, PosedScene
 from stages.geometry.normalisation import regrown

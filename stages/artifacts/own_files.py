@@ -9,9 +9,12 @@ from __future__ import annotations
 import errno
 import os
 import shlex
+import shutil
 import stat
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Literal
+from typing import BinaryIO, Literal
 
 from stages.errors import WorkspaceError
 from stages.inputs.folders import readable
@@ -110,16 +113,31 @@ def read_own(path: Path) -> bytes:
         return file.read(size)
 
 
-def write_own(path: Path, text: str) -> None:
-    """Write a small file whole or not at all, and make sure it is on the disk."""
+@contextmanager
+def written_whole(path: Path) -> Iterator[BinaryIO]:
+    """A file to write to, beside `path`; at the end it takes its place. A kill leaves one of the two whole."""
     temporary = path.with_name(path.name + ".tmp")
-    temporary.unlink(missing_ok=True)  # a link there would be followed
-    with temporary.open("x", encoding="utf-8") as file:
-        file.write(text)
+    remove(temporary)  # a link there would be followed
+    with temporary.open("xb") as file:
+        yield file
         file.flush()
         os.fsync(file.fileno())
     temporary.replace(path)
     sync(path.parent)
+
+
+def write_own(path: Path, text: str) -> None:
+    """Write a small file whole or not at all, and make sure it is on the disk."""
+    with written_whole(path) as file:
+        file.write(text.encode())
+
+
+def remove(path: Path) -> None:
+    """Remove a file, a link or a folder with all in it; nothing need be there."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
 
 
 def sync(path: Path) -> None:

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import logging
-import os
 import pickle
 import stat
 import zipfile
 from pathlib import Path
 from typing import Any
 
-from stages.artifacts.own_files import sync
-from stages.engine.workspace import remove
+from stages.artifacts.own_files import remove, written_whole
 
 log = logging.getLogger(__name__)
 
@@ -24,14 +22,8 @@ def write_checkpoint(path: Path, state: dict[str, Any]) -> None:
     """Write it beside the old one, then in its place: a kill leaves one of the two whole."""
     import torch
 
-    partial = path.with_name(path.name + ".tmp")
-    remove(partial)
-    with partial.open("xb") as file:
+    with written_whole(path) as file:
         torch.save(state, file)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(partial, path)
-    sync(path.parent)
 
 
 def read_checkpoint(path: Path) -> Any:

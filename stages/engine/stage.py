@@ -10,9 +10,10 @@ from typing import Any, Generic, Protocol, TypeVar
 from pydantic import BaseModel
 
 from stages.artifacts.artifact import Artifact
+from stages.artifacts.own_files import remove
 from stages.engine.fingerprint import FileDigests
 from stages.engine.manifest import Manifest
-from stages.engine.workspace import Record, remove
+from stages.engine.workspace import Record
 
 T = TypeVar("T")
 P = TypeVar("P")

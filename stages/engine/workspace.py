@@ -32,6 +32,7 @@ from stages.artifacts.own_files import (
     open_own,
     read_own,
     refuse_foreign,
+    remove,
     sync,
     write_own,
 )
@@ -515,13 +516,6 @@ def _replace(out: Path, final: Path, old: Path) -> None:
         final.rename(old)
     out.rename(final)
     sync(final.parent)
-
-
-def remove(path: Path) -> None:
-    if path.is_dir() and not path.is_symlink():
-        shutil.rmtree(path)
-    else:
-        path.unlink(missing_ok=True)
 
 
 def _sync_tree(folder: Path) -> None:

@@ -10,7 +10,6 @@ import os
 import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -235,4 +234,4 @@ def wrong_inputs(entry: EntryPoint, tiny: Tiny, folder: Callable[[], Path]) -> S
         place = folder()
         return place, entry.lay(draw, tiny, place)
 
-    return partial(laid)()
+    return laid()

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import itertools
-import os
 import shutil
 from pathlib import Path
 
 import pytest
-from entry_points import ENTRY_POINTS, EntryPoint, wrong_inputs
+from entry_points import ENTRY_POINTS, EntryPoint, some_photos, wrong_inputs
 from hypothesis import HealthCheck, Phase, given, seed, settings
 from tiny import RUN, Tiny
 from trust_runs import run_hineus
@@ -64,9 +63,8 @@ def _cases() -> list[Path]:
 @pytest.mark.parametrize("case", _cases(), ids=lambda case: case.name)
 def test_what_went_wrong_once_does_no_more(case: Path, tiny: Tiny, tmp_path: Path):
     place = tmp_path / "here"
-    (place / "p").mkdir(parents=True)
-    for photo in sorted(tiny.photos.iterdir())[:4]:
-        os.link(photo, place / "p" / photo.name)
+    place.mkdir()
+    some_photos(tiny, place)
     if case.name.startswith("photo_"):
         shutil.copy(case, place / "p")
     run = ["run", "p", "-w", "w", "--until", "ingest", *RUN]
