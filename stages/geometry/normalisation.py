@@ -22,12 +22,13 @@ MAX_REACH, MIN_FILLED, MAX_TILT_DEG = 1.1, 0.8, 5.0
 
 def rotation_onto(source: Float[np.ndarray, " 3"], target: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "3 3"]:
     """The smallest rotation that takes unit vector `source` to unit vector `target`."""
-    cross, cosine = np.cross(source, target), float(source @ target)
-    if cosine < -1 + 1e-9:  # opposite: half a turn about any axis perpendicular to it
+    cross, half = np.cross(source, target), source + target
+    one_and_cosine = float(half @ half) / 2  # which keeps its digits where they are nearly opposite
+    if one_and_cosine < 1e-14:  # opposite: half a turn about any axis perpendicular to it
         axis = perpendicular(source)
         return 2 * np.outer(axis, axis) - np.eye(3)
     K = np.array([[0, -cross[2], cross[1]], [cross[2], 0, -cross[0]], [-cross[1], cross[0], 0]])
-    return np.eye(3) + K + K @ K / (1 + cosine)
+    return np.eye(3) + K + K @ K / one_and_cosine
 
 
 def perpendicular(direction: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " 3"]:
