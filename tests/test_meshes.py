@@ -169,7 +169,11 @@ def test_ply_in_bytes_that_cannot_be(tmp_path: Path):
         ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf -1 -2 -99\n", "-99"),
         ("a.obj", "v 0 0 0\nv 1 0 0\n", "no faces|no points"),
         ("a.off", "OFF\n999999999999 1 0\n0 0 0\n", "cannot reshape"),
-        ("a.off", "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 7\n", "index"),
+        (
+            "a.off",
+            "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 7\n",
+            "face index outside the range|a face has vertex 7, of 3",
+        ),
         ("a.stl", b"\0" * 80 + struct.pack("<I", 0xFFFFFFFF) + b"\0" * 50, "no points"),
         ("a.stl", "solidendsolid" * 1000, "no points"),
         ("a.xyz", "1 2\n3 4\n", "cannot be read"),

@@ -30,22 +30,8 @@ HEAD_BYTES = 512
 JPEG_PIXELS_PER_BYTE = 1000  # it takes two bits or more for 64 pixels
 # Tags of EXIF and TIFF may all stand for the same bytes; together they may stand for so many times those of the file.
 MOST_SHARED = 16
-TAG_BYTES = {
-    1: 1,
-    2: 1,
-    3: 2,
-    4: 4,
-    5: 8,
-    6: 1,
-    7: 1,
-    8: 2,
-    9: 4,
-    10: 8,
-    11: 4,
-    12: 8,
-    13: 4,
-    16: 8,
-}  # a value, by type
+# Of a value, by type.
+TAG_BYTES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, 13: 4, 16: 8}
 TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 RAW = (b"IIU\0", b"IIRO", b"IIRS", b"MMOR", b"FUJIFILMCCD-RAW")  # Panasonic, Olympus, Fujifilm
 HEIF_BRANDS = frozenset({"heic", "heix", "heim", "heis", "hevc", "hevx", "hevm", "hevs", "mif1", "mif2", "msf1"})
