@@ -12,7 +12,7 @@ import sys
 from collections.abc import Callable
 from contextlib import suppress
 
-from hineus_cli.at_once import CRASHES, SIGNALS
+from hineus_cli.at_once import CRASHES, SIGNALS, signals_wait
 
 PR_SET_PDEATHSIG = 1
 LEFT = 1  # the exit code of a library that ends the process where it gets no memory, as OpenBLAS does
@@ -26,7 +26,10 @@ def supervised(command: Callable[[], None]) -> None:
     us = os.getpid()
     told, tell = os.pipe()
     try:
-        child = os.fork()
+        with signals_wait():  # until there is somebody to pass them on
+            child = os.fork()
+            if child:
+                _pass_signals_on(child)
     except OSError:  # no more processes are allowed: without a second one it goes as well
         return command()
     if child:
@@ -50,9 +53,7 @@ def _end_with(parent: int) -> None:
         os._exit(128 + signal.SIGKILL)
 
 
-def _await(child: int, told: int) -> int:
-    """Pass signals on to the child until it ends; its exit code, which it has `told` where it was not ended."""
-
+def _pass_signals_on(child: int) -> None:
     def pass_on(number: int, frame: object) -> None:
         with suppress(ProcessLookupError):
             os.kill(child, number)
@@ -60,6 +61,10 @@ def _await(child: int, told: int) -> int:
     for number in SIGNALS:
         if signal.getsignal(number) != signal.SIG_IGN:
             signal.signal(number, pass_on)
+
+
+def _await(child: int, told: int) -> int:
+    """The exit code of the child when it has ended, which it has `told` where it was not ended."""
     _, status, used = os.wait4(child, 0)
     if said := os.read(told, 1):
         return said[0]

@@ -314,7 +314,8 @@ def test_libraries_start_no_more_threads_than_the_container_has_cores(monkeypatc
     monkeypatch.setattr(limits, "available_cores", lambda: 1)
     monkeypatch.setattr(os, "cpu_count", lambda: 64)
     monkeypatch.setenv("OMP_NUM_THREADS", "2")  # somebody's own choice stays
-    monkeypatch.delenv("NUMBA_NUM_THREADS", raising=False)
+    monkeypatch.setenv("NUMBA_NUM_THREADS", "3")  # so that it is put back, where it was not set either
+    monkeypatch.delenv("NUMBA_NUM_THREADS")
     _bound_threads()
     assert (os.environ["OMP_NUM_THREADS"], os.environ["NUMBA_NUM_THREADS"]) == ("2", "1")
 

@@ -77,7 +77,7 @@ def choose_up(cameras: Up, ground: Float[np.ndarray, " 3"] | None) -> Up:
 def y_up_rotation(up: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "3 3"]:
     """The smallest rotation that turns `up` to +Y (glTF's up); what is upside down makes half a turn about X."""
     up = up / np.linalg.norm(up)
-    if up[1] < -1 + 1e-9:
+    if up[1] < -1 + 1e-14:
         return np.diag([1.0, -1.0, -1.0])
     return rotation_onto(up, np.array([0.0, 1.0, 0.0]))
 
