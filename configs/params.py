@@ -298,6 +298,14 @@ class BakeParams(Section):
     )
 
 
+class MaterialsParams(Section):
+    """Textured mesh and photos to materials and light."""
+
+    enabled: bool = Field(
+        False, description="learn base colour without light in it, roughness, metalness, and the light of the photos"
+    )
+
+
 class ExportParams(Section):
     """Textured mesh, and dense points, to files."""
 
@@ -340,5 +348,6 @@ class Config(Section):
     cleanup: CleanupParams = CleanupParams()
     atlas: AtlasParams = AtlasParams()
     bake: BakeParams = BakeParams()
+    materials: MaterialsParams = MaterialsParams()
     export: ExportParams = ExportParams()
     report: ReportParams = ReportParams()

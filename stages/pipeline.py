@@ -12,6 +12,7 @@ from stages.engine.stage import Stage
 from stages.export import EXPORT
 from stages.extract import EXTRACT
 from stages.ingest import INGEST
+from stages.materials import MATERIALS
 from stages.place import PLACE
 from stages.report import REPORT
 from stages.sfm import SFM
@@ -29,6 +30,7 @@ PIPELINE: tuple[Stage[Any], ...] = (
     CLEANUP,  # mesh -> clean, light mesh
     ATLAS,  # clean mesh -> UV charts
     BAKE,  # charts + photos -> texture
+    MATERIALS,  # photos + texture -> materials and light
     EXPORT,  # textured mesh -> GLB, USDZ, OBJ, PLY, STL; points -> PLY, LAZ
     REPORT,  # everything -> one HTML page
 )
