@@ -489,8 +489,8 @@ def test_help_lists_every_stage_and_loads_nothing_heavy() -> None:
     assert done.returncode == 0, done.stderr
     names, _, listed = done.stdout.partition("\n")
     assert names.split() == [
-        "ingest", "sfm", "place", "undistort", "densify", "train", "extract", "cleanup", "atlas", "bake", "export",
-        "report",
+        "ingest", "sfm", "place", "undistort", "densify", "train", "extract", "cleanup", "atlas", "bake",
+        "materials", "export", "report",
     ]  # fmt: skip
     for name in [*names.split(), "run", "status", "doctor", "demo", "config", "presets"]:
         assert f" {name} " in listed
