@@ -22,11 +22,12 @@ from stages.drawing.rasterizing import (
 )
 from stages.drawing.rendering import look_at, render_textured, turntable
 from stages.geometry.cameras import PinholeCameras
-from stages.texture.baking import Baked, Provenance, _prefetch, _Prepare, bake_texture
+from stages.texture.baking import Baked, Provenance, bake_texture
 from stages.texture.filling import face_neighbors, harmonic_offsets
 from stages.texture.gains import solve_gains
 from stages.texture.padding import pad_charts
 from stages.texture.photo_views import low_pass, prepare_view, surface_links
+from stages.texture.prepared_views import PreparedViews
 
 WORKERS = min(2, os.cpu_count() or 1)
 SIZE = 192
@@ -263,14 +264,15 @@ def test_the_first_photos_are_kept_whichever_are_ready_first(monkeypatch):
             first_two.set()
         return SimpleNamespace(nbytes=60 if index == 1 else 50, index=index)
 
-    monkeypatch.setattr("stages.texture.baking.prepare_view", prepare_view)
-    monkeypatch.setattr("stages.texture.baking.KEPT_BYTES", 100)
-    prepare = _Prepare(SimpleNamespace(vertices=None, faces=None), None, lambda index: (None, None), 0.0)
+    monkeypatch.setattr("stages.texture.prepared_views.prepare_view", prepare_view)
+    monkeypatch.setattr("stages.texture.prepared_views.KEPT_BYTES", 100)
+    flat = SimpleNamespace(vertices=np.zeros((3, 3)), faces=np.array([[0, 1, 2]]))
+    views = PreparedViews(flat, 1, range(4), lambda index: (None, None))
     with ThreadPoolExecutor(3) as pool:
         for _ in range(2):
-            assert [view.index for view in _prefetch(pool, prepare, 4, 3)] == [0, 1, 2, 3]
-            assert sorted(prepare.kept) == [0, 2]
-            assert prepare.room == 0
+            assert [view.index for view in views.in_order(pool, 3)] == [0, 1, 2, 3]
+            assert sorted(views.kept) == [0, 2]
+            assert views.room == 0
 
 
 def test_a_photo_that_shows_nothing_of_the_mesh_is_no_error(capture):
@@ -434,7 +436,7 @@ def test_charts_without_texels_are_refused(capture):
 
 def test_a_texture_done_in_parts_is_the_same(capture, baked, monkeypatch):
     monkeypatch.setattr("stages.texture.baking.BAND_BYTES", 16 * 25 * 3000)
-    monkeypatch.setattr("stages.texture.baking.KEPT_BYTES", 0)  # and photos are made ready anew for each
+    monkeypatch.setattr("stages.texture.prepared_views.KEPT_BYTES", 0)  # and photos are made ready anew for each
     monkeypatch.setattr("stages.texture.baking._CHUNK", 1000)
     again = bake(*capture)
     assert (again.base_color == baked.base_color).all()

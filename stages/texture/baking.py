@@ -12,7 +12,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import partial
@@ -22,16 +22,14 @@ import numpy as np
 from stages.artifacts import AtlasMesh
 from stages.drawing.rasterizing import Texels, surface_points
 from stages.geometry.cameras import PinholeCameras
-from stages.surface.triangle_mesh import face_areas
 from stages.texture.filling import face_neighbors, harmonic_offsets, vertex_means
 from stages.texture.gains import solve_gains
 from stages.texture.observing import STEPS_UNSIGNED, blend_texels, gather_texels, sample_points
 from stages.texture.padding import pad_charts
-from stages.texture.photo_views import View, prepare_view
+from stages.texture.photo_views import View
+from stages.texture.prepared_views import LoadPhoto, PreparedViews
 from stages.texture.sharpness import BLURRED, sharpness_of_photos
 
-# (photo index) -> [H, W, 3] uint8 RGB and [H, W] bool mask or None.
-LoadPhoto = Callable[[int], tuple[np.ndarray, np.ndarray | None]]
 # (points [P, 3], normals [P, 3], unit view directions [P, 3] from camera to point) -> [P, 3] sRGB in [0, 1].
 ColorField = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 Listener = Callable[[float, float, str], None]
@@ -44,12 +42,8 @@ SAMPLES = 20_000
 # bands are small only where all photos stay in memory.
 BAND_BYTES = 1 << 30
 SMALL_BAND_BYTES = 1 << 28
-# Prepared photos that stay in memory for the next pass; the others are made again.
-KEPT_BYTES = 1 << 30
 # Texels handed to a thread at a time.
 _CHUNK = 250_000
-# Photos made ready ahead of use.
-_MAX_AHEAD = 8
 
 
 class Provenance(IntEnum):
@@ -128,22 +122,21 @@ def bake_texture(
             listener(done, 2 * num_views + 1, note)
 
     with ThreadPoolExecutor(max_workers=max(1, workers)) as pool:
-        texel_side = float(np.sqrt(face_areas(atlas.vertices, atlas.faces).sum() / num_texels))  # mean, scene units
-        prepare = _Prepare(atlas, cameras, load_photo, texel_side)
-        gains, sharpness = _compare(atlas, texels, _prefetch(pool, prepare, num_views, workers), num_views, tell)
+        views_of = PreparedViews(atlas, num_texels, cameras, load_photo)
+        gains, sharpness = _compare(atlas, texels, views_of.in_order(pool, workers), num_views, tell)
         if not gain:
             gains = np.ones((num_views, 3))
-        bands = _bands(num_texels, views, SMALL_BAND_BYTES if len(prepare.kept) == num_views else BAND_BYTES)
+        bands = _bands(num_texels, views, SMALL_BAND_BYTES if len(views_of.kept) == num_views else BAND_BYTES)
         blend = partial(blend_texels, detail=detail, robust_sigma=robust_sigma, diffuse=diffuse)
         for number, band in enumerate(bands):
-            prepared = _prefetch(pool, prepare, num_views, workers)
+            prepared = views_of.in_order(pool, workers)
             if visit is not None and number == 0:
                 prepared = _visited(prepared, visit, gains)
             _blend(
                 pool, *surface_points(atlas, texels.face_ids[band], texels.corner[band]), gains, sharpness,
                 prepared, views, blend, colors[band], seen_by[band], partial(tell, "blending photos", 1 / len(bands)),
             )  # fmt: skip
-        prepare.kept.clear()
+        views_of.kept.clear()
 
     seen = seen_by > 0
     _fill_unseen(colors, seen, atlas, texels, color_field)
@@ -175,41 +168,6 @@ def _bands(num_texels: int, views: int, room: int) -> list[slice]:
     """Texels that are blended together, within `room` bytes."""
     length = max(room // (16 * (views + 1)), _CHUNK)
     return [slice(start, min(start + length, num_texels)) for start in range(0, num_texels, length)]
-
-
-class _Prepare:
-    """Makes photos ready for sampling, and keeps the first ones for the next pass."""
-
-    def __init__(self, atlas: AtlasMesh, cameras: PinholeCameras, load_photo: LoadPhoto, texel_side: float) -> None:
-        self.atlas, self.cameras, self.load_photo, self.texel_side = atlas, cameras, load_photo, texel_side
-        self.kept: dict[int, View] = {}
-        self.room = KEPT_BYTES
-
-    def __call__(self, index: int) -> View:
-        if index in self.kept:
-            return self.kept[index]
-        photo, mask = self.load_photo(index)
-        return prepare_view(self.cameras, index, photo, mask, self.atlas.vertices, self.atlas.faces, self.texel_side)
-
-    def keep(self, index: int, view: View) -> None:
-        """Keep a photo where there is room. Not for threads: they would take one another's."""
-        if index not in self.kept and view.nbytes <= self.room:
-            self.room -= view.nbytes
-            self.kept[index] = view
-
-
-def _prefetch(pool: ThreadPoolExecutor, prepare: _Prepare, count: int, ahead: int) -> Iterator[View]:
-    """Views 0..count-1 in order, `ahead` of them (at most `_MAX_AHEAD`) being made in the background, and kept."""
-    waiting: list[Future[View]] = []
-    ahead = min(ahead, _MAX_AHEAD)
-    submitted = 0
-    for index in range(count):
-        while submitted < count and len(waiting) <= ahead:
-            waiting.append(pool.submit(prepare, submitted))
-            submitted += 1
-        view = waiting.pop(0).result()
-        prepare.keep(index, view)
-        yield view
 
 
 def _visited(prepared: Iterator[View], visit: Visitor, gains: np.ndarray) -> Iterator[View]:

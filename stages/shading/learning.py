@@ -1,0 +1,186 @@
+"""Materials of points and the light on them, from nothing but what photos say: the loop over `fitting`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from stages.light.environment import solid_angles
+from stages.light.ggx import ROUGHNESSES
+from stages.shading.exposures import balanced, exposures
+from stages.shading.few_materials import choose_few, heard, neighbors
+from stages.shading.fitting import LEVELS, Materials, decoded, find_light, grey_world, radiance_of, try_out
+from stages.shading.observations import Observations
+from stages.shading.reflection import LIGHT_ROWS, Reflection
+
+# From each start so many turns; the better one goes on for so many more.
+FIRST_TURNS, MORE_TURNS = 4, 5
+# Points that take part in the turns, and in finding the light.
+MOST_POINTS, LIGHT_POINTS = 3000, 2000
+# Where all is metal nothing tells how bright light and surface are; a metal's brightest channel is then about this.
+METAL = 0.65
+# A roughness is told where the next but one fits worse by this part.
+TOLD_MARGIN = 0.02
+
+
+@dataclass(frozen=True)
+class Material:
+    """One of the few that the thing is made of.
+
+    Attributes:
+        metallic: 0 or 1.
+        level: of `ggx.ROUGHNESSES`, the best one.
+        roughness: between them.
+        told: whether the photos tell the roughness.
+    """
+
+    metallic: int
+    level: int
+    roughness: float
+    told: bool
+
+
+@dataclass(frozen=True)
+class Learned:
+    """What is known in the end.
+
+    Attributes:
+        light: [LIGHT_ROWS, 2 LIGHT_ROWS, 3] float32 in units of the photos' full scale.
+        materials: the few.
+        which: [S] the material of each point.
+        color: [S, 3] float32 linear base colours.
+        gains: [N] factor on each photo's linear values.
+        cost: of the fit, see `fitting.robust`.
+    """
+
+    light: np.ndarray
+    materials: tuple[Material, ...]
+    which: np.ndarray
+    color: np.ndarray
+    gains: np.ndarray
+    cost: float
+
+
+@dataclass(frozen=True)
+class _State:
+    light: Tensor
+    materials: Materials
+    gains: Tensor
+    cost: float = np.inf
+
+
+def learn(
+    observations: Observations,
+    reflection: Reflection,
+    positions: np.ndarray,
+    num_photos: int,
+    tell: Callable[[int, int], None] = lambda done, total: None,
+) -> Learned:
+    """Learn from S points.
+
+    What is no metal and mirrors little, and metal that mirrors much: from each of these starts materials and light are
+    found in turn, and the one that fits better goes on.
+
+    Args:
+        positions: [S, 3].
+        num_photos: N.
+        tell: told (turns done, all turns).
+    """
+    some = np.sort(np.random.default_rng(0).permutation(len(positions))[:MOST_POINTS])
+    turns = _Turns(observations.select(some), reflection.select(torch.from_numpy(some)), positions[some], num_photos)
+    total = 2 * FIRST_TURNS + MORE_TURNS
+    states: list[_State] = []
+    for metallic in (0.0, 1.0):
+        state = turns.start(metallic)
+        for turn in range(FIRST_TURNS):
+            tell(len(states) * FIRST_TURNS + turn, total)
+            state = turns.turn(state)
+        states.append(state)
+    state = min(states, key=lambda each: each.cost)
+    for turn in range(MORE_TURNS):
+        tell(2 * FIRST_TURNS + turn, total)
+        state = turns.turn(state, expose=True)
+    everything = _Turns(observations, reflection, positions, num_photos)
+    return everything.end(state)
+
+
+class _Turns:
+    """The loop's body, and what does not change in it."""
+
+    def __init__(
+        self, observations: Observations, reflection: Reflection, positions: np.ndarray, num_photos: int
+    ) -> None:
+        self.reflection = reflection
+        self.raw, self.weights = torch.from_numpy(observations.colors), torch.from_numpy(observations.weights)
+        self.photos, self.num_photos = torch.from_numpy(observations.photos), num_photos
+        shown = (self.raw * self.weights[..., None]).sum(1) / self.weights.sum(1, keepdim=True).clamp_min(1e-9)
+        self.near = neighbors(positions, shown.numpy())
+
+    def start(self, metallic: float) -> _State:
+        """A light that is the same from all sides, of which surfaces return half."""
+        count = len(self.raw)
+        mean = decoded(self.raw[self.weights > 0]).mean()
+        light = torch.full((2 * LIGHT_ROWS**2, 3), 2 * float(mean))
+        materials = Materials(torch.zeros(count, 3), torch.full((count,), 0.3), torch.full((count,), metallic))
+        return _State(light, materials, torch.ones(self.num_photos))
+
+    def turn(self, state: _State, expose: bool = False) -> _State:
+        """Light from materials, materials from light and, where asked, gains from both."""
+        some = torch.from_numpy(np.random.default_rng(0).permutation(len(self.raw))[:LIGHT_POINTS])
+        of_some = Materials(*(values[some] for values in vars(state.materials).values()))
+        observed = balanced(self.raw, state.gains, self.photos)
+        light, _ = find_light(self.reflection.select(some), observed[some], self.weights[some], of_some, state.light)
+        costs, colors = try_out(self.reflection, observed, self.weights, light)
+        costs = costs.flatten(1)
+        chosen, which = choose_few(heard(costs.numpy(), self.near))
+        best = torch.tensor(chosen)[torch.from_numpy(which)]
+        rows = torch.arange(len(best))
+        materials = Materials(
+            colors.flatten(1, 2)[rows, best], torch.tensor(ROUGHNESSES)[best % LEVELS], (best // LEVELS).float()
+        )
+        gains = state.gains
+        if expose:
+            radiance = radiance_of(self.reflection, observed, self.weights, materials, light)
+            gains = gains * exposures(radiance, observed, self.weights, self.photos, self.num_photos)
+        return _State(light, materials, gains, float(costs[rows, best].mean()))
+
+    def end(self, state: _State) -> Learned:
+        """The materials of all points under the light that was found, and the conventions for what nothing tells."""
+        observed = balanced(self.raw, state.gains, self.photos)
+        costs, colors = try_out(self.reflection, observed, self.weights, state.light)
+        shared = heard(costs.flatten(1).numpy(), self.near)
+        chosen, which = choose_few(shared)
+        rows, best = torch.arange(len(which)), torch.tensor(chosen)[torch.from_numpy(which)]
+        color = colors.flatten(1, 2)[rows, best]
+        light, color = grey_world(state.light, color, torch.from_numpy(solid_angles(LIGHT_ROWS).reshape(-1)))
+        metal = (best // LEVELS).bool()
+        if bool(metal.all()):
+            brightness = METAL / max(float(color.amax(1).median()), 1e-3)
+            light, color = light / brightness, (color * brightness).clamp(max=1.0)
+        found = tuple(_material(candidate, shared[which == k]) for k, candidate in enumerate(chosen))
+        return Learned(
+            light=light.reshape(LIGHT_ROWS, 2 * LIGHT_ROWS, 3).numpy(),
+            materials=found,
+            which=which,
+            color=color.numpy(),
+            gains=state.gains.numpy(),
+            cost=float(costs.flatten(1)[rows, best].mean()),
+        )
+
+
+def _material(candidate: int, costs: np.ndarray) -> Material:
+    """A chosen candidate, its roughness refined by the parabola through its own costs and its neighbours'."""
+    metallic, level = divmod(candidate, LEVELS)
+    curve = costs[:, metallic * LEVELS : (metallic + 1) * LEVELS].mean(0)
+    roughness = ROUGHNESSES[level]
+    if 0 < level < LEVELS - 1:
+        below, here, above = curve[level - 1 : level + 2]
+        bend = below - 2 * here + above
+        if bend > 0:
+            roughness += float(np.clip(0.5 * (below - above) / bend, -0.5, 0.5)) * (ROUGHNESSES[1] - ROUGHNESSES[0])
+    sides = [curve[at] for at in (level - 2, level + 2) if 0 <= at < LEVELS]
+    return Material(metallic, level, roughness, told=bool(min(sides) > (1 + TOLD_MARGIN) * curve[level]))
