@@ -20,8 +20,11 @@ from stages.artifacts import (
     GIVEN_REGION,
     HELD_OUT,
     IMAGE_SET,
+    LIGHT_HDR,
+    MATERIAL_COLOR,
     METRICS,
     MODEL,
+    ORM,
     OUTLINES,
     PAGE,
     PHOTOS,
@@ -56,7 +59,7 @@ def run(context: StageContext[ReportParams]) -> dict[str, Any]:
     """Write report.html. Returns its size in bytes, and how the final mesh meets held-out photos."""
     import jinja2
 
-    from stages.reporting import control, curves, numbers, photo_table, pictures, poses, stereo
+    from stages.reporting import control, curves, lit_view, numbers, photo_table, pictures, poses, stereo
     from stages.reporting.held_out_photos import compare_held_out
 
     scene, place, atlas = context.read(SCENE), context.read(WORLD_PLACE), context.read(ATLAS_MESH)
@@ -93,6 +96,8 @@ def run(context: StageContext[ReportParams]) -> dict[str, Any]:
     page |= describe_view(
         scene, place, region, atlas, texture, left(context, QUALITY), left(context, POINT_CLOUD), captions
     )
+    color, orm = context.read(MATERIAL_COLOR), context.read(ORM)
+    page["viewer"] |= lit_view.describe_lights(context.read(LIGHT_HDR), color, orm, scene, place)
     context.progress(4, steps, "writing the page")
     placed = {name: manifests[name].numbers for name in ("undistort", "place", "train") if name in manifests}
     page |= {
@@ -186,7 +191,7 @@ def replay(context: StageContext[ReportParams]) -> str:
 
 REPORT: Stage[ReportParams] = Stage(
     name="report",
-    version=10,
+    version=11,
     settings=lambda config: config.report,
     run=run,
     reads=(
@@ -207,6 +212,9 @@ REPORT: Stage[ReportParams] = Stage(
         BASE_COLOR,
         PROVENANCE,
         QUALITY,
+        MATERIAL_COLOR,
+        ORM,
+        LIGHT_HDR,
     ),
     writes=(PAGE,),
     reads_manifests=(
@@ -220,6 +228,7 @@ REPORT: Stage[ReportParams] = Stage(
         "cleanup",
         "atlas",
         "bake",
+        "materials",
         "export",
     ),
     reads_run=True,

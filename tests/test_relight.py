@@ -50,6 +50,7 @@ def uniform(path: Path, radiance: float) -> str:
 
 
 # ---------------------------------------------------------------- pictures
+@pytest.mark.slow
 def test_the_light_from_above_lights_the_top_and_colours_are_the_materials(learned: Path, tmp_path: Path) -> None:
     """The scene's up is +Z, the light's is +Y: that of the GLB."""
     picture = drawn(learned, tmp_path / "a.png", "learned", background="white").astype(int)
@@ -74,6 +75,7 @@ def test_without_materials_the_texture_is_shown_and_it_is_said(
     assert not (tmp_path / "b.png").exists()
 
 
+@pytest.mark.slow
 def test_foreign_lights_are_metered_and_the_exposure_counts_from_there(learned: Path, tmp_path: Path) -> None:
     dim, bright = (
         drawn(learned, tmp_path / "a.png", uniform(tmp_path / f"{k}.hdr", 4.0**k)).astype(int) for k in (-2, 3)
@@ -177,6 +179,7 @@ def test_lights_that_are_none(plain: Path, tmp_path: Path) -> None:
             drawn(plain, tmp_path / "a.png", light)
 
 
+@pytest.mark.slow
 def test_a_workspace_without_a_texture_or_with_one_of_another_mesh(tmp_path: Path) -> None:
     with pytest.raises(WorkspaceError):
         drawn(tmp_path / "absent", tmp_path / "a.png")
@@ -199,6 +202,7 @@ def run(*words: object) -> Result:
     return CliRunner().invoke(build_app(), ["relight", *map(str, words)])
 
 
+@pytest.mark.slow
 def test_the_command_draws_and_says_how(learned: Path, tmp_path: Path) -> None:
     out = tmp_path / "a.png"
     done = run(learned, "--light", "sun", "--out", out, "--size", "64x48", "--exposure", -1, "--turn", 30, "--json")
