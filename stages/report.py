@@ -20,6 +20,7 @@ from stages.artifacts import (
     GIVEN_REGION,
     HELD_OUT,
     IMAGE_SET,
+    KNOWN,
     LIGHT_HDR,
     MATERIAL_COLOR,
     METRICS,
@@ -59,7 +60,7 @@ def run(context: StageContext[ReportParams]) -> dict[str, Any]:
     """Write report.html. Returns its size in bytes, and how the final mesh meets held-out photos."""
     import jinja2
 
-    from stages.reporting import control, curves, lit_view, numbers, photo_table, pictures, poses, stereo
+    from stages.reporting import control, curves, numbers, photo_table, pictures, poses, stereo
     from stages.reporting.held_out_photos import compare_held_out
 
     scene, place, atlas = context.read(SCENE), context.read(WORLD_PLACE), context.read(ATLAS_MESH)
@@ -96,8 +97,7 @@ def run(context: StageContext[ReportParams]) -> dict[str, Any]:
     page |= describe_view(
         scene, place, region, atlas, texture, left(context, QUALITY), left(context, POINT_CLOUD), captions
     )
-    color, orm = context.read(MATERIAL_COLOR), context.read(ORM)
-    page["viewer"] |= lit_view.describe_lights(context.read(LIGHT_HDR), color, orm, scene, place)
+    page["viewer"] |= in_lights(context, scene, place)
     context.progress(4, steps, "writing the page")
     placed = {name: manifests[name].numbers for name in ("undistort", "place", "train") if name in manifests}
     page |= {
@@ -172,6 +172,13 @@ def describe_view(
     }
 
 
+def in_lights(context: StageContext[ReportParams], scene: PosedScene, place: Place) -> dict[str, Any]:
+    """What the 3D view shows the model in: lights, and the material where it was learned."""
+    from stages.reporting.lit_view import describe_lights
+
+    return describe_lights(context.read(LIGHT_HDR), context.read(MATERIAL_COLOR), context.read(ORM), scene, place)
+
+
 def region_corners(scene: PosedScene, region: GivenRegion | None) -> np.ndarray | None:
     """Corners [8, 3] of the box that was given as region, scene frame; None where none was."""
     corners = region.box_corners() if region else None
@@ -214,6 +221,7 @@ REPORT: Stage[ReportParams] = Stage(
         QUALITY,
         MATERIAL_COLOR,
         ORM,
+        KNOWN,
         LIGHT_HDR,
     ),
     writes=(PAGE,),
