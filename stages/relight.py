@@ -19,7 +19,7 @@ from stages.engine.damage import damage_named
 from stages.engine.status import replaced_inputs
 from stages.engine.workspace import DISK_FULL, Workspace
 from stages.errors import ConfigError, InputError, WorkspaceError, did_you_mean
-from stages.geometry.up import y_up_rotation
+from stages.geometry.up import gltf_from_scene
 from stages.light.built_in import LIGHTS, MEAN, mean_radiance
 from stages.materials import MATERIALS
 
@@ -178,7 +178,6 @@ def read_subject(opened: Workspace) -> Subject:
     """The asset: with its materials, or with the photos' colours and the roughness that exported files say."""
     from stages.drawing.relighting import Material
     from stages.files.contents import ROUGHNESS
-    from stages.geometry.similarity import Similarity
     from stages.reporting.pictures import read_rgb
     from stages.surface.placing import placed
     from stages.texture.tangents import vertex_tangents
@@ -188,10 +187,7 @@ def read_subject(opened: Workspace) -> Subject:
 
     scene = artifacts.SCENE.load(opened.stage_folder(artifacts.SCENE.stage))
     place = artifacts.WORLD_PLACE.load(opened.stage_folder(artifacts.WORLD_PLACE.stage))
-    world_from_scene = scene.world_from_scene(place)
-    turn = y_up_rotation(world_from_scene.rotation @ scene.up_in(place))
-    gltf_from_scene = Similarity(1.0, turn, np.zeros(3)).compose(world_from_scene)
-    mesh = placed(artifacts.ATLAS_MESH.load(opened.stage_folder("atlas")), gltf_from_scene)
+    mesh = placed(artifacts.ATLAS_MESH.load(opened.stage_folder("atlas")), gltf_from_scene(scene, place))
     normal = read_rgb(path(artifacts.NORMAL_MAP)) if path(artifacts.NORMAL_MAP).exists() else None
     tangents = None if normal is None else vertex_tangents(mesh)
     if path(artifacts.MATERIAL_COLOR).exists() and not replaced_inputs(MATERIALS, opened):

@@ -12,7 +12,7 @@ from stages.files.contents import ROUGHNESS
 from stages.files.light_files import read_light
 from stages.geometry.cameras import PosedScene
 from stages.geometry.place import Place
-from stages.geometry.up import y_up_rotation
+from stages.geometry.up import gltf_from_scene, y_up_rotation
 from stages.light.built_in import LIGHTS
 from stages.light.environment import resized
 from stages.reporting.pictures import data_uri, jpeg_uri, read_rgb, shrink
@@ -62,10 +62,8 @@ def describe_lights(learned: Path | None, color: Path, orm: Path, scene: PosedSc
 
 def view_turn_deg(scene: PosedScene, place: Place) -> float:
     """By how much the view is turned about the vertical from the frame of the GLB, as `environment.turned` counts."""
-    world_from_scene = scene.world_from_scene(place)
-    up = scene.up_in(place)
-    gltf_from_scene = y_up_rotation(world_from_scene.rotation @ up) @ world_from_scene.rotation
-    ahead = y_up_rotation(up) @ gltf_from_scene.T @ np.array([1.0, 0, 0])
+    view_from_scene = y_up_rotation(scene.up_in(place))
+    ahead = view_from_scene @ gltf_from_scene(scene, place).rotation.T @ np.array([1.0, 0, 0])
     return float(np.degrees(np.arctan2(ahead[2], ahead[0])))
 
 
