@@ -208,4 +208,4 @@ def _exr_parts(file: Path, header_only: bool = False) -> list[Any]:
     import OpenEXR
 
     with contextlib.redirect_stdout(io.StringIO()):
-        return list(OpenEXR.File(str(file), separate_channels=True, header_only=header_only, num_threads=1).parts)
+        return list(OpenEXR.File(str(file), separate_channels=True, header_only=header_only).parts)
