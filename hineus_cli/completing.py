@@ -19,6 +19,12 @@ def devices(incomplete: str) -> list[str]:
     return _starting(incomplete, ["auto", "cpu", "cuda"])
 
 
+def lights(incomplete: str) -> list[str]:
+    from stages.light.built_in import LIGHTS
+
+    return _starting(incomplete, ["learned", *LIGHTS])
+
+
 def setting_keys(incomplete: str) -> list[str]:
     """Keys with the equals sign; behind it the values, of settings that have few."""
     from configs.load import describe_settings

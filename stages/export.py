@@ -31,6 +31,7 @@ from stages.geometry.place import GivenRegion, Place
 from stages.geometry.point_cloud import PointCloud
 from stages.geometry.similarity import Similarity
 from stages.geometry.up import y_up_rotation
+from stages.surface.placing import placed, turned
 
 if TYPE_CHECKING:
     from stages.files.contents import Textures
@@ -63,13 +64,11 @@ class Asset:
 
     def in_world(self, mesh: artifacts.AtlasMesh) -> artifacts.AtlasMesh:
         """A mesh of the scene frame in the world, its vertices and normals as float64 and the normals unit."""
-        normals = unit_normals(mesh.vertices, mesh.normals, mesh.faces) @ self.world_from_scene.rotation.T
-        return replace(mesh, vertices=self.world_from_scene.apply(mesh.vertices.astype(np.float64)), normals=normals)
+        return placed(mesh, self.world_from_scene)
 
     def in_gltf(self, mesh: artifacts.AtlasMesh) -> artifacts.AtlasMesh:
         """The same with Y up."""
-        world, turn = self.in_world(mesh), self.gltf_from_world.T
-        return replace(world, vertices=world.vertices @ turn, normals=world.normals @ turn)
+        return turned(self.in_world(mesh), self.gltf_from_world)
 
 
 def run(context: StageContext[ExportParams]) -> dict[str, Any]:
@@ -285,25 +284,6 @@ def load_textures(context: StageContext[ExportParams]) -> Textures:
     optional = (context.read(NORMAL_MAP), context.read(OCCLUSION))
     normal, occlusion = (path.read_bytes() if path.exists() else None for path in optional)
     return Textures(context.read(BASE_COLOR).read_bytes(), normal, occlusion)
-
-
-def unit_normals(vertices: np.ndarray, normals: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Vertex normals [V, 3] float64 of length 1: those without a length take an adjoining face's, else +Z."""
-    from stages.surface.triangle_mesh import face_normals
-
-    unit = normals.astype(np.float64)
-    lengths = np.linalg.norm(unit, axis=1)
-    bad = ~np.isfinite(lengths) | (lengths < 1e-6)
-    if bad.any():
-        flat = face_normals(vertices, faces)
-        usable = np.linalg.norm(flat, axis=1) > 0
-        unit[bad] = (0, 0, 1)
-        for k in range(3):
-            takes = usable & bad[faces[:, k]]
-            unit[faces[takes, k]] = flat[takes]
-        lengths = np.linalg.norm(unit, axis=1)
-    unit /= lengths[:, None]
-    return unit
 
 
 def vertex_colors(texture_png: bytes, uvs: np.ndarray) -> np.ndarray:

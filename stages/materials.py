@@ -8,7 +8,6 @@ from configs.params import MaterialsParams
 from stages.artifacts import (
     ATLAS_MESH,
     BASE_COLOR,
-    CAMERAS,
     HELD_OUT,
     KNOWN,
     LIGHT,
@@ -35,7 +34,7 @@ MATERIALS: Stage[MaterialsParams] = Stage(
     version=1,
     settings=lambda config: config.materials,
     run=run,
-    reads=(PINHOLE_PHOTOS, CAMERAS, HELD_OUT, SCENE, WORLD_PLACE, ATLAS_MESH, BASE_COLOR, OCCLUSION),
+    reads=(PINHOLE_PHOTOS, HELD_OUT, SCENE, WORLD_PLACE, ATLAS_MESH, BASE_COLOR, OCCLUSION),
     writes=(MATERIAL_COLOR, ORM, KNOWN, LIGHT, LIGHT_HDR, LIGHT_HARMONICS),
     summary="texture + photos -> base colour, roughness, metalness, light",
 )

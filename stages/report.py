@@ -20,8 +20,12 @@ from stages.artifacts import (
     GIVEN_REGION,
     HELD_OUT,
     IMAGE_SET,
+    KNOWN,
+    LIGHT_HDR,
+    MATERIAL_COLOR,
     METRICS,
     MODEL,
+    ORM,
     OUTLINES,
     PAGE,
     PHOTOS,
@@ -93,6 +97,7 @@ def run(context: StageContext[ReportParams]) -> dict[str, Any]:
     page |= describe_view(
         scene, place, region, atlas, texture, left(context, QUALITY), left(context, POINT_CLOUD), captions
     )
+    page["viewer"] |= in_lights(context, scene, place)
     context.progress(4, steps, "writing the page")
     placed = {name: manifests[name].numbers for name in ("undistort", "place", "train") if name in manifests}
     page |= {
@@ -167,6 +172,13 @@ def describe_view(
     }
 
 
+def in_lights(context: StageContext[ReportParams], scene: PosedScene, place: Place) -> dict[str, Any]:
+    """What the 3D view shows the model in: lights, and the material where it was learned."""
+    from stages.reporting.lit_view import describe_lights
+
+    return describe_lights(context.read(LIGHT_HDR), context.read(MATERIAL_COLOR), context.read(ORM), scene, place)
+
+
 def region_corners(scene: PosedScene, region: GivenRegion | None) -> np.ndarray | None:
     """Corners [8, 3] of the box that was given as region, scene frame; None where none was."""
     corners = region.box_corners() if region else None
@@ -186,7 +198,7 @@ def replay(context: StageContext[ReportParams]) -> str:
 
 REPORT: Stage[ReportParams] = Stage(
     name="report",
-    version=10,
+    version=11,
     settings=lambda config: config.report,
     run=run,
     reads=(
@@ -207,6 +219,10 @@ REPORT: Stage[ReportParams] = Stage(
         BASE_COLOR,
         PROVENANCE,
         QUALITY,
+        MATERIAL_COLOR,
+        ORM,
+        KNOWN,
+        LIGHT_HDR,
     ),
     writes=(PAGE,),
     reads_manifests=(
@@ -220,6 +236,7 @@ REPORT: Stage[ReportParams] = Stage(
         "cleanup",
         "atlas",
         "bake",
+        "materials",
         "export",
     ),
     reads_run=True,

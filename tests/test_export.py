@@ -23,7 +23,7 @@ from stages.engine.fingerprint import Identity
 from stages.engine.manifest import Manifest
 from stages.engine.stage import StageContext
 from stages.errors import ReconstructionError, SystemRequirementError
-from stages.export import EXPORT, unit_normals
+from stages.export import EXPORT
 from stages.files.contents import Textures
 from stages.files.glb import glb_bytes, shapes_glb_bytes
 from stages.files.obj import obj_text
@@ -32,6 +32,7 @@ from stages.geometry.cameras import PinholeCameras
 from stages.geometry.place import Place
 from stages.geometry.similarity import Similarity
 from stages.geometry.up import y_up_rotation
+from stages.surface.placing import unit_normals
 
 ROOT = Path(__file__).parents[1]
 # No rotation maps this tetrahedron with its four colours to its mirror image.

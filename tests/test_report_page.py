@@ -13,17 +13,21 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from relit_workspace import ball
 from report_inputs import BOX, bare_inputs, full_inputs, manifest, page
 
 from configs.texts import read_region
 from hineus_cli.viewing import serving, watch
 from stages import artifacts
+from stages.artifacts import write_png
 from stages.engine.stage import StageContext
 from stages.engine.workspace import Workspace
+from stages.files.light_files import write_hdr
 from stages.geometry.normalisation import rotation_onto
 from stages.geometry.place import GivenRegion, Place, given_region
 from stages.geometry.point_cloud import PointCloud
 from stages.geometry.similarity import Similarity
+from stages.light.environment import directions
 
 BROWSER = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(BROWSER is None, reason="needs Chromium")]
@@ -291,3 +295,80 @@ def test_the_live_page_draws_under_its_policy(tmp_path):
             dom = browse(tmp_path, url, "--dump-dom").stdout  # which asserts that nothing was refused
     assert 'data-live="ready"' in dom
     assert re.search(r"<figure><svg [^>]*>.*<polyline .*</svg><figcaption>psnr: now 13<", dom)
+
+
+# ---------------------------------------------------------------- in a light
+START = np.array([0.53, 0.34, 0.78])  # where the view looks from, see viewer.js
+YAW = np.radians(40)
+
+
+def in_a_light(context: StageContext, lamp: np.ndarray) -> StageContext:
+    """A polished metal ball whose learned light comes from one direction of the GLB's frame; world and scene differ."""
+    artifacts.ATLAS_MESH.save(context.inputs["atlas"], ball())
+    turn = np.array([[np.cos(YAW), -np.sin(YAW), 0], [np.sin(YAW), np.cos(YAW), 0], [0, 0, 1]])
+    artifacts.WORLD_PLACE.save(context.inputs["place"], Place(Similarity(2.0, turn, np.array([5.0, 6, 7]))))
+    folder = context.inputs["materials"]
+    write_png(artifacts.MATERIAL_COLOR.load(folder), np.full((16, 16, 3), 255, np.uint8))
+    write_png(artifacts.ORM.load(folder), np.full((16, 16, 3), (255, 60, 255), np.uint8))
+    light = np.full((64, 128, 3), 0.02, np.float32)
+    light[directions(64) @ lamp > np.cos(np.radians(12))] = 30
+    write_hdr(artifacts.LIGHT_HDR.load(folder), light)
+    return context
+
+
+def highlight(picture: np.ndarray) -> np.ndarray:
+    """Where the ball of a screenshot is brightest: right and up of its middle, in radii."""
+    stage = picture[315:900, 40:860]
+    grey = np.ptp(stage, axis=2) < 12
+    rows, columns = np.nonzero(grey & (stage.mean(2) < 90))
+    dark = np.array([columns.min(), columns.max(), rows.min(), rows.max()])
+    middle, radius = np.array([dark[:2].mean(), dark[2:].mean()]), (dark[1] - dark[0]) / 2
+    y, x = np.indices(stage.shape[:2])
+    inside = np.hypot(x - middle[0], y - middle[1]) < 0.97 * radius
+    lit = np.argwhere(inside & (stage.mean(2) > 0.8 * stage.mean(2)[inside].max()))[:, ::-1].mean(0)
+    return (lit - middle) / radius * [1, -1]
+
+
+@pytest.mark.parametrize("turn", [0, 60])
+def test_the_learned_light_comes_from_where_it_came_and_turns(tmp_path, turn):
+    """The view is not in the GLB's frame: it is turned about the vertical, back by the world's yaw."""
+    ahead, lamp = START / np.linalg.norm(START), np.array([0.2, 0.5, 0.84])
+    lamp /= np.linalg.norm(lamp)
+    context = in_a_light(bare_inputs(tmp_path), lamp)
+    page(context)
+    url = f"{artifacts.PAGE.load(context.out).as_uri()}#show=learned&turn={turn}"
+    found = highlight(screenshot(context.scratch, url, "--window-size=900,1200"))
+    # a yaw about the scene's +Z is one about the view's +Y; to greater φ is a negative turn about +Y
+    back = -YAW - np.radians(turn)
+    cosine, sine = np.cos(back), np.sin(back)
+    towards = np.array([[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]]) @ lamp
+    right = np.cross([0, 1, 0], ahead)
+    right /= np.linalg.norm(right)
+    halfway = (towards + ahead) / np.linalg.norm(towards + ahead)
+    expected = np.array([halfway @ right, halfway @ np.cross(ahead, right)])
+    assert np.linalg.norm(found - expected) < 0.12, (found, expected)
+
+
+def test_a_light_lights_the_texture_where_no_materials_were_learned(full):
+    page(full)
+    text = artifacts.PAGE.load(full.out).read_text()
+    assert 'value="studio"' in text
+    assert 'value="learned"' not in text
+    assert 'value="roughness"' not in text
+    url = artifacts.PAGE.load(full.out).as_uri()
+    plain, lit = (screenshot(full.scratch, f"{url}#show={what}") for what in ("texture", "sun"))
+    turned = screenshot(full.scratch, f"{url}#show=sun&turn=180")
+    red = (plain[..., 0] > 180) & (plain[..., 1] < 90)
+    assert np.abs(lit - plain)[red].mean() > 10
+    assert np.abs(lit - turned)[red].mean() > 5
+    assert (lit[red][:, 0] > 1.3 * lit[red][:, 2]).mean() > 0.9  # it is still red
+
+
+def test_the_materials_maps_are_shown_in_grey(tmp_path):
+    context = in_a_light(bare_inputs(tmp_path), np.array([0, 1.0, 0]))
+    page(context)
+    url = artifacts.PAGE.load(context.out).as_uri()
+    for what, grey in (("roughness", 60), ("metalness", 255), ("color", 255)):
+        shown = screenshot(context.scratch, f"{url}#show={what}", "--window-size=900,1200")
+        middle = shown[560:640, 410:490]
+        assert np.abs(middle - grey).max() <= 3, what

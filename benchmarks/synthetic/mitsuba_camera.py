@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import glob
-import os
-import subprocess
-import sys
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -13,52 +9,15 @@ from typing import Any
 import numpy as np
 
 from benchmarks.synthetic.model import Ground, Part, Scene
-from stages.errors import SystemRequirementError
+from stages.drawing.path_tracing import EVERYWHERE as EVERYWHERE
+from stages.drawing.path_tracing import FAST as FAST
+from stages.drawing.path_tracing import choose_variant as choose_variant
 
-FAST, EVERYWHERE = "llvm_ad_rgb", "scalar_rgb"
-LIBRARY = "DRJIT_LIBLLVM_PATH"
-LIBRARIES = ("/usr/lib/*/libLLVM*.so*", "/usr/lib64/libLLVM*.so*", "/opt/homebrew/opt/llvm/lib/libLLVM.dylib")
-# An old libLLVM ends the process instead of raising, so each is tried in one of its own.
-TRIAL = (
-    "import mitsuba as mi; mi.set_variant('llvm_ad_rgb'); "
-    "s = mi.load_dict(mi.cornell_box()); mi.render(s, spp=1).numpy()"
-)
 MAX_BOUNCES = 4
 FLOOR_SIDE = 200.0  # around the printed ground, to the horizon
 FLOOR_DROP = 2e-3
 # Of Disney's principled surface, and alpha of the metal's microfacets (Walter et al. 2007). Metals are aluminium.
 ROUGHNESS = {"glossy": 0.4, "metal": 0.12}
-
-
-def choose_variant() -> tuple[str, str]:
-    """The fastest variant of Mitsuba that runs here, and why; sets the path of libLLVM for this process.
-
-    Raises:
-        SystemRequirementError: Mitsuba is not installed.
-    """
-    try:
-        import mitsuba  # noqa: F401
-    except ImportError as error:
-        raise SystemRequirementError("Mitsuba is not installed.", "Try `pip install 'hineus[bench]'`.") from error
-    given = os.environ.get(LIBRARY)
-    found = sorted((path for pattern in LIBRARIES for path in glob.glob(pattern)), key=_version, reverse=True)
-    for library in [given] if given else found:
-        environment = {**os.environ, LIBRARY: library}
-        done = subprocess.run([sys.executable, "-c", TRIAL], env=environment, capture_output=True, check=False)
-        if done.returncode == 0:
-            os.environ[LIBRARY] = library
-            return FAST, f"with {library}"
-    reason = f"none of {len(found)} files" if found else "no file"
-    return (
-        EVERYWHERE,
-        f"three times slower than with LLVM: {reason} of libLLVM; 19 is known to do, {LIBRARY} names another",
-    )
-
-
-def _version(path: str) -> tuple[int, ...]:
-    """The numbers in a library's name."""
-    name = Path(path).name
-    return tuple(int(number) for number in "".join(c if c.isdigit() else " " for c in name).split())
 
 
 class Photographer:

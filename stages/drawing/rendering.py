@@ -35,13 +35,22 @@ def look_at(
 
 
 def turntable(
-    vertices: np.ndarray, up: np.ndarray, count: int = 4, width: int = 480, height: int = 480
+    vertices: np.ndarray,
+    up: np.ndarray,
+    count: int = 4,
+    width: int = 480,
+    height: int = 480,
+    front: np.ndarray | None = None,
 ) -> list[PinholeCameras]:
-    """`count` cameras around the vertices' bounding sphere, evenly spaced about `up`, each seeing all of it."""
+    """`count` cameras around the vertices' bounding sphere, evenly spaced about `up`, each seeing all of it.
+
+    The first is at the unit vector `front`, at right angles to `up`, or at any; the others follow counter-clockwise,
+    seen from above.
+    """
     up = up / np.linalg.norm(up)
     center = (vertices.min(0) + vertices.max(0)) / 2
     radius = max(float(np.linalg.norm(vertices - center, axis=1).max()), 1e-9)
-    side = perpendicular(up)
+    side = perpendicular(up) if front is None else front
     ahead = np.cross(up, side)
     distance = 1.03 * radius / np.sin(np.radians(FOV_DEG) / 2) * max(1.0, height / width)
     elevation = np.radians(ELEVATION_DEG)

@@ -1,1 +1,1 @@
-"""Meshes and points to the bytes of other programs: GLB, USDZ, OBJ, PLY, STL, LAZ. No stage, no path."""
+"""Meshes, points and lights to the bytes of other programs: GLB, USDZ, OBJ, PLY, STL, LAZ, EXR, HDR. No stage."""

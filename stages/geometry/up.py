@@ -12,11 +12,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from stages.geometry.cameras import PinholeCameras
+from stages.geometry.cameras import PinholeCameras, PosedScene
 from stages.geometry.normalisation import rotation_onto
+from stages.geometry.similarity import Similarity
 
 if TYPE_CHECKING:
     from jaxtyping import Float
+
+    from stages.geometry.place import Place
 
 IRLS_STEPS = 30
 TINY = 1e-12  # keeps divisions finite; far below any length that occurs
@@ -80,6 +83,13 @@ def y_up_rotation(up: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "3 3"]:
     if up[1] < -1 + 1e-14:
         return np.diag([1.0, -1.0, -1.0])
     return rotation_onto(up, np.array([0.0, 1.0, 0.0]))
+
+
+def gltf_from_scene(scene: PosedScene, place: Place) -> Similarity:
+    """From the scene's frame to that of the exported GLB: the world, turned +Y up."""
+    world_from_scene = scene.world_from_scene(place)
+    turn = y_up_rotation(world_from_scene.rotation @ scene.up_in(place))
+    return Similarity(1.0, turn, np.zeros(3)).compose(world_from_scene)
 
 
 def angle_deg(a: Float[np.ndarray, " 3"], b: Float[np.ndarray, " 3"]) -> float:

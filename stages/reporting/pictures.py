@@ -47,6 +47,14 @@ def jpeg_uri(image: np.ndarray, quality: int = 85) -> str:
     return "data:image/jpeg;base64," + base64.b64encode(data.tobytes()).decode()
 
 
+def data_uri(image: np.ndarray, suffix: str) -> str:
+    """[H, W, 3] uint8 RGB as a data URI of a format without loss, such as ".png"."""
+    import cv2
+
+    _, data = cv2.imencode(suffix, cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
+    return f"data:image/{suffix[1:]};base64," + base64.b64encode(data.tobytes()).decode()
+
+
 def draw_stills(atlas: AtlasMesh, texture: np.ndarray, up: np.ndarray) -> list[np.ndarray]:
     """The model from four sides: with its texture, then its shape alone."""
     from stages.drawing.rendering import render_textured, turntable

@@ -64,9 +64,9 @@ def pack_mesh(atlas: AtlasMesh, texture: np.ndarray, up: np.ndarray) -> dict[str
     small = len(atlas.vertices) <= 1 << 16
     return {
         **_pack_positions(atlas.vertices @ turn.T),
-        "uvs": _encode(np.round(uvs * 65535).astype("<u2")),
-        "normals": _encode(normals),
-        "faces": _encode(atlas.faces.astype("<u2" if small else "<u4")),
+        "uvs": encode(np.round(uvs * 65535).astype("<u2")),
+        "normals": encode(normals),
+        "faces": encode(atlas.faces.astype("<u2" if small else "<u4")),
         "face_bits": 16 if small else 32,
         "texture": jpeg_uri(shrink(texture, TEXTURE_SIDE), 88),
     }
@@ -135,7 +135,7 @@ def pack_dense(cloud: PointCloud, scene: PosedScene) -> dict[str, Any] | None:
     if not len(rows):
         return None
     positions = _pack_positions(moved.points[rows] @ y_up_rotation(scene.up).T)
-    return {**positions, "colors": _encode(moved.colors[rows]), "shown": len(rows), "total": len(cloud)}
+    return {**positions, "colors": encode(moved.colors[rows]), "shown": len(rows), "total": len(cloud)}
 
 
 def pack_region(scene: PosedScene, place: Place, given: GivenRegion | None) -> dict[str, Any]:
@@ -207,7 +207,7 @@ def _corner_rays(cameras: PinholeCameras) -> np.ndarray:
 def _overlay(key: str, label: str, values: np.ndarray, low: float, high: float, missing: str) -> dict[str, Any]:
     scaled = np.clip((np.asarray(values, dtype=np.float64) - low) / (high - low), 0, 1) * (NO_VALUE - 1)
     packed = np.where(np.isnan(scaled), NO_VALUE, np.round(scaled)).astype(np.uint8)
-    return {"key": key, "label": label, "low": low, "high": high, "missing": missing, "values": _encode(packed)}
+    return {"key": key, "label": label, "low": low, "high": high, "missing": missing, "values": encode(packed)}
 
 
 def _top(values: np.ndarray) -> float:
@@ -223,7 +223,7 @@ def _pack_positions(points: np.ndarray) -> dict[str, Any]:
     low = points.min(0)
     size = np.maximum(points.max(0) - low, 1e-9)
     packed = np.round((points - low) / size * 65535).astype("<u2")
-    return {"positions": _encode(packed), "low": low.tolist(), "size": size.tolist()}
+    return {"positions": encode(packed), "low": low.tolist(), "size": size.tolist()}
 
 
 def _plain(array: np.ndarray) -> list[float]:
@@ -231,5 +231,6 @@ def _plain(array: np.ndarray) -> list[float]:
     return [float(f"{value:.5g}") for value in np.asarray(array).ravel()]
 
 
-def _encode(array: np.ndarray) -> str:
+def encode(array: np.ndarray) -> str:
+    """The bytes of an array as base64."""
     return base64.b64encode(np.ascontiguousarray(array).tobytes()).decode()

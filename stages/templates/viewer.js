@@ -1,5 +1,6 @@
 // The page's 3D view, on three.js (global THREE): the mesh with its texture or a measure per vertex in colours, the
-// cameras as pyramids, sparse and dense points, ground, region, and the next photos to take. Drawn when something changes only.
+// cameras as pyramids, sparse and dense points, ground, region, and the next photos to take; the mesh in a light from all
+// around, and what the material is. Drawn when something changes only.
 (function () {
   "use strict";
   const canvas = document.getElementById("viewer");
@@ -33,7 +34,7 @@
   const lines = (numbers, color) => {
     const geometry = new THREE.BufferGeometry();
     geometry.setAttribute("position", new THREE.BufferAttribute(new Float32Array(numbers), 3));
-    return new THREE.LineSegments(geometry, new THREE.LineBasicMaterial({ color }));
+    return new THREE.LineSegments(geometry, new THREE.LineBasicMaterial({ color, toneMapped: false }));
   };
 
   // ---------------------------------------------------------------- the mesh and its measures
@@ -51,20 +52,88 @@
   const count = geometry.getAttribute("position").count;
   const colors = new THREE.BufferAttribute(new Float32Array(3 * count), 3);
   geometry.setAttribute("color", colors);
-  const texture = new THREE.Texture();
-  texture.colorSpace = THREE.SRGBColorSpace;
-  texture.flipY = false;
-  texture.anisotropy = Math.min(4, renderer.capabilities.getMaxAnisotropy());
+  const image = (colorSpace) => {
+    const made = new THREE.Texture();
+    Object.assign(made, { colorSpace, flipY: false, anisotropy: Math.min(4, renderer.capabilities.getMaxAnisotropy()) });
+    return made;
+  };
+  const load = (into, source, show = (picture) => picture) => {
+    const picture = new Image();
+    picture.src = source;
+    return picture.decode().then(() => {
+      into.image = show(picture);
+      into.needsUpdate = true;
+    });
+  };
+  const texture = image(THREE.SRGBColorSpace);
   const side = THREE.DoubleSide;
   const materials = {
     texture: new THREE.MeshBasicMaterial({ map: texture, side }),
     shaded: new THREE.MeshLambertMaterial({ map: texture, side }),
     shape: new THREE.MeshLambertMaterial({ color: "#c8c8c8", side }),
     measure: new THREE.MeshLambertMaterial({ vertexColors: true, side }),
+    lit: new THREE.MeshStandardMaterial({ map: texture, roughness: data.roughness, metalness: 0, side }),
   };
+  const basic = ["color", "roughness", "metalness"];
+  if (data.material) {
+    for (const what of basic) materials[what] = new THREE.MeshBasicMaterial({ map: image(THREE.SRGBColorSpace), side });
+    const packed = image(THREE.NoColorSpace);
+    const maps = { map: materials.color.map, aoMap: packed, roughnessMap: packed, metalnessMap: packed };
+    Object.assign(materials.lit, maps, { roughness: 1, metalness: 1 });
+  }
+  for (const what of basic) if (materials[what]) materials[what].toneMapped = false;
   Object.values(materials).forEach(region.dim);
   const mesh = new THREE.Mesh(geometry, materials.texture);
   scene.add(mesh);
+
+  // ---------------------------------------------------------------- light from all around, and the material's images
+  const surroundings = {};
+  const surround = (light) => {
+    if (surroundings[light.key]) return surroundings[light.key];
+    const pixels = new Uint16Array(bytes(light.pixels));
+    const map = new THREE.DataTexture(pixels, light.width, light.width / 2, THREE.RGBAFormat, THREE.HalfFloatType);
+    map.mapping = THREE.EquirectangularReflectionMapping;
+    map.magFilter = map.minFilter = THREE.LinearFilter;
+    map.needsUpdate = true;
+    const sky = new THREE.Scene();
+    sky.background = map;
+    const blur = new THREE.PMREMGenerator(renderer);
+    const blurred = blur.fromScene(sky).texture; // at more pixels than the map has, or rough surfaces show its corners
+    blur.dispose();
+    return (surroundings[light.key] = blurred);
+  };
+  const inLight = (light) => {
+    lamp.visible = ambient.visible = !light;
+    renderer.toneMapping = light ? THREE.NeutralToneMapping : THREE.NoToneMapping;
+    element("light-controls").hidden = element("light-note").hidden = !light;
+    if (!light) return;
+    const turn = Number(element("light-turn").value);
+    element("light-degrees").textContent = `${turn}°`;
+    if (materials.lit.envMap !== surround(light)) materials.lit.needsUpdate = true;
+    materials.lit.envMap = surround(light);
+    // the map's angles grow from +X to +Z, which is a negative turn about +Y
+    materials.lit.envMapRotation.y = (-(light.turn + turn) * Math.PI) / 180;
+  };
+  let told = null;
+  const showMaterial = () => {
+    if (!data.material || told) return told;
+    const channel = (index) => (picture) => {
+      const drawing = Object.assign(document.createElement("canvas"), { width: picture.width, height: picture.height });
+      const pen = drawing.getContext("2d");
+      pen.drawImage(picture, 0, 0);
+      const grey = pen.getImageData(0, 0, drawing.width, drawing.height);
+      for (let i = 0; i < grey.data.length; i += 4) grey.data.fill(grey.data[i + index], i, i + 3);
+      pen.putImageData(grey, 0, 0);
+      return drawing;
+    };
+    told = Promise.all([
+      load(materials.color.map, data.material.color),
+      load(materials.lit.roughnessMap, data.material.orm),
+      load(materials.roughness.map, data.material.orm, channel(1)),
+      load(materials.metalness.map, data.material.orm, channel(2)),
+    ]).then(redraw);
+    return told;
+  };
 
   // Viridis (Smith and van der Walt, 2015): even steps to the eye, and to those who confuse red and green.
   const ramp = ["#440154", "#414487", "#2a788e", "#22a884", "#7ad151", "#fde725"].map((c) => new THREE.Color(c));
@@ -77,8 +146,11 @@
   });
   const show = (what) => {
     const overlay = data.overlays.find((each) => each.key === what);
+    const light = data.lights.find((each) => each.key === what);
     mesh.visible = what !== "none";
-    mesh.material = overlay ? materials.measure : materials[what] || materials.texture;
+    mesh.material = overlay ? materials.measure : light ? materials.lit : materials[what] || materials.texture;
+    inLight(light);
+    if (light || basic.includes(what)) showMaterial();
     const legend = element("view-legend");
     legend.hidden = !overlay;
     if (overlay) {
@@ -90,7 +162,7 @@
       element("legend-missing").hidden = !overlay.missing;
       element("legend-missing-label").textContent = overlay.missing;
     }
-    element("surface").value = overlay || materials[what] || !mesh.visible ? what : "texture";
+    element("surface").value = overlay || light || materials[what] || !mesh.visible ? what : "texture";
     redraw();
   };
 
@@ -99,6 +171,8 @@
     const c = [0, 3, 6, 9].map((i) => corners.slice(i, i + 3));
     return [0, 1, 2, 3].flatMap((i) => [...apex, ...c[i], ...c[i], ...c[(i + 1) % 4]]);
   };
+  const dots = (how) =>
+    region.dim(new THREE.PointsMaterial({ ...how, size: 2, sizeAttenuation: false, toneMapped: false }));
   const used = data.cameras.filter((camera) => !camera.held_out);
   const layers = {
     cameras: lines(used.flatMap(pyramid), paint("--camera")),
@@ -108,7 +182,7 @@
     ground: lines(data.ground || [], paint("--ground")),
     points: new THREE.Points(
       new THREE.BufferGeometry(),
-      region.dim(new THREE.PointsMaterial({ color: paint("--point"), size: 2, sizeAttenuation: false })),
+      dots({ color: paint("--point") }),
     ),
   };
   layers.points.geometry.setAttribute("position", new THREE.BufferAttribute(new Float32Array(sparse), 3));
@@ -120,7 +194,7 @@
       const [r, g, b] = shades.subarray(i, i + 3);
       color.setRGB(r / 255, g / 255, b / 255, THREE.SRGBColorSpace).toArray(painted, i);
     }
-    const material = region.dim(new THREE.PointsMaterial({ vertexColors: true, size: 2, sizeAttenuation: false }));
+    const material = dots({ vertexColors: true });
     layers.dense = new THREE.Points(new THREE.BufferGeometry(), material);
     layers.dense.geometry.setAttribute("position", new THREE.BufferAttribute(positions(data.dense), 3));
     layers.dense.geometry.setAttribute("color", new THREE.BufferAttribute(painted, 3));
@@ -137,7 +211,8 @@
   [eye.near, eye.far] = [radius * 0.01, radius * 100];
   const lamp = new THREE.DirectionalLight("#fff", 0.65 * Math.PI);
   eye.add(lamp);
-  scene.add(eye, new THREE.AmbientLight("#fff", 0.35 * Math.PI));
+  const ambient = new THREE.AmbientLight("#fff", 0.35 * Math.PI);
+  scene.add(eye, ambient);
   const controls = new THREE.OrbitControls(eye, canvas);
   controls.minDistance = radius * 0.1;
   controls.maxDistance = radius * 30;
@@ -229,6 +304,7 @@
   element("card-close").addEventListener("click", () => choose(""));
   element("card-look").addEventListener("click", () => lookFrom(current));
   element("surface").addEventListener("change", (e) => show(e.target.value));
+  element("light-turn").addEventListener("input", () => show(element("surface").value));
   element("view-home").addEventListener("click", home);
   document.querySelectorAll("[data-layer]").forEach((box) => {
     const sync = () => {
@@ -273,16 +349,14 @@
   fit();
   home();
   region.start();
-  // report.html#show=seen&pick=camera-3 opens with that surface and that camera, #edit=region with the region's numbers
+  // report.html#show=seen&pick=camera-3 opens with that surface and that camera, #show=studio&turn=90 in a light that is
+  // turned, #edit=region with the region's numbers
   const asked = new URLSearchParams(location.hash.slice(1));
   if (asked.get("edit") === "region") element("region-toggle").click();
+  element("light-turn").value = asked.get("turn") || "0";
   show(asked.get("show") || "texture");
   choose(asked.get("pick") || "");
-  const image = new Image();
-  image.src = data.texture;
-  image.decode().then(() => {
-    texture.image = image;
-    texture.needsUpdate = true;
+  Promise.all([load(texture, data.texture), told]).then(() => {
     draw();
     document.documentElement.dataset.viewer = "ready";
   });

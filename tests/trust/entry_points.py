@@ -177,6 +177,12 @@ def _matrix(draw: DrawFn, tiny: Tiny, folder: Path) -> Commands:
     return [["evaluate", "mesh", mesh, mesh, "--matrix", "m.txt", "--samples", "2000"]]
 
 
+def _light(draw: DrawFn, tiny: Tiny, folder: Path) -> Commands:
+    name = draw(st.sampled_from(("flat.hdr", "runs.hdr", "light.exr")))
+    wrong_file(draw, tiny.input(name), folder / name)
+    return [["relight", str(tiny.workspace), "--light", name, "--out", "a.png", "--size", "32x32"]]
+
+
 # ---------------------------------------------------------------- a workspace of someone else, or damaged
 def _record(draw: DrawFn, tiny: Tiny, folder: Path) -> Commands:
     shutil.copytree(tiny.workspace, folder / "w")
@@ -221,6 +227,7 @@ ENTRY_POINTS = (
     EntryPoint("control points", 6, _control),
     EntryPoint("mesh", 12, _mesh),
     EntryPoint("matrix", 3, _matrix),
+    EntryPoint("light", 6, _light),
     EntryPoint("record of a workspace", 8, _record),
     EntryPoint("artifact of a stage", 6, _artifact, WITHIN_S),
 )

@@ -93,6 +93,7 @@ def _inputs(tiny: Tiny) -> None:
         "EPSG:32632\n"
         + "".join(f"5000{i % 3}0.5 53000{i % 3}0 10{i % 3} {100 + i} 9{i} {i:03d}.jpg P{i % 3}\n" for i in range(9))
     )
+    _lights(tiny)
     np.savetxt(tiny.input("matrix.txt"), np.diag([2.0, 2, 2, 1]))
     shutil.copy(tiny.workspace / "config.yaml", tiny.input("config.yaml"))
 
@@ -147,6 +148,17 @@ def _poses(tiny: Tiny) -> None:
     for kind, write in (("text", "write_text"), ("binary", "write_binary")):
         tiny.input(kind).mkdir()
         getattr(pycolmap.Reconstruction(str(model)), write)(str(tiny.input(kind)))
+
+
+def _lights(tiny: Tiny) -> None:
+    import cv2
+
+    from stages.files.light_files import write_exr, write_hdr
+
+    radiance = np.random.default_rng(0).random((8, 16, 3)).astype(np.float32)
+    write_hdr(tiny.input("flat.hdr"), radiance)
+    cv2.imwrite(str(tiny.input("runs.hdr")), radiance)
+    write_exr(tiny.input("light.exr"), radiance)
 
 
 def files_of(folder: Path) -> Mapping[str, bytes]:
