@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from configs.params import MaterialsParams
 from stages.artifacts import (
@@ -19,14 +23,129 @@ from stages.artifacts import (
     PINHOLE_PHOTOS,
     SCENE,
     WORLD_PLACE,
+    write_json,
+    write_png,
 )
 from stages.engine.stage import Stage, StageContext
+from stages.errors import ReconstructionError
+
+# Points that materials and light are learned at, and photos that a point must be seen in.
+POINTS, FEWEST_VIEWS = 6000, 3
+FEWEST_POINTS = 50
 
 
 def run(context: StageContext[MaterialsParams]) -> dict[str, Any]:
+    """Learn materials and light, where asked. Returns them in numbers."""
     if not context.params.enabled:
         return {}
-    raise NotImplementedError
+    import torch
+
+    from stages.drawing.rasterizing import rasterize_atlas, surface_points
+    from stages.files.light_files import harmonics_json, write_exr, write_hdr
+    from stages.geometry.up import gltf_from_scene
+    from stages.shading.learning import learn
+    from stages.shading.observations import observe
+    from stages.shading.reflection import reflection
+    from stages.shading.surroundings import look_around
+    from stages.shading.texels import Points, base_colors
+    from stages.texture.padding import pad_charts
+    from stages.texture.prepared_views import PreparedViews
+
+    torch.set_num_threads(context.workers)
+    photos, held_out, scene = context.read(PINHOLE_PHOTOS), context.read(HELD_OUT), context.read(SCENE)
+    cameras = scene.cameras.select([i for i, name in enumerate(scene.cameras.names) if name not in held_out])
+    light_from_scene = gltf_from_scene(scene, context.read(WORLD_PLACE))
+    atlas = context.read(ATLAS_MESH)
+    texture = _read_image(context.read(BASE_COLOR))
+    texels = rasterize_atlas(atlas.uvs, atlas.faces, atlas.texture_size)
+    baked = texture.reshape(-1, 3)[texels.index]
+    views = PreparedViews(atlas, len(texels), cameras, lambda index: photos.masked(cameras.names[index]))
+    chosen = np.sort(np.random.default_rng(0).permutation(len(texels))[:POINTS])
+    positions, normals = surface_points(atlas, texels.face_ids[chosen], texels.corner[chosen])
+    tell = context.progress
+    with ThreadPoolExecutor(max_workers=max(1, context.workers)) as pool:
+        tell(0, 10, "looking at points in all photos")
+        seen = observe(positions, normals, views.in_order(pool, context.workers))
+        rows = np.flatnonzero((seen.weights > 0).sum(1) >= FEWEST_VIEWS)
+        if len(rows) < FEWEST_POINTS:
+            raise ReconstructionError(
+                f"Materials cannot be learned: {len(rows)} of {len(positions)} points on the surface are seen by "
+                f"{FEWEST_VIEWS} photos or more (need {FEWEST_POINTS}).",
+                "Try it without: `hineus run PHOTOS --set materials.enabled=false`, or add photos from more sides.",
+            )
+        seen, positions, normals, chosen = seen.select(rows), positions[rows], normals[rows], chosen[rows]
+        tell(2, 10, "what lies around points")
+        linear = _linear(texture.astype(np.float32) / 255)
+        around = look_around(atlas, linear, positions, normals, light_from_scene)
+        reflected = reflection(seen, normals, around, light_from_scene)
+        learned = learn(
+            seen, reflected, positions, len(cameras),
+            lambda done, total: tell(3 + 4 * done / total, 10, "materials and light in turn"),
+        )  # fmt: skip
+        tell(7, 10, "base colour of each texel")
+        points = Points(positions, normals, baked[chosen].astype(np.float32) / 255, around)
+        everywhere = surface_points(atlas, texels.face_ids, texels.corner)
+        found = base_colors(
+            *everywhere, baked, points, learned, light_from_scene,
+            lambda: views.in_order(pool, context.workers), context.workers,
+        )  # fmt: skip
+    roughness = np.array([material.roughness for material in learned.materials])[found.which]
+    metallic = np.array([material.metallic for material in learned.materials])[found.which]
+    occlusion = _occlusion(context.read(OCCLUSION), atlas.texture_size).reshape(-1)[texels.index]
+    orm = np.stack([occlusion, 255 * roughness + 0.5, 255.0 * metallic], axis=1).astype(np.uint8)
+    write_png(context.to_write(MATERIAL_COLOR), pad_charts(*texels.paint(_code(found.color)))[0])
+    write_png(context.to_write(ORM), pad_charts(*texels.paint(orm))[0])
+    write_png(context.to_write(KNOWN), texels.paint(found.told[:, None])[0][..., 0])
+    write_exr(context.to_write(LIGHT), learned.light)
+    write_hdr(context.to_write(LIGHT_HDR), learned.light)
+    write_json(context.to_write(LIGHT_HARMONICS), harmonics_json(learned.light))
+    shares = np.bincount(found.which, minlength=len(learned.materials)) / max(len(found.which), 1)
+    return {
+        "materials": [
+            {
+                "share": round(float(share), 4),
+                "metallic": material.metallic,
+                "roughness": round(material.roughness, 3),
+                "roughness_told": material.told,
+            }
+            for share, material in zip(shares, learned.materials, strict=True)
+        ],
+        "light_max_over_mean": round(float(learned.light.max() / learned.light.mean()), 2),
+        "gain_min": round(float(learned.gains.min()), 4),
+        "gain_max": round(float(learned.gains.max()), 4),
+        "cost": round(learned.cost, 4),
+    }
+
+
+def _read_image(path: Path) -> np.ndarray:
+    """[H, W, 3] uint8 RGB of an image of our own."""
+    import cv2
+
+    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    if image is None:
+        raise ReconstructionError(f"{path} cannot be read.", "Make it anew: `hineus run PHOTOS --from bake`.")
+    return np.ascontiguousarray(image[..., ::-1])
+
+
+def _occlusion(path: Path, size: int) -> np.ndarray:
+    """[size, size] uint8; all open where there is no such map."""
+    import cv2
+
+    if not path.exists():
+        return np.full((size, size), 255, np.uint8)
+    image = _read_image(path)[..., 0]
+    resized: np.ndarray = cv2.resize(image, (size, size), interpolation=cv2.INTER_LINEAR)
+    return resized
+
+
+def _linear(coded: np.ndarray) -> np.ndarray:
+    return np.where(coded <= 0.04045, coded / 12.92, ((coded + 0.055) / 1.055) ** 2.4).astype(np.float32)
+
+
+def _code(linear: np.ndarray) -> np.ndarray:
+    """8-bit sRGB codes of linear values 0..1."""
+    coded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 0) ** (1 / 2.4) - 0.055)
+    return np.clip(255 * coded + 0.5, 0, 255).astype(np.uint8)
 
 
 MATERIALS: Stage[MaterialsParams] = Stage(
