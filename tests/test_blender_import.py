@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import shutil
+import subprocess
 from pathlib import Path
 
+import light_in_blender
 import numpy as np
 import pytest
 
@@ -12,6 +15,7 @@ from benchmarks import blender_import
 from stages.artifacts import AtlasMesh
 from stages.files.contents import Textures
 from stages.files.glb import glb_bytes, shapes_glb_bytes
+from stages.light.environment import directions
 
 CORNERS = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
 FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
@@ -87,3 +91,21 @@ def test_blender_has_the_four_maps_where_they_belong(material: Path) -> None:
         "Roughness": "occlusion_roughness_metallic 4x4 Non-Color Green",
         "Metallic": "occlusion_roughness_metallic 4x4 Non-Color Blue",
     }
+
+
+@pytest.mark.slow
+def test_blender_takes_the_light_without_a_turn(tmp_path: Path) -> None:
+    import OpenEXR
+
+    blender = shutil.which("blender")
+    if blender is None:
+        pytest.skip("needs Blender")
+    light = tmp_path / "light.exr"  # whose radiance says where it comes from
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    OpenEXR.File(header, {"RGB": directions(32) + 1}).write(str(light))
+    script = ["--python", light_in_blender.__file__, "--", str(light), str(tmp_path)]
+    command = [blender, "--background", "--factory-startup", "--python-exit-code", "1", *script]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
+    (seen,) = [line for line in done.stdout.splitlines() if line.startswith(light_in_blender.MARK)]
+    found = np.array(json.loads(seen.removeprefix(light_in_blender.MARK))) - 1
+    np.testing.assert_allclose(found, light_in_blender.TOWARDS, atol=5e-3)
