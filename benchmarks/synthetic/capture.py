@@ -22,8 +22,7 @@ from benchmarks.synthetic.mitsuba_camera import Photographer
 from benchmarks.synthetic.model import Scene
 from benchmarks.synthetic.scenes import RECIPES
 from stages.evaluation.protocols.known_object import TRUTH_CAMERAS, TRUTH_MESH
-from stages.light.tone_mapping import srgb
-from stages.scenes.photo_files import is_complete, photo_exif, write_truth
+from stages.scenes.photo_files import is_complete, photo_exif, srgb, write_truth
 
 SUITE_VERSION = 1  # raise it when the same recipe would give other photos
 IMAGES, MASKS = "images", "masks"

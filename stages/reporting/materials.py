@@ -7,11 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from stages.light.tone_mapping import tone_mapped
+from stages.drawing.tone_mapping import on_screen
 from stages.reporting.pictures import jpeg_uri, read_rgb, shrink
 
 MAP_SIDE = 512
 LIGHT_WIDTH = 512
+MIDDLE_GREY = 0.18  # the light's mean in its picture
 
 
 def describe_materials(color: Path, orm: Path, known: Path, light: Path) -> dict[str, Any] | None:
@@ -39,13 +40,14 @@ def describe_materials(color: Path, orm: Path, known: Path, light: Path) -> dict
 
 
 def light_picture(file: Path) -> str | None:
-    """An environment map, tone-mapped, as a data URI; None where it is missing or damaged."""
+    """An environment map, exposed by its mean and tone-mapped, as a data URI; None where it is missing or damaged."""
     import cv2
 
     found = cv2.imdecode(np.frombuffer(file.read_bytes(), np.uint8), cv2.IMREAD_UNCHANGED) if file.exists() else None
     if found is None or found.dtype != np.float32 or found.ndim != 3:
         return None
-    shown = tone_mapped(cv2.cvtColor(found, cv2.COLOR_BGR2RGB))
+    exposure = np.log2(MIDDLE_GREY / max(float(found.mean()), 1e-9))
+    shown = (255 * on_screen(cv2.cvtColor(found, cv2.COLOR_BGR2RGB), exposure) + 0.5).astype(np.uint8)
     return jpeg_uri(cv2.resize(shown, (LIGHT_WIDTH, LIGHT_WIDTH // 2), interpolation=cv2.INTER_LINEAR))
 
 

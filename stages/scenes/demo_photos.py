@@ -12,10 +12,9 @@ from typing import Any
 import numpy as np
 
 from stages.evaluation.protocols.known_object import TRUTH_CAMERAS, TRUTH_MESH
-from stages.light.tone_mapping import srgb
 from stages.scenes.figurine import make_figurine
 from stages.scenes.figurine_pictures import light_scene, render
-from stages.scenes.photo_files import is_complete, photo_exif, write_truth
+from stages.scenes.photo_files import is_complete, photo_exif, srgb, write_truth
 from stages.scenes.viewpoints import camera_ring
 
 SCENE_VERSION = 1  # raise it when the same seed would give other photos
