@@ -180,6 +180,7 @@ FOLDERS = OUT / "ablation"
 POSED, SHARED = ("undistort", "densify"), "densify"  # what trainings start from, and up to where all runs share it
 # Of `stages`, what the stages measured are made of.
 SOURCES = ("train.py", "extract.py", "cleanup.py", "compiling.py", "neural", "surface", "geometry")
+LATER = ("atlas", "bake", "materials", "export", "report")  # sections of settings that no stage measured depends on
 HOLDOUT = 8  # every so many photos one is left out, on sets whose score is the PSNR
 # Two runs with a thread each do more on two cores than one run with two.
 ONE_THREAD = {
@@ -364,10 +365,11 @@ def poses_hash(shared: Path) -> str:
 
 
 def config_hash(plan: Plan) -> str:
-    """Hash of all settings of a run: a result is one of now only where presets and defaults are the same."""
+    """Hash of the settings of a run: a result is one of now only where presets and defaults are the same."""
     from stages.engine.fingerprint import digest
 
-    return digest(load_config(plan.preset, None, plan.sets).model_dump(mode="json"))[:12]
+    settings = load_config(plan.preset, None, plan.sets).model_dump(mode="json", exclude=set(LATER))
+    return digest(settings)[:12]
 
 
 def default_steps(preset: str) -> int:

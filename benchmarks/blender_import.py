@@ -19,8 +19,14 @@ from typing import Any
 
 SCENE = Path(__file__).with_name("blender_scene.py")
 MARK = "IMPORTED "
-# Words by which the file says that it holds a texture, and the input of Blender's shader that it has to reach.
-INPUTS = {b'"baseColorTexture"': "Base Color", b'"normalTexture"': "Normal", b'"occlusionTexture"': "Occlusion"}
+# Words by which the file says that it holds a texture, and the inputs of Blender's shader that it has to reach; of one
+# that holds several maps, with the channel.
+INPUTS = {
+    b'"baseColorTexture"': {"Base Color": ""},
+    b'"normalTexture"': {"Normal": ""},
+    b'"occlusionTexture"': {"Occlusion": ""},
+    b'"metallicRoughnessTexture"': {"Roughness": " Green", "Metallic": " Blue"},
+}
 
 
 def import_model(blender: str, model: Path, still: Path | None, time_limit: float = 540.0) -> dict[str, Any]:
@@ -48,7 +54,12 @@ def missing(model: Path, found: dict[str, Any]) -> list[str]:
     lacking = [] if found["meshes"] and found["triangles"] else ["mesh"]
     if b"TEXCOORD_0" in head and not found["uv_layers"]:
         lacking.append("UVs")
-    return lacking + [name for word, name in INPUTS.items() if word in head and name not in found["images"]]
+    wanted = {name: channel for word, inputs in INPUTS.items() if word in head for name, channel in inputs.items()}
+    return lacking + [name for name, channel in wanted.items() if not _reached(found["images"].get(name), channel)]
+
+
+def _reached(image: str | None, channel: str) -> bool:
+    return image is not None and image.endswith(channel)
 
 
 def main(arguments: list[str] | None = None) -> int:

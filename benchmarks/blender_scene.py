@@ -20,6 +20,7 @@ if "bool" not in numpy.__dict__:
     numpy.bool = bool
 
 MARK = "IMPORTED "
+SEPARATORS = ("SEPARATE_COLOR", "SEPRGB")  # nodes that take an image apart, of today and of before 3.3
 SIDE = 640  # of the still, pixels
 SAMPLES = 16
 
@@ -49,14 +50,16 @@ def describe() -> dict:
 
 
 def behind(socket) -> str | None:
-    """Name and size of the image that feeds a socket, through whatever lies between; None where there is none."""
+    """Name, size and colour space of the image that feeds a socket, through whatever lies between, and the channel
+    where it is one of them (Red, Green, Blue); None where there is no image."""
     for link in socket.links:
         node = link.from_node
         if node.type == "TEX_IMAGE" and node.image is not None and node.image.size[0] > 0:
             return f"{node.image.name} {node.image.size[0]}x{node.image.size[1]} {node.image.colorspace_settings.name}"
+        channel = f" {link.from_socket.name}" if node.type in SEPARATORS else ""
         for inner in node.inputs:
             if found := behind(inner):
-                return found
+                return found + channel
     return None
 
 

@@ -326,6 +326,11 @@ class ExportParams(Section):
     collision: Literal["off", "hulls"] = Field(
         "off", description="a GLB of convex pieces for physics engines; needs `pip install coacd`"
     )
+    simulation: Literal["off", "usd"] = Field(
+        "off",
+        description="a USDZ for simulators: mesh, material, convex pieces with UsdPhysics' collision, and the light "
+        "where `materials.enabled` found it; needs `pip install coacd`",
+    )
     collision_pieces: int = Field(16, ge=1, le=256, description="at most this many convex pieces")
 
 

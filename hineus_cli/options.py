@@ -159,6 +159,14 @@ NoGround = Annotated[bool, typer.Option("--no-ground", help="Cut off the ground 
 Watertight = Annotated[
     bool, typer.Option("--watertight", help="A closed mesh, as for printing: sets cleanup.keep_closed.")
 ]
+Relightable = Annotated[
+    bool,
+    typer.Option(
+        "--relightable",
+        help="Base colour without light in it, roughness, metalness, and the light of the photos: sets "
+        "materials.enabled.",
+    ),
+]
 Deterministic = Annotated[
     bool,
     typer.Option(
@@ -189,6 +197,7 @@ def settings(
     black_keeps: bool | None = None,
     moving_object: bool = False,
     masks: Path | None = None,
+    relightable: bool = False,
 ) -> tuple[str, ...]:
     """Those of --set, then what other options stand for; an option that was not given says nothing."""
     chosen = masks is not None or any(text.startswith("ingest.auto_mask=") for text in sets or ())
@@ -197,6 +206,7 @@ def settings(
         HOLD_OUT: hold_out,
         "cleanup.remove_ground": no_ground or None,
         "cleanup.keep_closed": watertight or None,
+        "materials.enabled": relightable or None,
         "sfm.deterministic": deterministic or None,
         "sfm.masks": "always" if moving_object else None,
         "undistort.masks": "alone" if moving_object else None,
@@ -229,6 +239,7 @@ def of_a_run(
     hold_out: HoldOut = None,
     no_ground: NoGround = False,
     watertight: Watertight = False,
+    relightable: Relightable = False,
     deterministic: Deterministic = False,
     moving_object: MovingObject = False,
 ) -> Request:
@@ -246,7 +257,17 @@ def of_a_run(
         preset=preset,
         config=config,
         sets=settings(
-            sets, time, hold_out, no_ground, watertight, deterministic, no_masks, black_keeps, moving_object, masks
+            sets,
+            time,
+            hold_out,
+            no_ground,
+            watertight,
+            deterministic,
+            no_masks,
+            black_keeps,
+            moving_object,
+            masks,
+            relightable,
         ),
         device=device,
         workers=workers,

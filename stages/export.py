@@ -17,8 +17,13 @@ from stages.artifacts import (
     ATLAS_MESH,
     BASE_COLOR,
     GIVEN_REGION,
+    LIGHT,
+    LIGHT_HARMONICS,
+    LIGHT_HDR,
+    MATERIAL_COLOR,
     NORMAL_MAP,
     OCCLUSION,
+    ORM,
     POINT_CLOUD,
     SCENE,
     WORLD_PLACE,
@@ -49,6 +54,8 @@ class Asset:
         world_from_scene: similarity.
         gltf_from_world: rotation [3, 3] to Y up.
         textures: of the one material.
+        light: the files of the light that the photos were taken in, by their kind (exr, hdr, json); none where it was
+            not learned.
         extras: what the file says of its origin.
         note: the same in a line of ASCII.
         out: the folder for files.
@@ -58,6 +65,7 @@ class Asset:
     world_from_scene: Similarity
     gltf_from_world: np.ndarray
     textures: Textures
+    light: dict[str, bytes]
     extras: dict[str, Any]
     note: str
     out: Path
@@ -77,14 +85,16 @@ def run(context: StageContext[ExportParams]) -> dict[str, Any]:
     scene, place = context.read(SCENE), context.read(WORLD_PLACE)
     world_from_scene = scene.world_from_scene(place)
     gltf_from_world = y_up_rotation(world_from_scene.rotation @ scene.up_in(place))
-    baked = context.manifests.get("bake")
+    textures = load_textures(context)
+    textured = context.manifests.get("bake" if textures.orm is None else "materials")
     asset = Asset(
         mesh=context.read(ATLAS_MESH),
         world_from_scene=world_from_scene,
         gltf_from_world=gltf_from_world,
-        textures=load_textures(context),
+        textures=textures,
+        light=load_light(context),
         # The fingerprint of its textures, and so of photos, settings and versions, tells this asset from others.
-        extras=provenance(scene, place, gltf_from_world, baked.identity.fingerprint if baked else None),
+        extras=provenance(scene, place, gltf_from_world, textured.identity.fingerprint if textured else None),
         note=place.describe().replace("±", "+-"),
         out=context.out,
     )
@@ -94,6 +104,7 @@ def run(context: StageContext[ExportParams]) -> dict[str, Any]:
         "units": place.units,
     }
     writers = {"glb": _write_glb, "usdz": _write_usdz, "obj": _write_obj, "ply": _write_ply, "stl": _write_stl}
+    warnings = [_no_metres()] if params.simulation == "usd" and not place.metric else []
     _write_georeference(asset, place)
     try:
         extent = np.ptp(asset.in_world(asset.mesh).vertices, axis=0)
@@ -102,17 +113,25 @@ def run(context: StageContext[ExportParams]) -> dict[str, Any]:
         for level, (faces, size) in enumerate(_write_levels(asset, params.lods), 1):
             numbers.setdefault("lod_faces", []).append(faces)
             sizes[f"lod{level}"] = size
+        if params.collision == "hulls" or params.simulation == "usd":
+            pieces = _convex_pieces(asset, params.collision_pieces)
+            numbers["collision_pieces"] = len(pieces)
         if params.collision == "hulls":
-            numbers["collision_pieces"], sizes["collision"] = _write_collision(asset, params.collision_pieces)
+            sizes["collision"] = _write_collision(asset, pieces)
+        if params.simulation == "usd":
+            sizes["simulation"] = _write_simulation(asset, pieces)
+        for kind, data in asset.light.items():
+            sizes[f"light_{kind}"] = artifacts.light_path(asset.out, kind).write_bytes(data)
     except ValueError as error:
         raise ReconstructionError(
             f"The mesh cannot be exported: {error}.", "Rebuild it: `hineus run PHOTOS --from cleanup`."
         ) from error
     if "points" in params.formats:
         about_points, of_points = _write_points(context, asset, place)
+        warnings += about_points.pop("warnings", [])
         numbers |= about_points
         sizes |= of_points
-    return {**numbers, "bytes": sizes}
+    return {**numbers, **({"warnings": warnings} if warnings else {}), "bytes": sizes}
 
 
 def _write_glb(asset: Asset) -> int:
@@ -134,9 +153,8 @@ def _write_levels(asset: Asset, count: int) -> Iterator[tuple[int, int]]:
         yield len(light.faces), artifacts.lod_path(asset.out, level).write_bytes(data)
 
 
-def _write_collision(asset: Asset, count: int) -> tuple[int, int]:
-    """Pieces and bytes of the collision shapes."""
-    from stages.files.glb import shapes_glb_bytes
+def _convex_pieces(asset: Asset, count: int) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Vertices in the frame of the GLB and faces of each collision shape."""
     from stages.surface.collision import convex_pieces
 
     try:
@@ -144,15 +162,42 @@ def _write_collision(asset: Asset, count: int) -> tuple[int, int]:
     except ImportError as error:
         raise SystemRequirementError(
             f"Convex pieces are found by coacd, which cannot be imported: {error}.",
-            "Try `pip install coacd`, or `--set export.collision=off`.",
+            "Try `pip install coacd`, or `--set export.collision=off --set export.simulation=off`.",
         ) from error
-    shapes = {
-        # the name by which Unreal knows a convex collision shape of the mesh "model"
-        f"UCX_model_{k:02d}": (asset.world_from_scene.apply(corners) @ asset.gltf_from_world.T, faces)
-        for k, (corners, faces) in enumerate(pieces)
-    }
-    data = shapes_glb_bytes(shapes, generator(), asset.extras)
-    return len(pieces), artifacts.collision_path(asset.out).write_bytes(data)
+    return [(asset.world_from_scene.apply(corners) @ asset.gltf_from_world.T, faces) for corners, faces in pieces]
+
+
+def _write_collision(asset: Asset, pieces: list[tuple[np.ndarray, np.ndarray]]) -> int:
+    from stages.files.glb import shapes_glb_bytes
+
+    # the name by which Unreal knows a convex collision shape of the mesh "model"
+    shapes = {f"UCX_model_{k:02d}": piece for k, piece in enumerate(pieces)}
+    return artifacts.collision_path(asset.out).write_bytes(shapes_glb_bytes(shapes, generator(), asset.extras))
+
+
+def _write_simulation(asset: Asset, pieces: list[tuple[np.ndarray, np.ndarray]]) -> int:
+    from stages.files.simulation import simulation_bytes
+
+    try:
+        light = asset.light.get("exr")
+        data = simulation_bytes(asset.in_gltf(asset.mesh), asset.textures, pieces, light, asset.extras)
+    except ImportError as error:
+        raise SystemRequirementError(
+            f"The file for simulators is written with usd-core, which cannot be imported: {error}.",
+            "Try `pip install usd-core`, or `--set export.simulation=off`.",
+        ) from error
+    return artifacts.simulation_path(asset.out).write_bytes(data)
+
+
+def _no_metres() -> dict[str, str]:
+    """For the report: that things may fall too fast or too slowly."""
+    sentence = (
+        "Simulators read the lengths in model_simulation.usdz as metres, but the true size is not known: one known "
+        "distance, markers or GPS give it."
+    )
+    log.warning("%s", sentence)
+    command = "hineus run --workspace WORKSPACE --set 'place.known_distance=X1 Y1 Z1 X2 Y2 Z2 METRES'"
+    return {"sentence": sentence, "command": command}
 
 
 def _write_usdz(asset: Asset) -> int:
@@ -171,16 +216,17 @@ def _write_usdz(asset: Asset) -> int:
 
 def _write_obj(asset: Asset) -> int:
     """The OBJ, its material and its images. Returns the bytes of the OBJ."""
-    from stages.files.obj import mtl_text, obj_text
+    from stages.files.obj import mtl_text, obj_text, roughness_and_metalness
 
     texture_path, mtl = artifacts.asset_path(asset.out, "png"), artifacts.asset_path(asset.out, "mtl")
     texture_path.write_bytes(asset.textures.base_color)
-    normal_map_name = None
-    if asset.textures.normal is not None:
-        normal_map_path = artifacts.obj_normal_map_path(asset.out)
-        normal_map_path.write_bytes(asset.textures.normal)
-        normal_map_name = normal_map_path.name
-    mtl.write_text(mtl_text(texture_path.name, normal_map_name), encoding="utf-8")
+    maps = {} if asset.textures.normal is None else {"normal": asset.textures.normal}
+    if asset.textures.orm is not None:
+        maps["roughness"], maps["metallic"] = roughness_and_metalness(asset.textures.orm)
+    paths = {kind: artifacts.obj_map_path(asset.out, kind) for kind in maps}
+    for kind, png in maps.items():
+        paths[kind].write_bytes(png)
+    mtl.write_text(mtl_text(texture_path.name, {kind: path.name for kind, path in paths.items()}), encoding="utf-8")
     text = obj_text(asset.in_world(asset.mesh), mtl.name, asset.note)
     return artifacts.asset_path(asset.out, "obj").write_text(text, encoding="utf-8")
 
@@ -278,12 +324,25 @@ def _write_georeference(asset: Asset, place: Place) -> None:
 
 
 def load_textures(context: StageContext[ExportParams]) -> Textures:
-    """The images that the bake stage left."""
+    """The images of the material that was learned, else of the photos' colours as they are."""
     from stages.files.contents import Textures
 
-    optional = (context.read(NORMAL_MAP), context.read(OCCLUSION))
-    normal, occlusion = (path.read_bytes() if path.exists() else None for path in optional)
-    return Textures(context.read(BASE_COLOR).read_bytes(), normal, occlusion)
+    optional = (NORMAL_MAP, OCCLUSION, MATERIAL_COLOR, ORM)
+    normal, occlusion, color, orm = (_bytes_where_made(context.read(artifact)) for artifact in optional)
+    if color is None or orm is None:
+        return Textures(context.read(BASE_COLOR).read_bytes(), normal, occlusion)
+    return Textures(color, normal, orm=orm)
+
+
+def load_light(context: StageContext[ExportParams]) -> dict[str, bytes]:
+    """The files of the light by their kind; none where it was not learned."""
+    kinds = {"exr": LIGHT, "hdr": LIGHT_HDR, "json": LIGHT_HARMONICS}
+    files = {kind: _bytes_where_made(context.read(artifact)) for kind, artifact in kinds.items()}
+    return {kind: data for kind, data in files.items() if data is not None}
+
+
+def _bytes_where_made(path: Path) -> bytes | None:
+    return path.read_bytes() if path.exists() else None
 
 
 def vertex_colors(texture_png: bytes, uvs: np.ndarray) -> np.ndarray:
@@ -331,8 +390,22 @@ EXPORT: Stage[ExportParams] = Stage(
     version=9,
     settings=lambda config: config.export,
     run=run,
-    reads=(SCENE, WORLD_PLACE, GIVEN_REGION, POINT_CLOUD, ATLAS_MESH, BASE_COLOR, NORMAL_MAP, OCCLUSION),
+    reads=(
+        SCENE,
+        WORLD_PLACE,
+        GIVEN_REGION,
+        POINT_CLOUD,
+        ATLAS_MESH,
+        BASE_COLOR,
+        NORMAL_MAP,
+        OCCLUSION,
+        MATERIAL_COLOR,
+        ORM,
+        LIGHT,
+        LIGHT_HDR,
+        LIGHT_HARMONICS,
+    ),
     writes=(ASSET,),
-    reads_manifests=("bake",),
+    reads_manifests=("bake", "materials"),
     summary="textured mesh -> GLB, USDZ, OBJ, PLY, STL; dense points -> PLY, LAZ",
 )

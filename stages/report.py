@@ -60,7 +60,7 @@ def run(context: StageContext[ReportParams]) -> dict[str, Any]:
     """Write report.html. Returns its size in bytes, and how the final mesh meets held-out photos."""
     import jinja2
 
-    from stages.reporting import control, curves, numbers, photo_table, pictures, poses, stereo
+    from stages.reporting import control, curves, materials, numbers, photo_table, pictures, poses, stereo
     from stages.reporting.held_out_photos import compare_held_out
 
     scene, place, atlas = context.read(SCENE), context.read(WORLD_PLACE), context.read(ATLAS_MESH)
@@ -74,6 +74,9 @@ def run(context: StageContext[ReportParams]) -> dict[str, Any]:
         "stills": [pictures.jpeg_uri(still) for still in pictures.draw_stills(atlas, texture, scene.up)],
         "texture": pictures.jpeg_uri(pictures.shrink(texture, pictures.PICTURE_SIDE)),
         "provenance": pictures.describe_provenance(context.read(PROVENANCE)),
+        "materials": materials.describe_materials(
+            *(context.read(artifact) for artifact in (MATERIAL_COLOR, ORM, KNOWN, LIGHT_HDR))
+        ),
     }
     context.progress(1, steps, "comparing with held-out photos")
 

@@ -193,6 +193,15 @@ def test_no_ground_sets_the_cut_and_is_remembered(folder: Path) -> None:
     assert "remove_ground: false" in config.read_text()
 
 
+def test_relightable_asks_for_materials_and_the_workspace_remembers_it(folder: Path) -> None:
+    config = folder / "photos_hineus" / "config.yaml"
+    hineus("run", "photos")
+    assert "materials:\n  enabled: false" in config.read_text()
+    hineus("run", "photos", "--relightable")
+    hineus("run", "photos")
+    assert "materials:\n  enabled: true" in config.read_text()
+
+
 def test_watertight_sets_the_closed_mesh(folder: Path) -> None:
     hineus("run", "photos", "--watertight")
     assert "keep_closed: true" in (folder / "photos_hineus" / "config.yaml").read_text()

@@ -11,6 +11,7 @@ from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from globe import globe
@@ -22,6 +23,7 @@ from configs.params import ReportParams
 from stages import artifacts
 from stages.artifacts import ImageRecord, ImageSet, Registration, SkippedImage, Unregistered, VertexQuality, write_png
 from stages.drawing.overview import overview_svg
+from stages.drawing.tone_mapping import on_screen
 from stages.engine.stage import StageContext
 from stages.engine.workspace import Record
 from stages.geometry.normalisation import rotation_onto
@@ -31,6 +33,7 @@ from stages.geometry.up import y_up_rotation
 from stages.report import THREE, region_corners
 from stages.reporting import view3d
 from stages.reporting.curves import line_chart
+from stages.reporting.materials import describe_materials, light_picture
 from stages.reporting.numbers import describe_history, describe_where, duration
 from stages.reporting.photo_table import PhotoResult
 from stages.reporting.pictures import draw_stills
@@ -46,6 +49,7 @@ from stages.reporting.view3d import (
 )
 
 ROOT = Path(__file__).parents[1]
+MATERIALS = (artifacts.MATERIAL_COLOR, artifacts.ORM, artifacts.KNOWN, artifacts.LIGHT_HDR)
 
 
 @pytest.fixture
@@ -157,6 +161,40 @@ def test_the_size_is_told_in_metres_where_they_are_known(full):
     assert "0.312 x" not in page(sized("arbitrary units"))
 
 
+def test_materials_and_light_are_shown_where_they_were_learned(full):
+    folder = full.inputs["materials"]
+    write_png(artifacts.MATERIAL_COLOR.load(folder), np.full((16, 16, 3), (200, 40, 10), np.uint8))
+    write_png(artifacts.ORM.load(folder), np.full((16, 16, 3), (255, 60, 220), np.uint8))
+    material = describe_materials(*(full.read(each) for each in MATERIALS))
+    assert [tuple(decoded(shown["image"])[8, 8]) for shown in material["maps"]] == [
+        pytest.approx(color, abs=3) for color in ((200, 40, 10), (60, 60, 60), (220, 220, 220))
+    ]
+    assert material["light"] is None
+    write_png(artifacts.KNOWN.load(folder), np.full((16, 16), 128, np.uint8))
+    radiance = np.zeros((8, 16, 3), np.float32)
+    radiance[:4] = 40.0
+    hdr = cv2.imencode(".hdr", radiance)[1].tobytes()
+    artifacts.LIGHT_HDR.load(folder).write_bytes(hdr)
+    html = page(full)
+    parsed(html)
+    shown = html[html.index("Materials and light") : html.index("<h2>Where</h2>")]
+    assert shown.count("<figure") == 5
+    light = decoded(shown.split('src="')[-1].split('"')[0])
+    grey = 255 * on_screen(np.full(3, 2 * 0.18))[0]  # half of it is black
+    assert light.shape[:2] == (256, 512)
+    np.testing.assert_allclose([light[10].mean(), light[-10].mean()], [grey, 0], atol=3)
+    artifacts.ORM.load(folder).write_text("not an image")
+    artifacts.LIGHT_HDR.load(folder).write_text("not an image")
+    assert describe_materials(*(full.read(each) for each in MATERIALS)) is None
+    assert light_picture(artifacts.LIGHT_HDR.load(folder)) is None
+
+
+def decoded(uri: str) -> np.ndarray:
+    """[H, W, 3] RGB of a data URI."""
+    data = np.frombuffer(base64.b64decode(uri.split(",")[1]), np.uint8)
+    return cv2.imdecode(data, cv2.IMREAD_COLOR)[..., ::-1]
+
+
 def test_photos_left_out_come_first_and_pictures_are_capped(full):
     html = page(replace(full, params=ReportParams(thumbnails=1)))
     shown = html[html.index('class="thumbs"') :]
@@ -176,6 +214,7 @@ def test_a_report_from_almost_nothing(context):
     assert "<h2>Training</h2>" not in html
     assert "<h2>Where to stand" not in html
     assert "<h2>Held-out photos" not in html
+    assert "<h2>Materials and light" not in html
     assert "Run it again" not in html
 
 

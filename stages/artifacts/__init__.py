@@ -14,9 +14,11 @@ from stages.artifacts.export import (
     METADATA,
     asset_path,
     collision_path,
+    light_path,
     lod_path,
-    obj_normal_map_path,
+    obj_map_path,
     points_path,
+    simulation_path,
 )
 from stages.artifacts.ingest import IMAGE_SET, LEFT_OUT, PHOTOS, ImageRecord, ImageSet, SkippedImage
 from stages.artifacts.json_files import read_json, write_json

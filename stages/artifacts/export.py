@@ -21,9 +21,9 @@ def points_path(folder: Path, kind: str) -> Path:
     return folder / f"points.{kind}"
 
 
-def obj_normal_map_path(folder: Path) -> Path:
-    """The normal map that the MTL names, where there is one."""
-    return folder / "model_normal.png"
+def obj_map_path(folder: Path, kind: str) -> Path:
+    """A map that the MTL names beside the texture, where there is one: normal, roughness or metallic."""
+    return folder / f"model_{kind}.png"
 
 
 def lod_path(folder: Path, level: int) -> Path:
@@ -34,3 +34,13 @@ def lod_path(folder: Path, level: int) -> Path:
 def collision_path(folder: Path) -> Path:
     """The GLB of convex pieces."""
     return folder / "model_collision.glb"
+
+
+def simulation_path(folder: Path) -> Path:
+    """The USDZ for simulators."""
+    return folder / "model_simulation.usdz"
+
+
+def light_path(folder: Path, kind: str) -> Path:
+    """The light of the photos: exr, hdr or json (its spherical harmonics), in the frame of the GLB."""
+    return folder / f"model_light.{kind}"

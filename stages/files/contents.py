@@ -19,11 +19,18 @@ class Textures:
         base_color: sRGB.
         normal: tangent-space normals, +Y up, or None.
         occlusion: grey, 255 where all is open to light, or None.
+        orm: linear occlusion, roughness and metalness as red, green and blue, in place of `occlusion`; None where the
+            material was not learned, which then is no metal and of `ROUGHNESS`.
     """
 
     base_color: bytes
     normal: bytes | None = None
     occlusion: bytes | None = None
+    orm: bytes | None = None
+
+    def __post_init__(self) -> None:
+        if self.orm is not None and self.occlusion is not None:
+            raise ValueError("expected the occlusion beside the roughness or alone, got both")
 
 
 def checked_mesh(mesh: AtlasMesh) -> AtlasMesh:

@@ -25,7 +25,7 @@ def glb_bytes(
     generator: str = "hineus",
     extras: dict[str, Any] | None = None,
 ) -> bytes:
-    """A binary glTF 2.0 file with one mesh and one PBR material (metallic 0, roughness `ROUGHNESS`).
+    """A binary glTF 2.0 file with one mesh and one PBR material, see `Textures`.
 
     Written by hand so that every field is chosen here (buffer targets, sampler, extras, the PNG's own
     bytes): the format is two chunks, JSON and a binary blob (glTF 2.0 specification, section 4). With a normal map
@@ -52,18 +52,7 @@ def glb_bytes(
     if textures.normal is not None:
         attributes["TANGENT"] = buffer.add_numbers(vertex_tangents(mesh), "VEC4")
     indices = buffer.add_numbers(mesh.faces.ravel(), "SCALAR", _ELEMENT_ARRAY_BUFFER)
-    material: dict[str, Any] = {
-        "name": NAME,
-        "pbrMetallicRoughness": {
-            "baseColorTexture": {"index": buffer.add_image(textures.base_color, "base_color")},
-            "metallicFactor": 0.0,
-            "roughnessFactor": ROUGHNESS,
-        },
-    }
-    if textures.normal is not None:
-        material["normalTexture"] = {"index": buffer.add_image(textures.normal, "normal")}
-    if textures.occlusion is not None:
-        material["occlusionTexture"] = {"index": buffer.add_image(textures.occlusion, "occlusion")}
+    material = _material(buffer, textures)
     primitive = {"attributes": attributes, "indices": indices, "material": 0}
     return buffer.file(
         [{"name": NAME, "primitives": [primitive]}],
@@ -74,6 +63,25 @@ def glb_bytes(
         samplers=[_SAMPLER],
         images=buffer.images,
     )
+
+
+def _material(buffer: _GlbBuffer, textures: Textures) -> dict[str, Any]:
+    """The material, its images added to the buffer. One image of three channels serves as two textures."""
+    surface: dict[str, Any] = {
+        "baseColorTexture": {"index": buffer.add_image(textures.base_color, "base_color")},
+        "metallicFactor": 0.0,
+        "roughnessFactor": ROUGHNESS,
+    }
+    material: dict[str, Any] = {"name": NAME, "pbrMetallicRoughness": surface}
+    if textures.orm is not None:
+        packed = {"index": buffer.add_image(textures.orm, "occlusion_roughness_metallic")}
+        surface |= {"metallicRoughnessTexture": packed, "metallicFactor": 1.0, "roughnessFactor": 1.0}
+        material["occlusionTexture"] = packed
+    if textures.normal is not None:
+        material["normalTexture"] = {"index": buffer.add_image(textures.normal, "normal")}
+    if textures.occlusion is not None:
+        material["occlusionTexture"] = {"index": buffer.add_image(textures.occlusion, "occlusion")}
+    return material
 
 
 def shapes_glb_bytes(

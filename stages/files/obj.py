@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from stages.artifacts import AtlasMesh
@@ -21,15 +23,36 @@ def obj_text(mesh: AtlasMesh, mtl_name: str, comment: str = "") -> str:
     return "\n".join(lines) + "\n"
 
 
-def mtl_text(texture_name: str, normal_map_name: str | None = None) -> str:
-    """The material "textured": a matt surface of the colours in `texture_name`.
+# The words by which a material names a map. Readers know normals by one of two: that of the PBR extension, and bumps.
+_WORDS = {"roughness": ("map_Pr",), "metallic": ("map_Pm",), "normal": ("norm", "map_bump")}
 
-    Readers know a map of normals by one of two names: `norm` (the PBR extension) or `map_bump`.
+
+def mtl_text(texture_name: str, maps: Mapping[str, str] | None = None) -> str:
+    """The material "textured", of the colours in `texture_name`; without maps of roughness and metalness a matt one.
+
+    Args:
+        maps: file names of its maps: roughness, metallic (the PBR extension: `Pr` and `Pm` times the map) and normal.
     """
+    maps = maps or {}
     lines = [
-        "newmtl textured", "Ka 0 0 0", "Kd 1 1 1", "Ks 0 0 0", "illum 1", f"Pr {ROUGHNESS}", "Pm 0",
+        "newmtl textured", "Ka 0 0 0", "Kd 1 1 1", "Ks 0 0 0", "illum 1",
+        f"Pr {1 if 'roughness' in maps else ROUGHNESS}", f"Pm {1 if 'metallic' in maps else 0}",
         f"map_Kd {texture_name}",
     ]  # fmt: skip
-    if normal_map_name is not None:
-        lines += [f"norm {normal_map_name}", f"map_bump {normal_map_name}"]
+    lines += [f"{word} {maps[kind]}" for kind in _WORDS if kind in maps for word in _WORDS[kind]]
     return "\n".join(lines) + "\n"
+
+
+def roughness_and_metalness(orm_png: bytes) -> tuple[bytes, bytes]:
+    """The grey images that an MTL wants, as PNG, of one that holds occlusion, roughness and metalness.
+
+    Raises:
+        ValueError: it is no image.
+    """
+    import cv2
+
+    packed = cv2.imdecode(np.frombuffer(orm_png, np.uint8), cv2.IMREAD_COLOR)
+    if packed is None:
+        raise ValueError("expected a readable image of occlusion, roughness and metalness")
+    metalness, roughness, _ = cv2.split(packed)  # OpenCV's channels begin with blue
+    return cv2.imencode(".png", roughness)[1].tobytes(), cv2.imencode(".png", metalness)[1].tobytes()

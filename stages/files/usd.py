@@ -7,6 +7,7 @@ import json
 import struct
 import tempfile
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -33,23 +34,40 @@ def usdz_bytes(mesh: AtlasMesh, textures: Textures, extras: dict[str, Any] | Non
         ImportError: there is no usd-core.
         ValueError: see `checked_mesh`.
     """
+    mesh = checked_mesh(mesh)
+    images = texture_files(textures)
+
+    def fill(stage: Any) -> None:
+        describe(stage, extras)
+        add_material(stage, add_mesh(stage, mesh), set(images))
+
+    return packed({ROOT_LAYER: layer_bytes(fill), **images})
+
+
+def texture_files(textures: Textures) -> dict[str, bytes]:
+    """The images of a package and their names in it."""
+    images = {
+        "base_color.png": textures.base_color,
+        "orm.png": textures.orm,
+        "normal.png": textures.normal,
+        "occlusion.png": textures.occlusion,
+    }
+    return {name: png for name, png in images.items() if png is not None}
+
+
+def layer_bytes(fill: Callable[[Any], None]) -> bytes:
+    """The binary layer of a new stage that `fill` has filled. The library writes such to files only."""
     from pxr import Usd
 
-    mesh = checked_mesh(mesh)
-    optional = {"normal.png": textures.normal, "occlusion.png": textures.occlusion}
-    images = {"base_color.png": textures.base_color}
-    images |= {file: png for file, png in optional.items() if png is not None}
-    # The library writes binary layers to files only.
     with tempfile.TemporaryDirectory(prefix="usdz-") as folder:
         layer = Path(folder) / ROOT_LAYER
         stage = Usd.Stage.CreateNew(str(layer))
-        _describe(stage, extras)
-        _add_material(stage, _add_mesh(stage, mesh), set(images))
+        fill(stage)
         stage.GetRootLayer().Save()
-        return _packed({ROOT_LAYER: layer.read_bytes(), **images})
+        return layer.read_bytes()
 
 
-def _packed(files: dict[str, bytes]) -> bytes:
+def packed(files: dict[str, bytes]) -> bytes:
     """A USDZ of files in this order: a zip without compression whose files begin at multiples of 64 bytes.
 
     The library's own packer changed its name between versions, and renames the images.
@@ -65,7 +83,8 @@ def _packed(files: dict[str, bytes]) -> bytes:
     return data.getvalue()
 
 
-def _describe(stage: Any, extras: dict[str, Any] | None) -> None:
+def describe(stage: Any, extras: dict[str, Any] | None) -> None:
+    """Y up, metres, the root that others refer to, and `extras`."""
     from pxr import UsdGeom
 
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
@@ -75,25 +94,39 @@ def _describe(stage: Any, extras: dict[str, Any] | None) -> None:
         stage.GetRootLayer().customLayerData = {"hineus": json.dumps(extras)}
 
 
-def _add_mesh(stage: Any, mesh: AtlasMesh) -> Any:
-    from pxr import Sdf, UsdGeom, Vt
+def add_shape(stage: Any, path: str, vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray | None = None) -> Any:
+    """A mesh of triangles [F, 3] of vertices [V, 3], flat where it has no `normals` [V, 3] float32."""
+    from pxr import UsdGeom, Vt
 
-    made = UsdGeom.Mesh.Define(stage, f"{ROOT}/mesh")
-    points = Vt.Vec3fArray.FromNumpy(mesh.vertices)
+    made = UsdGeom.Mesh.Define(stage, path)
+    points = Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(vertices, dtype=np.float32))
     made.CreatePointsAttr(points)
     made.CreateExtentAttr(UsdGeom.PointBased.ComputeExtent(points))
-    made.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(mesh.faces), 3, dtype=np.int32)))
-    made.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(mesh.faces.astype(np.int32).ravel()))
-    made.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(mesh.normals))
-    made.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
+    made.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(faces), 3, dtype=np.int32)))
+    made.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(faces.astype(np.int32).ravel()))
+    if normals is not None:
+        made.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(normals))
+        made.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
     made.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+    return made
+
+
+def add_mesh(stage: Any, mesh: AtlasMesh) -> Any:
+    """The textured mesh, checked, at `ROOT`/mesh."""
+    from pxr import Sdf, UsdGeom, Vt
+
+    made = add_shape(stage, f"{ROOT}/mesh", mesh.vertices, mesh.faces, mesh.normals)
     st = UsdGeom.PrimvarsAPI(made).CreatePrimvar("st", Sdf.ValueTypeNames.TexCoord2fArray, UsdGeom.Tokens.vertex)
     st.Set(Vt.Vec2fArray.FromNumpy(mesh.uvs))
     return made
 
 
-def _add_material(stage: Any, mesh: Any, files: set[str]) -> None:
-    """A preview surface of the images `files`, bound to the mesh."""
+def add_material(stage: Any, mesh: Any, files: set[str]) -> None:
+    """A preview surface of the images `files`, see `texture_files`, bound to the mesh.
+
+    Without a map of roughness and metalness it is no metal and of `ROUGHNESS`. Its model is glTF's: GGX, F0 of 0.04 by
+    its default index of refraction.
+    """
     from pxr import Gf, Sdf, UsdShade
 
     types = Sdf.ValueTypeNames
@@ -108,28 +141,34 @@ def _add_material(stage: Any, mesh: Any, files: set[str]) -> None:
     reader.CreateInput("varname", types.String).Set("st")
     reader.CreateOutput("result", types.Float2)
     surface = shader("surface", "UsdPreviewSurface")
-    surface.CreateInput("roughness", types.Float).Set(ROUGHNESS)
-    surface.CreateInput("metallic", types.Float).Set(0.0)
+    if "orm.png" not in files:
+        surface.CreateInput("roughness", types.Float).Set(ROUGHNESS)
+        surface.CreateInput("metallic", types.Float).Set(0.0)
 
-    def texture(file: str, space: str, output: str, into: str, kind: Any) -> Any:
+    def texture(file: str, space: str, **inputs: str) -> Any:
+        """An image whose channels, "rgb" or one of them, go to inputs of the surface."""
         made = shader(Path(file).stem, "UsdUVTexture")
         made.CreateInput("file", types.Asset).Set(Sdf.AssetPath(file))
         made.CreateInput("sourceColorSpace", types.Token).Set(space)
         for wrap in ("wrapS", "wrapT"):
             made.CreateInput(wrap, types.Token).Set("clamp")
         made.CreateInput("st", types.Float2).ConnectToSource(reader.ConnectableAPI(), "result")
-        made.CreateOutput(output, types.Float3 if output == "rgb" else types.Float)
-        surface.CreateInput(into, kind).ConnectToSource(made.ConnectableAPI(), output)
+        for output, into in inputs.items():
+            made.CreateOutput(output, types.Float3 if output == "rgb" else types.Float)
+            surface.CreateInput(into, kinds.get(into, types.Float)).ConnectToSource(made.ConnectableAPI(), output)
         return made
 
-    texture("base_color.png", "sRGB", "rgb", "diffuseColor", types.Color3f)
+    kinds = {"diffuseColor": types.Color3f, "normal": types.Normal3f}
+    texture("base_color.png", "sRGB", rgb="diffuseColor")
+    if "orm.png" in files:
+        texture("orm.png", "raw", r="occlusion", g="roughness", b="metallic")
     if "normal.png" in files:
-        normal = texture("normal.png", "raw", "rgb", "normal", types.Normal3f)
+        normal = texture("normal.png", "raw", rgb="normal")
         # from 0..1 to -1..1
         normal.CreateInput("scale", types.Float4).Set(Gf.Vec4f(2, 2, 2, 1))
         normal.CreateInput("bias", types.Float4).Set(Gf.Vec4f(-1, -1, -1, 0))
     if "occlusion.png" in files:
-        texture("occlusion.png", "raw", "r", "occlusion", types.Float)
+        texture("occlusion.png", "raw", r="occlusion")
     surface.CreateOutput("surface", types.Token)
     material.CreateSurfaceOutput().ConnectToSource(surface.ConnectableAPI(), "surface")
     UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim()).Bind(material)
