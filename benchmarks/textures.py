@@ -337,14 +337,16 @@ def matched(image: np.ndarray, photo: np.ndarray, counted: np.ndarray) -> np.nda
 
 def measure(workspace: Path, data: Path, before: SetResult | None) -> SetResult:
     """All rows of one set; those of an earlier, interrupted measurement are kept, each is saved when it is done."""
+    from stages.texture.charts import WAYS
     from stages.texture.filling import face_neighbors
-    from stages.texture.footprint import pixels_per_area, texture_size_for
+    from stages.texture.footprint import pixels_per_area, texels_needed, texture_size_for
 
     known = {row.name: row for row in before.scores} if before else {}
     costs = before.costs if before else {}
     capture = Capture(workspace, data)
     atlas = capture.atlas
-    size = texture_size_for(*pixels_per_area(atlas.vertices, atlas.faces, capture.cameras))
+    texels_wanted = texels_needed(*pixels_per_area(atlas.vertices, atlas.faces, capture.cameras))
+    size = texture_size_for(texels_wanted, WAYS["uvatlas"].fill)
     texels = rasterize_atlas(atlas.uvs, atlas.faces, size)
     naive, label = best_view(capture, texels)
     pairs = face_neighbors(atlas.vertices, atlas.faces)

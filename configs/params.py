@@ -273,9 +273,16 @@ class AtlasParams(Section):
     texture_size: int | None = Field(
         None, ge=64, le=16384, description="side of the texture, pixels; null: as large as the photos can fill"
     )
+    method: Literal["uvatlas", "xatlas"] = Field(
+        "uvatlas",
+        description="what makes the charts: uvatlas few and large ones, xatlas many small ones in less time",
+    )
     padding: int = Field(4, ge=1, le=64, description="texels kept free between charts")
     time_limit: float = Field(
-        120.0, gt=0, le=1_000_000, description="seconds before the fallback parametrisation takes over"
+        120.0,
+        gt=0,
+        le=1_000_000,
+        description="seconds for each way to charts, then the next takes over: uvatlas, xatlas, projection",
     )
 
 

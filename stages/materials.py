@@ -54,7 +54,7 @@ def run(context: StageContext[MaterialsParams]) -> dict[str, Any]:
     torch.set_num_threads(context.workers)
     photos, held_out, scene = context.read(PINHOLE_PHOTOS), context.read(HELD_OUT), context.read(SCENE)
     cameras = scene.cameras.select([i for i, name in enumerate(scene.cameras.names) if name not in held_out])
-    light_from_scene = gltf_from_scene(scene, context.read(WORLD_PLACE))
+    light_from_scene = gltf_from_scene(scene, context.read(WORLD_PLACE)).rotation
     atlas = context.read(ATLAS_MESH)
     texture = _read_image(context.read(BASE_COLOR))
     texels = rasterize_atlas(atlas.uvs, atlas.faces, atlas.texture_size)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stages.drawing.rendering import look_at
-from stages.texture.footprint import CHARTS_FILL, LARGEST, SMALLEST, pixels_per_area, texture_size_for
+from stages.texture.footprint import LARGEST, SMALLEST, pixels_per_area, texels_needed, texture_size_for
 
 
 def test_a_square_seen_from_the_front_has_the_density_of_its_pixels():
@@ -20,20 +20,29 @@ def test_a_square_seen_from_the_front_has_the_density_of_its_pixels():
     assert density[2] == 0
 
 
-def test_the_size_gives_a_texel_to_a_pixel_and_follows_the_middle_of_the_surface():
-    areas = np.ones(10)
-    density = np.full(10, 2000**2 * CHARTS_FILL / 10)  # as many pixels as 2000 squared holds
-    assert texture_size_for(density, areas) == 2048
-    assert texture_size_for(4 * density, areas) == 4096
-    assert texture_size_for(density * 1.3**2, areas) == 4096  # 2600: 2048 would lose too much
+def test_a_texel_for_a_pixel_follows_the_middle_of_the_surface():
+    areas, density = np.ones(10), np.full(10, 200.0)
+    assert texels_needed(density, areas) == pytest.approx(2000)
     closer = density.copy()
     closer[:4] *= 100
-    assert texture_size_for(closer, areas) == 2048
+    assert texels_needed(closer, areas) == pytest.approx(2000)
     hidden = density.copy()
     hidden[:8] = 0
-    assert texture_size_for(hidden, areas) == 2048
+    assert texels_needed(hidden, areas) == pytest.approx(2000)
+    assert texels_needed(np.zeros(10), areas) == 0
 
 
-@pytest.mark.parametrize(("density", "size"), [(0.0, SMALLEST), (1e-6, SMALLEST), (1e12, LARGEST)])
-def test_the_size_has_bounds(density, size):
-    assert texture_size_for(np.full(4, density), np.ones(4)) == size
+def test_the_size_has_room_for_the_texels():
+    texels = 0.5 * 2000**2  # as many as half of 2000 squared
+    assert texture_size_for(texels, 0.5) == 2048
+    assert texture_size_for(4 * texels, 0.5) == 4096
+    assert texture_size_for(1.3**2 * texels, 0.5) == 4096  # 2600: 2048 would lose too much
+
+
+def test_charts_that_fill_more_of_it_need_a_smaller_texture_for_the_same_texels_on_the_surface():
+    assert [texture_size_for(1400**2, fill) for fill in (0.3, 0.7)] == [4096, 2048]
+
+
+@pytest.mark.parametrize(("texels", "size"), [(0.0, SMALLEST), (1e-6, SMALLEST), (1e12, LARGEST)])
+def test_the_size_has_bounds(texels, size):
+    assert texture_size_for(texels, 0.5) == size

@@ -9,7 +9,7 @@ import subprocess
 import sys
 import tempfile
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -25,7 +25,7 @@ from stages.engine.locking import take
 from stages.engine.system import SYSTEM_LIBRARIES, missing_libraries
 from stages.engine.workspace import storage_errors
 from stages.errors import WorkspaceError
-from stages.texture.charts import unwrap_xatlas
+from stages.texture.charts import UvLayout, unwrap_uvatlas, unwrap_xatlas
 
 REPOSITORY = Path(__file__).parents[1]
 FULL = OSError(errno.ENOSPC, "No space left on device")
@@ -430,7 +430,7 @@ def ran(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The current folder is somebody else's, whose modules have names that we import: a file that they make if run."""
     ran, folder = tmp_path / "ran", tmp_path / "planted"
     folder.mkdir()
-    installed = ("numpy", "torch", "cv2", "xatlas", "numba", "trimesh", "typer", "yaml", "pydantic")
+    installed = ("numpy", "torch", "cv2", "open3d", "xatlas", "numba", "trimesh", "typer", "yaml", "pydantic")
     for name in (*installed, "secrets", "uuid", "colorsys"):  # and of Python's own, such as are imported late
         (folder / f"{name}.py").write_text(f"open({str(ran)!r}, 'a').write(__name__ + ' ')", encoding="utf-8")
     monkeypatch.chdir(folder)
@@ -454,10 +454,11 @@ def test_a_child_runs_no_code_of_the_current_folder(ran: Path) -> None:
     assert not ran.exists()
 
 
-def test_xatlas_runs_no_code_of_the_current_folder(ran: Path) -> None:
+@pytest.mark.parametrize("unwrap", [pytest.param(unwrap_uvatlas, marks=pytest.mark.slow), unwrap_xatlas])
+def test_charts_run_no_code_of_the_current_folder(ran: Path, unwrap: Callable[..., UvLayout]) -> None:
     vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], dtype=np.float64)
     faces = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]], dtype=np.int32)
-    layout = unwrap_xatlas(vertices, faces, 64, 2, 60)
+    layout = unwrap(vertices, faces, 64, 2, 60)
     assert len(layout.faces) == 4
     assert not ran.exists()
 

@@ -197,6 +197,32 @@ def repair_manifold(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray
     return vertices[faces.ravel()[first[order]]], new_faces.astype(np.int32)
 
 
+def cut_into_manifold(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The same faces, cut apart where they are no oriented manifold: the vertex [W] each new one copies, faces [F, 3].
+
+    Each fan of faces gets its own copy of its vertex. What is still wrong then, faces at edges that fans around other
+    vertices hold together and faces on the same three vertices, is cut out whole.
+
+    Args:
+        faces: [F, 3], none with a vertex twice.
+    """
+    alone = np.zeros(len(faces), dtype=bool)
+    own = int(faces.max(initial=-1)) + 1 + np.arange(faces.size).reshape(-1, 3)
+    while True:
+        glued = np.where(alone[:, None], own, faces)
+        _, first, corner = np.unique(_fans(glued, edge_use(glued)), return_index=True, return_inverse=True)
+        cut = corner.reshape(-1, 3).astype(np.int32)
+        use = edge_use(cut)
+        wrong = use.counts[use.edge] > 1
+        wrong[np.concatenate(use.manifold_pairs())] = False
+        _, same, count = np.unique(np.sort(cut, axis=1), axis=0, return_inverse=True, return_counts=True)
+        bad = count[same.reshape(-1)] > 1
+        bad[use.face[wrong]] = True
+        if not bad.any():
+            return faces.ravel()[first].astype(np.int64), cut
+        alone |= bad
+
+
 def clip(vertices: np.ndarray, faces: np.ndarray, normal: np.ndarray, offset: float) -> tuple[np.ndarray, np.ndarray]:
     """The part of the mesh with normal . x >= offset; faces across the plane are cut at it. Unused vertices go."""
     heights = vertices.astype(np.float64) @ normal - offset

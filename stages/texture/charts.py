@@ -1,4 +1,4 @@
-"""UV charts for a mesh: xatlas in a process with a time limit, or projected charts of our own.
+"""UV charts for a mesh: UVAtlas or xatlas, each in a process with a time limit, or projected charts of our own.
 
 Texel coordinates here have their origin at the bottom-left corner of the texture; a texel's centre lies at .5.
 """
@@ -7,14 +7,23 @@ from __future__ import annotations
 
 import subprocess
 import tempfile
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from stages import children
 from stages.geometry.vectors import unit
-from stages.surface.triangle_mesh import face_adjacency, face_areas, face_normals, label_pieces, vertex_normals
+from stages.surface.triangle_mesh import (
+    cut_into_manifold,
+    face_adjacency,
+    face_areas,
+    face_normals,
+    label_pieces,
+    vertex_normals,
+)
 
 # xatlas charts may cover at most the mesh's area over this: its time grows steeply with the size of a chart.
 CHARTS_AT_LEAST = 200
@@ -26,13 +35,13 @@ TOUCHING = 1e-4
 SMOOTHING_ROUNDS = 8
 
 
-class XatlasError(Exception):
-    """xatlas failed, or was stopped at its time limit; the message says how."""
+class ChartsError(Exception):
+    """UVAtlas or xatlas failed, or was stopped at its time limit; the message says which and how."""
 
 
 @dataclass(frozen=True)
 class UvLayout:
-    """A mesh's vertices split along chart seams, laid out on a square texture. Charts may be mirrored.
+    """A mesh's vertices split along chart seams, laid out on a square texture. Charts of xatlas may be mirrored.
 
     Attributes:
         source: [W] input vertex of each split vertex.
@@ -47,42 +56,133 @@ class UvLayout:
     charts: np.ndarray
 
 
+def unwrap_uvatlas(
+    vertices: np.ndarray, faces: np.ndarray, texture_size: int, padding: int, time_limit: float
+) -> UvLayout:
+    """Charts by UVAtlas, in a subprocess that is killed after `time_limit` seconds: few, large, none mirrored.
+
+    UVAtlas refuses or crashes on what is no manifold, so it is given a copy whose faces are cut apart there, without
+    those that name a vertex twice.
+
+    Raises:
+        ChartsError: the limit was reached, UVAtlas crashed, or its charts do not fit.
+    """
+    whole = (faces != np.roll(faces, 1, axis=1)).all(1)
+    source, sound = cut_into_manifold(faces[whole])
+    found = _in_child(
+        "UVAtlas",
+        "stages.texture.uvatlas_worker",
+        time_limit,
+        vertices=vertices[source],
+        faces=sound,
+        resolution=texture_size - padding,
+        padding=padding,
+    )["texels"].astype(np.float64)
+    if found.shape != (len(sound), 3, 2) or not np.isfinite(found).all():
+        raise ChartsError(f"UVAtlas placed {np.isfinite(found).all((1, 2)).sum()} of {len(sound)} faces")
+    corners = np.full((len(faces), 3, 2), np.nan)
+    corners[whole] = found
+    return _checked("UVAtlas", *_joined(faces, corners), texture_size, padding)
+
+
 def unwrap_xatlas(
     vertices: np.ndarray, faces: np.ndarray, texture_size: int, padding: int, time_limit: float
 ) -> UvLayout:
-    """Charts by xatlas, in a subprocess that is killed after `time_limit` seconds.
+    """Charts by xatlas, in a subprocess that is killed after `time_limit` seconds: many, small, some mirrored.
 
     Raises:
-        XatlasError: the limit was reached, xatlas crashed, or its charts do not fit.
+        ChartsError: the limit was reached, xatlas crashed, or its charts do not fit.
+    """
+    found = _in_child(
+        "xatlas",
+        "stages.texture.xatlas_worker",
+        time_limit,
+        vertices=vertices,
+        faces=faces,
+        max_chart_area=float(face_areas(vertices, faces).sum() / CHARTS_AT_LEAST),
+        resolution=texture_size - padding,
+        padding=padding,
+    )
+    source, new_faces = found["source"].astype(np.int64), found["faces"].astype(np.int32)
+    if new_faces.shape != faces.shape or (source[new_faces] != faces).any():
+        raise ChartsError(f"xatlas kept {len(new_faces)} of {len(faces)} faces, or not in order")
+    return _checked("xatlas", source, new_faces, found["texels"].astype(np.float64), texture_size, padding)
+
+
+@dataclass(frozen=True)
+class Way:
+    """A way to charts that may fail.
+
+    Attributes:
+        unwrap: vertices, faces, texture size, padding, time limit -> layout; raises `ChartsError`.
+        fill: part of the texture that its charts fill on curved objects, by which the texture's size is chosen.
+    """
+
+    unwrap: Callable[[np.ndarray, np.ndarray, int, int, float], UvLayout]
+    fill: float
+
+
+# Of a texture, by projected charts.
+PROJECTED_FILL = 0.41
+# In the order in which one takes over from the other; docs/benchmarks/charts.md has the fills.
+WAYS = {"uvatlas": Way(unwrap_uvatlas, 0.6), "xatlas": Way(unwrap_xatlas, 0.41)}
+
+
+def _in_child(who: str, module: str, time_limit: float, **job: np.ndarray | float) -> dict[str, np.ndarray]:
+    """What one of our modules, run on its own, makes of arrays.
+
+    Raises:
+        ChartsError: it needed longer than `time_limit` seconds, or ended without a result.
     """
     with tempfile.TemporaryDirectory(prefix="atlas-") as folder:
         source, target = Path(folder) / "in.npz", Path(folder) / "out.npz"
-        np.savez(
-            source,
-            vertices=vertices,
-            faces=faces,
-            max_chart_area=face_areas(vertices, faces).sum() / CHARTS_AT_LEAST,
-            resolution=texture_size - padding,
-            padding=padding,
-        )
-        command = children.module_command("stages.texture.xatlas_worker", str(source), str(target))
+        arrays: dict[str, Any] = dict(job)
+        np.savez(source, **arrays)
         try:
-            done = children.run(command, time_limit)
+            done = children.run(children.module_command(module, str(source), str(target)), time_limit)
         except subprocess.TimeoutExpired as error:
-            raise XatlasError(f"xatlas needed more than {time_limit:g} s for {len(faces)} faces") from error
+            raise ChartsError(
+                f"{who} needed more than {time_limit:g} s for {len(np.asarray(job['faces']))} faces"
+            ) from error
         if done.returncode != 0 or not target.is_file():
-            last = (done.stderr.strip().splitlines() or ["no message"])[-1]
-            raise XatlasError(f"xatlas ended with code {done.returncode}: {last}")
+            last = ([line for line in done.stderr.splitlines() if line.strip()] or ["no message"])[-1]
+            raise ChartsError(f"{who} ended with code {done.returncode}: {last.strip()}")
         with np.load(target) as data:
-            mapping, new_faces, texels = data["source"], data["faces"].astype(np.int32), data["texels"]
-    if new_faces.shape != faces.shape or (mapping[new_faces] != faces).any():
-        raise XatlasError(f"xatlas kept {len(new_faces)} of {len(faces)} faces, or not in order")
-    if texels.max(initial=0) > texture_size - padding:
-        raise XatlasError(f"the charts need {texels.max():.0f} texels a side, got {texture_size - padding}")
-    texels = texels.astype(np.float64) + padding / 2
-    charts = label_pieces(len(new_faces), face_adjacency(new_faces))
-    layout = UvLayout(mapping.astype(np.int64), new_faces, texels, charts)
-    pairs = overlapping_pairs(texels[new_faces])
+            return {name: data[name] for name in data.files}
+
+
+def _joined(faces: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Split vertices of texels [F, 3, 2] given to each corner: source [W], faces [F, 3], texels [W, 2].
+
+    A face without texels (nan) lies in a point: where one of its vertices does, or at the origin.
+    """
+    placed = np.isfinite(corners).all((1, 2))
+    of_vertex = np.full((int(faces.max(initial=-1)) + 1, 2), np.nan)
+    of_vertex[faces[placed].ravel()] = corners[placed].reshape(-1, 2)
+    corners = corners.copy()
+    for face in np.flatnonzero(~placed):
+        known = of_vertex[faces[face]]
+        known = known[np.isfinite(known).all(1)]
+        corners[face] = known[0] if len(known) else 0.0
+    rows = np.concatenate([faces.reshape(-1, 1).astype(np.float64), corners.reshape(-1, 2)], axis=1)
+    unique, index = np.unique(rows, axis=0, return_inverse=True)
+    return unique[:, 0].astype(np.int64), index.reshape(-1, 3).astype(np.int32), unique[:, 1:]
+
+
+def _checked(
+    who: str, source: np.ndarray, faces: np.ndarray, texels: np.ndarray, texture_size: int, padding: int
+) -> UvLayout:
+    """A layout of texels in [0, texture_size - padding], with half the padding around all and no overlaps.
+
+    Raises:
+        ChartsError: the texels reach further, or no room is left for faces that overlap.
+    """
+    if texels.max(initial=0) > texture_size - padding or texels.min(initial=0) < 0:
+        reach = f"{texels.min():.0f} to {texels.max():.0f}"
+        raise ChartsError(f"the charts of {who} lie at {reach} texels, expected 0 to {texture_size - padding}")
+    texels = texels + padding / 2
+    layout = UvLayout(source, faces, texels, label_pieces(len(faces), face_adjacency(faces)))
+    pairs = overlapping_pairs(texels[faces])
     return _move_overlaps(layout, pairs, texture_size, padding) if len(pairs) else layout
 
 
@@ -173,10 +273,11 @@ def _layers(pairs: np.ndarray, rank: np.ndarray) -> np.ndarray:
 def _move_overlaps(layout: UvLayout, pairs: np.ndarray, texture_size: int, padding: int) -> UvLayout:
     """The same layout with one face of each overlapping pair moved to where the texture is free.
 
-    xatlas lets a few small faces of a chart fold over; they become charts of their own, at the same scale.
+    xatlas lets a few small faces of a chart fold over, and UVAtlas may; they become charts of their own, at the same
+    scale.
 
     Raises:
-        XatlasError: no room is left for them.
+        ChartsError: no room is left for them.
     """
     import cv2
 
@@ -203,7 +304,7 @@ def _move_overlaps(layout: UvLayout, pairs: np.ndarray, texture_size: int, paddi
         width, height = np.ceil(texels[members].max(0)).astype(np.int64) - low + 1
         corner = _free_box(taken, int(width), int(height))
         if corner is None:
-            raise XatlasError(f"{len(pairs)} pairs of faces overlap in the texture and no room is left to move them")
+            raise ChartsError(f"{len(pairs)} pairs of faces overlap in the texture and no room is left to move them")
         x, y = corner
         texels[members] += np.array([x, y]) - low
         around = padding + 1

@@ -9,8 +9,6 @@ from stages.geometry.cameras import PinholeCameras
 from stages.surface.triangle_mesh import face_normals
 
 SMALLEST, LARGEST = 1024, 8192
-# Part of a texture that charts fill: what xatlas reaches on curved objects.
-CHARTS_FILL = 0.41
 # A texture this much too small (of its side) is still preferred to one of twice the side.
 SHORT_OF = 0.15
 
@@ -38,8 +36,8 @@ def pixels_per_area(vertices: np.ndarray, faces: np.ndarray, cameras: PinholeCam
     return best, length / 2
 
 
-def texture_size_for(density: np.ndarray, areas: np.ndarray) -> int:
-    """The power of two between `SMALLEST` and `LARGEST` at which a texel covers what a pixel does in the best view.
+def texels_needed(density: np.ndarray, areas: np.ndarray) -> float:
+    """Texels on the whole surface at which one covers what a pixel does in the best view; 0 where no photo shows it.
 
     The median over the surface that photos show decides, so that neither close-ups of a small part nor faces no photo
     shows call for a texture that the others cannot fill.
@@ -50,9 +48,14 @@ def texture_size_for(density: np.ndarray, areas: np.ndarray) -> int:
     """
     shown = np.flatnonzero(density > 0)
     if not len(shown):
-        return SMALLEST
+        return 0.0
     order = shown[np.argsort(density[shown])]
     cumulative = np.cumsum(areas[order])
     typical = density[order[np.searchsorted(cumulative, cumulative[-1] / 2)]]
-    side = np.sqrt(areas.sum() * typical / CHARTS_FILL)
+    return float(areas.sum() * typical)
+
+
+def texture_size_for(texels: float, fill: float) -> int:
+    """The power of two between `SMALLEST` and `LARGEST` at which charts that fill a part `fill` have so many texels."""
+    side = np.sqrt(texels / fill)
     return int(np.clip(2.0 ** np.ceil(np.log2(max(side * (1 - SHORT_OF), 1.0))), SMALLEST, LARGEST))
