@@ -76,7 +76,7 @@ def test_the_same_seed_builds_the_same_city_and_another_seed_another():
 
 def test_objects_are_made_one_large_and_keep_their_paint():
     striped = Part(np.eye(3) * 4 + 7, np.array([[0, 1, 2]]), "matte", lambda points, normals: points, grain=0.2)
-    (moved,) = scenes._normalised([striped])
+    (moved,) = scenes.normalised([striped])
     assert np.ptp(moved.vertices, axis=0).max() == pytest.approx(1.0)
     assert moved.vertices[:, 2].min() == pytest.approx(0.0)
     np.testing.assert_allclose(moved.paint(moved.vertices, moved.vertices), striped.vertices)

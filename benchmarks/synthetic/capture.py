@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ import numpy as np
 from benchmarks.synthetic import MADE_WITH
 from benchmarks.synthetic.mitsuba_camera import Photographer
 from benchmarks.synthetic.model import Scene
-from benchmarks.synthetic.scenes import RECIPES
+from benchmarks.synthetic.scenes import RECIPES, Recipe
 from stages.evaluation.protocols.known_object import TRUTH_CAMERAS, TRUTH_MESH
 from stages.scenes.photo_files import is_complete, photo_exif, srgb, write_truth
 
@@ -65,13 +65,19 @@ class Order:
         return {"suite_version": SUITE_VERSION, **asdict(self), "size": list(self.size)}
 
 
-def make(order: Order, folder: Path, variant: str, progress: Callable[[int], None] = lambda done: None) -> bool:
+def make(
+    order: Order,
+    folder: Path,
+    variant: str,
+    progress: Callable[[int], None] = lambda done: None,
+    recipes: Mapping[str, Recipe] = RECIPES,
+) -> bool:
     """Make what is not there yet; whether there was anything to do."""
     if is_complete(folder, order.as_dict()):
         return False
     _begin(order, folder)
     rng = np.random.default_rng(order.seed)
-    scene = RECIPES[order.scene].make(rng, order.num_photos)
+    scene = recipes[order.scene].make(rng, order.num_photos)
     exposures = 1 + DRIFT * _drift(order.num_photos, rng)
     _write_mesh(scene, folder / TRUTH_MESH)
     camera = Photographer(scene, order.focal, order.size, variant)
@@ -107,9 +113,12 @@ def _drift(count: int, rng: np.random.Generator) -> np.ndarray:
 
 
 def _meter(scene: Scene, order: Order, variant: str) -> float:
-    """Exposure of the whole set, from a small first photo."""
+    """Exposure of the set, from a small first photo: from all of it, or from an object that stands on nothing."""
     small = (order.size[0] // 4, order.size[1] // 4)
-    first = Photographer(scene, order.focal / 4, small, variant).radiance(scene.cam_from_world[0], METER_PATHS, seed=0)
+    camera, pose = Photographer(scene, order.focal / 4, small, variant), scene.cam_from_world[0]
+    first = camera.radiance(pose, METER_PATHS, seed=0)
+    if scene.ground is None:
+        first = first[camera.coverage(pose, METER_PATHS, seed=1) == 1]
     return float(WHITE_POINT / np.percentile(first, 90))
 
 

@@ -14,13 +14,26 @@ FINISHES = ("matte", "glossy", "metal", "mirror")
 
 
 @dataclass(frozen=True)
+class Principled:
+    """A finish with known parameters: Disney's principled surface with F0 = 0.04 where it is no metal.
+
+    Attributes:
+        roughness: perceptual, 0 to 1; the microfacets' alpha is its square.
+        metallic: 0 to 1.
+    """
+
+    roughness: float
+    metallic: float
+
+
+@dataclass(frozen=True)
 class Part:
     """A triangle mesh with its paint.
 
     Attributes:
         vertices: [V, 3].
         faces: [F, 3] int, outward.
-        finish: one of FINISHES.
+        finish: one of FINISHES, or one with known parameters.
         paint: evaluated at the vertices.
         normals: [V, 3] unit, to shade with; None: each face is flat.
         grain: longest edge that is painted; longer ones are split before, which leaves the surface as it is. None:
@@ -29,13 +42,13 @@ class Part:
 
     vertices: np.ndarray
     faces: np.ndarray
-    finish: str
+    finish: str | Principled
     paint: Paint
     normals: np.ndarray | None = None
     grain: float | None = None
 
     def __post_init__(self) -> None:
-        if self.finish not in FINISHES:
+        if not isinstance(self.finish, Principled) and self.finish not in FINISHES:
             raise ValueError(f"finish: expected one of {FINISHES}, got {self.finish}")
 
 
@@ -54,7 +67,7 @@ class Scene:
 
     Attributes:
         parts: what is looked at; together they are the known surface.
-        ground: under it, not part of it; None: the parts are all there is.
+        ground: under it, not part of it; None: the parts are all there is, and the exposure is set for them.
         sky: radiance [H, 2 H, 3] by direction, row 0 at the zenith, column 0 at +x, towards +y.
         cam_from_world: [N, 4, 4], OpenCV axes.
     """

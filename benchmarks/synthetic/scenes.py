@@ -37,7 +37,7 @@ def _on_table(make_object: Callable[[np.random.Generator], list[Part]]) -> Calla
     """The object, made 1 large, on a printed cloth in a room with windows."""
 
     def make(rng: np.random.Generator, num_photos: int) -> Scene:
-        parts = _normalised(make_object(rng))
+        parts = normalised(make_object(rng))
         ground = Ground(make_cloth(rng), CLOTH_SIDE, -GROUND_GAP)
         room = np.minimum(make_environment(rng, SKY_HEIGHT), ROOM_BRIGHTEST)
         room[SKY_HEIGHT // 2 :] = 0  # the floor hides it, all but a line at the horizon: no path need look there
@@ -46,7 +46,7 @@ def _on_table(make_object: Callable[[np.random.Generator], list[Part]]) -> Calla
     return make
 
 
-def _normalised(parts: list[Part]) -> tuple[Part, ...]:
+def normalised(parts: list[Part]) -> tuple[Part, ...]:
     """Moved and scaled to rest on z = 0, around the z axis, with largest extent 1; painted as before."""
     points = np.concatenate([part.vertices for part in parts])
     low, high = points.min(0), points.max(0)
