@@ -14,7 +14,7 @@ from stages import artifacts
 from stages.light import environment
 from stages.scenes.room import sphere_directions
 
-LIGHT_HEIGHT = 256  # of the map that the judge lights with
+LIGHT_HEIGHT = 512  # of the map that the judge lights with
 
 
 @dataclass(frozen=True)

@@ -40,7 +40,7 @@ class Judge:
             sensor = pinhole(mi, pose, views.focal, views.size, spp)
             # other random paths than the truth's
             image = mi.render(scene, sensor=sensor, integrator=mi.load_dict(PATHS), spp=spp, seed=1000 + i)
-            pictures.append(np.array(image, dtype=np.float32))
+            pictures.append(np.nan_to_num(np.array(image, dtype=np.float32)))  # rarely, a path is no number
         return np.stack(pictures)
 
     def maps(self, model: Model) -> list[dict[str, np.ndarray]]:

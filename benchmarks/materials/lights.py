@@ -12,7 +12,7 @@ import numpy as np
 
 from stages.scenes.room import sphere_directions
 
-HEIGHT = 256
+HEIGHT = 512
 EDGE = np.radians(180 / HEIGHT)  # over which a lamp's rim fades, radians
 SUN_RADIUS_DEG = 1.5
 SUN_DEG = (35.0, 48.0)  # azimuth and elevation
@@ -25,7 +25,7 @@ ROOM_LOW, ROOM_HIGH = np.array([-2.2, -1.8, -1.1]), np.array([2.0, 2.4, 1.6])
 def studio(height: int = HEIGHT) -> np.ndarray:
     """Three softboxes on a dim grey."""
     d = sphere_directions(height)
-    light = (0.10 + 0.06 * d[..., 2:]) * np.ones(3)
+    light = (0.22 + 0.10 * d[..., 2:]) * np.ones(3)
     for azimuth, elevation, wide, high, radiance in (
         (40, 42, 42, 32, (9.0, 8.6, 8.0)),
         (165, 12, 22, 54, (3.0, 3.3, 3.7)),

@@ -14,8 +14,8 @@ from benchmarks.synthetic.capture import Order, make
 from benchmarks.synthetic.check import check
 from benchmarks.synthetic.model import Scene
 
-PHOTOS, SIZE, SPP = 40, (640, 480), 16
-HELD_OUT_SIZE, HELD_OUT_SPP = (320, 240), 64
+PHOTOS, SIZE, SPP = 40, (640, 480), 25
+HELD_OUT_SIZE, HELD_OUT_SPP = (320, 240), 144
 SEED = 21
 
 

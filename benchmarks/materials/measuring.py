@@ -17,7 +17,7 @@ from benchmarks.materials.scenes import SUBJECTS
 from benchmarks.materials.sheet import Row
 from stages.evaluation.machine import machine
 
-SPP = 36  # a pixel of the judge's pictures
+SPP = 100  # a pixel of the judge's pictures
 SHOWN = 2  # the held-out view on the contact sheet
 
 
@@ -71,7 +71,7 @@ class Truth:
     Attributes:
         views: held-out cameras.
         maps: of each view, with the radiances.
-        masks: [N, H, W] bool, the pixels that count.
+        masks: [N, H, W] bool, the pixels that count; not those, rare, where the renderer made no number.
         lights: by name, each as `Scene.sky`.
     """
 
@@ -85,11 +85,15 @@ class Truth:
         views = Views.load(folder)
         maps = [read_truth(folder, i) for i in range(len(views.cam_from_world))]
         lights = {path.stem: z_up_map(read_exr(path)) for path in sorted((folder / LIGHT_MAPS).glob("*.exr"))}
-        return cls(views, maps, np.stack([scoring.counted(one["coverage"]) for one in maps]), lights)
+        masks = [scoring.counted(one["coverage"]) for one in maps]
+        for mask, one in zip(masks, maps, strict=True):
+            for light in lights:
+                mask &= np.isfinite(one[f"radiance_{light}"]).all(2)
+        return cls(views, maps, np.stack(masks), lights)
 
     def radiance(self, light: str) -> np.ndarray:
-        """[N, H, W, 3] of all views."""
-        return np.stack([one[f"radiance_{light}"] for one in self.maps])
+        """[N, H, W, 3] of all views, 0 where the renderer made no number."""
+        return np.nan_to_num(np.stack([one[f"radiance_{light}"] for one in self.maps]))
 
     def row(self, unseen: tuple[str, ...]) -> Row:
         shown, mask = self.maps[SHOWN], self.masks[SHOWN]

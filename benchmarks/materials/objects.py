@@ -13,6 +13,7 @@ from stages.scenes.noise import ValueNoise
 PLASTER, PAINT = Principled(1.0, 0.0), Principled(0.8, 0.0)
 PLASTIC = Principled(0.2, 0.0)
 POLISHED, ROUGH_METAL = Principled(0.15, 1.0), Principled(0.45, 1.0)
+HANDLE_GAP = 0.05  # from the middle of the jug's wall to what is the handle's
 STEEL, COPPER, GOLD = (0.66, 0.64, 0.61), (0.93, 0.60, 0.48), (0.95, 0.74, 0.36)
 
 
@@ -49,10 +50,11 @@ def plastic_jug(rng: np.random.Generator) -> list[Part]:
     """A jug of shiny plastic: red with bands of two more colours."""
 
     def paint(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
-        height, outside = points[:, 2], np.hypot(points[:, 0], points[:, 1]) > 0.34
+        height, radius = points[:, 2], np.hypot(points[:, 0], points[:, 1])
         colors = np.where((height > 0.55)[:, None], [0.80, 0.62, 0.10], [0.60, 0.06, 0.05])
         colors = np.where((height < 0.16)[:, None], [0.05, 0.20, 0.42], colors)
-        return np.where((outside & (points[:, 0] > 0))[:, None], [0.06, 0.06, 0.07], colors)
+        handle = (points[:, 0] > 0) & (radius > objects.jug_radius(height) + HANDLE_GAP) & (height > 0.16)
+        return np.where(handle[:, None], [0.06, 0.06, 0.07], colors)
 
     return [_of(part, PLASTIC, paint) for part in objects.jug(rng)]
 

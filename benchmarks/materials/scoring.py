@@ -46,7 +46,13 @@ def exposure(truths: np.ndarray, masks: np.ndarray) -> float:
 
 
 def coded(linear: np.ndarray) -> np.ndarray:
-    """8-bit sRGB of linear values."""
+    """8-bit sRGB of linear values.
+
+    Raises:
+        ValueError: a value is not finite. Cast to 8 bits, two such pictures would agree perfectly.
+    """
+    if not np.isfinite(linear).all():
+        raise ValueError(f"expected finite values, got {int((~np.isfinite(linear)).sum())} that are not")
     return (srgb(np.clip(linear, 0, 1)) * 255 + 0.5).astype(np.uint8)
 
 

@@ -15,23 +15,29 @@ GRAIN = 0.02  # longest painted edge of rods
 
 WHITE = plain(0.78, 0.77, 0.75)
 MOSAIC = ((0.62, 0.16, 0.10), (0.80, 0.55, 0.15), (0.12, 0.30, 0.50), (0.75, 0.70, 0.58), (0.10, 0.36, 0.22))
+# The middle of a jug's wall: radius and height.
+JUG_CURVE = np.array(
+    [[0, 0.03], [0.12, 0.03], [0.22, 0.05], [0.31, 0.16], [0.35, 0.32], [0.30, 0.50], [0.19, 0.64],
+     [0.155, 0.74], [0.18, 0.86], [0.22, 0.92]]
+)  # fmt: skip
+
+
+def jug_radius(height: np.ndarray) -> np.ndarray:
+    """[P] of the middle of its wall, at heights [P]."""
+    return np.interp(height, JUG_CURVE[:, 1], JUG_CURVE[:, 0])
 
 
 def jug(rng: np.random.Generator) -> list[Part]:
     """A painted jug, hollow, with a spout, a handle and flutes."""
     wall = 0.022
-    curve = np.array(
-        [[0, 0.03], [0.12, 0.03], [0.22, 0.05], [0.31, 0.16], [0.35, 0.32], [0.30, 0.50], [0.19, 0.64],
-         [0.155, 0.74], [0.18, 0.86], [0.22, 0.92]]
-    )  # fmt: skip
-    vessel = profile(curve)
+    vessel = profile(JUG_CURVE)
     handle = [(0.19, 0, 0.86), (0.32, 0, 0.88), (0.44, 0, 0.78), (0.46, 0, 0.62), (0.42, 0, 0.46), (0.33, 0, 0.36)]
     spout = [(-0.14, 0, 0.80), (-0.22, 0, 0.86), (-0.33, 0, 0.93)]
 
     def shape(points: np.ndarray) -> np.ndarray:
         angle = np.arctan2(points[:, 1], points[:, 0])
         belly = np.exp(-(((points[:, 2] - 0.33) / 0.16) ** 2))
-        outside = np.hypot(points[:, 0], points[:, 1]) > np.interp(points[:, 2], curve[:, 1], curve[:, 0])
+        outside = np.hypot(points[:, 0], points[:, 1]) > jug_radius(points[:, 2])
         flutes = 0.012 * belly * np.cos(14 * angle + 9 * points[:, 2]) * outside
         hollow = without(
             union(vessel(points) - wall - flutes, tube(points, spout, (0.07, 0.06, 0.045)), width=0.04),
