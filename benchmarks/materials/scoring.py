@@ -20,9 +20,9 @@ from stages.scenes.room import sphere_directions
 
 WHOLE = 0.999  # coverage
 DARK = 1e-4  # below which a quotient says nothing
-# A main source is sought with a cap of this radius: lamps are smaller, and a learned map is coarse.
-CAP_DEG = 15.0
-SOURCE_ROWS = 64
+LOBE_DEG = 15.0  # lamps are hardly larger, and a learned map is coarse
+SHIFTS = 50
+SOURCE_ROWS = 32
 
 
 def counted(coverage: np.ndarray) -> np.ndarray:
@@ -107,26 +107,26 @@ def map_scores(found: Sequence[dict[str, np.ndarray]], truths: Sequence[dict[str
 def main_source(light: np.ndarray) -> np.ndarray:
     """Unit direction [3] of the main source of a light that is given as `Scene.sky` is.
 
-    The cap of `CAP_DEG` that most light comes from, and in it the middle of what is brighter than its mean.
+    Where the light that is brighter than the map's median, blurred by a lobe of `LOBE_DEG`, is brightest: the best
+    pixel of a coarse map, then by mean shift (Fukunaga and Hostetler 1975).
     """
-    directions, power = _coarse(light)
-    best, cosine = None, np.cos(np.radians(CAP_DEG))
-    gathered = np.array([power[directions @ direction > cosine].sum() for direction in directions])
-    best = directions @ directions[np.argmax(gathered)] > cosine
-    excess = np.maximum(power[best] - power[best].mean(), 0)
-    middle = excess @ directions[best]
-    return middle / max(np.linalg.norm(middle), 1e-12)
+    from stages.light.environment import resized, solid_angles
+
+    small = resized(light.astype(np.float32), SOURCE_ROWS)
+    brightness = small.mean(2)
+    power = (np.maximum(brightness - np.median(brightness), 0) * solid_angles(SOURCE_ROWS)).ravel()
+    directions = sphere_directions(SOURCE_ROWS).reshape(-1, 3)
+
+    def lobe(direction: np.ndarray) -> np.ndarray:
+        return power * np.exp((directions @ direction - 1) / np.radians(LOBE_DEG) ** 2)
+
+    best = max(directions, key=lambda direction: lobe(direction).sum())
+    for _ in range(SHIFTS):
+        middle = lobe(best) @ directions
+        best = middle / max(np.linalg.norm(middle), 1e-12)
+    return best
 
 
 def source_error_deg(found: np.ndarray, truth: np.ndarray) -> float:
     """Angle between the main sources of two lights."""
     return float(np.degrees(np.arccos(np.clip(main_source(found) @ main_source(truth), -1, 1))))
-
-
-def _coarse(light: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Directions [P, 3] and power [P] of a map's blocks of pixels."""
-    from stages.light.environment import resized, solid_angles
-
-    small = resized(light.astype(np.float32), SOURCE_ROWS)
-    power = small.mean(2) * solid_angles(SOURCE_ROWS)
-    return sphere_directions(SOURCE_ROWS).reshape(-1, 3), power.ravel()
