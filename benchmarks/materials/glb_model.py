@@ -11,6 +11,7 @@ import numpy as np
 
 from benchmarks.materials.held_out import read_exr
 from stages import artifacts
+from stages.errors import InputError
 from stages.light import environment
 from stages.scenes.room import sphere_directions
 
@@ -63,8 +64,14 @@ class Finished:
 
 
 def read_finished(folder: Path) -> Finished:
-    """A workspace, or a folder with `model.glb` and, perhaps, `light.exr`; its poses are those of the truth."""
-    glb = next(path for path in (folder / "export" / "model.glb", folder / "model.glb") if path.is_file())
+    """A workspace, or a folder with `model.glb` and, perhaps, `light.exr`; its poses are those of the truth.
+
+    Raises:
+        InputError: there is no model.
+    """
+    glb = next((path for path in (folder / "export" / "model.glb", folder / "model.glb") if path.is_file()), None)
+    if glb is None:
+        raise InputError(f"There is no model.glb in {folder}.", "Try `python -m benchmarks.materials run OUT`.")
     model, frames, has_materials = read_glb(glb)
     made = folder / "materials"
     if (made / artifacts.ORM.files[0]).is_file():
