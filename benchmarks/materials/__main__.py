@@ -29,7 +29,7 @@ from benchmarks.pages import write_tables
 from benchmarks.run_sets import run_hineus
 from benchmarks.synthetic.mitsuba_camera import FAST, choose_variant
 from stages import artifacts
-from stages.engine.workspace import Workspace
+from stages.engine.manifest import load_manifest
 from stages.errors import HineusError
 
 RUNS, SHEETS, TRUE = "runs", "sheets", "true"
@@ -96,9 +96,10 @@ def run_object(truth: Path, workspace: Path, steps: int | None) -> None:
 
 def score_object(name: str, out: Path, folder: Path, results: Path, variant: str) -> None:
     """Score a workspace or a folder of files, and draw its contact sheet."""
-    measured = measure(name, out / name, read_finished(folder), variant)
-    manifest = Workspace(folder).published("materials") if (folder / "materials").is_dir() else None
-    if manifest is not None:
+    manifest = load_manifest(folder / "materials")
+    finished = read_finished(folder)
+    measured = measure(name, out / name, finished, variant)
+    if manifest is not None and finished.has_materials:
         measured.result["cost"] = {"wall_s": manifest.wall_s, "cpu_s": manifest.cpu_s, "peak_rss": manifest.peak_rss}
     results.mkdir(parents=True, exist_ok=True)
     artifacts.write_json(results / f"{name}.json", measured.result)
