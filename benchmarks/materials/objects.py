@@ -36,8 +36,8 @@ def copper_knot(rng: np.random.Generator) -> list[Part]:
     """A trefoil of a thick tube, of rough copper."""
     turn = np.linspace(0, 2 * np.pi, 181)
     ring = 2 + np.cos(3 * turn)
-    path = np.stack([ring * np.cos(2 * turn), ring * np.sin(2 * turn), 1.25 * np.sin(3 * turn)], 1) / 6
-    path = [tuple(point) for point in path]
+    places = np.stack([ring * np.cos(2 * turn), ring * np.sin(2 * turn), 1.25 * np.sin(3 * turn)], 1) / 6
+    path = [tuple(point) for point in places]
 
     def shape(points: np.ndarray) -> np.ndarray:
         return tube(points, path, [0.125] * len(path))
