@@ -7,7 +7,7 @@ import numpy as np
 from benchmarks.synthetic import objects
 from benchmarks.synthetic.model import Paint, Part, Principled, plain
 from benchmarks.synthetic.shapes import cylinder, mesh_of
-from stages.scenes.implicit import ellipsoid, tube, union
+from stages.scenes.implicit import ellipsoid, union
 from stages.scenes.noise import ValueNoise
 
 PLASTER, PAINT = Principled(1.0, 0.0), Principled(0.8, 0.0)
@@ -34,13 +34,14 @@ def polished_dog(rng: np.random.Generator) -> list[Part]:
 
 def copper_knot(rng: np.random.Generator) -> list[Part]:
     """A trefoil of a thick tube, of rough copper."""
-    turn = np.linspace(0, 2 * np.pi, 181)
+    from scipy.spatial import cKDTree
+
+    turn = np.linspace(0, 2 * np.pi, 4000)
     ring = 2 + np.cos(3 * turn)
-    places = np.stack([ring * np.cos(2 * turn), ring * np.sin(2 * turn), 1.25 * np.sin(3 * turn)], 1) / 6
-    path = [tuple(point) for point in places]
+    line = cKDTree(np.stack([ring * np.cos(2 * turn), ring * np.sin(2 * turn), 1.25 * np.sin(3 * turn)], 1) / 6)
 
     def shape(points: np.ndarray) -> np.ndarray:
-        return tube(points, path, [0.125] * len(path))
+        return line.query(points)[0] - 0.125
 
     vertices, faces, normals = mesh_of(shape, (-0.66, -0.66, -0.36), (0.66, 0.66, 0.36), 1.2 * objects.CELL)
     return [Part(vertices, faces, ROUGH_METAL, plain(*COPPER), normals)]

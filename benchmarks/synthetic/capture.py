@@ -88,7 +88,8 @@ def make(
             covered = camera.coverage(cam_from_world, MASK_PATHS, seed=_noise_seed(order, i, 1))
             _save(mask, _picture(np.where(covered >= 0.5, 255, 0).astype(np.uint8)))
             radiance = camera.radiance(cam_from_world, order.spp, seed=_noise_seed(order, i, 0))
-            developed = develop(radiance * exposures[i], np.random.default_rng([order.seed, i]))
+            # rarely, a path is no number
+            developed = develop(np.nan_to_num(radiance) * exposures[i], np.random.default_rng([order.seed, i]))
             picture = _picture(developed)
             _save(photo, picture, quality=JPEG_QUALITY, exif=photo_exif(picture, i, "Synthetic camera", FOCAL_35MM))
         progress(i + 1)
