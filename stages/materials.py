@@ -43,6 +43,7 @@ def run(context: StageContext[MaterialsParams]) -> dict[str, Any]:
     from stages.drawing.rasterizing import rasterize_atlas, surface_points
     from stages.files.light_files import harmonics_json, write_exr, write_hdr
     from stages.geometry.up import gltf_from_scene
+    from stages.light.srgb import as_bytes, decoded
     from stages.shading.learning import learn
     from stages.shading.observations import observe
     from stages.shading.reflection import reflection
@@ -75,7 +76,7 @@ def run(context: StageContext[MaterialsParams]) -> dict[str, Any]:
             )
         seen, positions, normals, chosen = seen.select(rows), positions[rows], normals[rows], chosen[rows]
         tell(2, 10, "what lies around points")
-        linear = _linear(texture.astype(np.float32) / 255)
+        linear = decoded(texture.astype(np.float32) / 255)
         around = look_around(atlas, linear, positions, normals, light_from_scene)
         reflected = reflection(seen, normals, around, light_from_scene)
         learned = learn(
@@ -93,7 +94,7 @@ def run(context: StageContext[MaterialsParams]) -> dict[str, Any]:
     metallic = np.array([material.metallic for material in learned.materials])[found.which]
     occlusion = _occlusion(context.read(OCCLUSION), atlas.texture_size).reshape(-1)[texels.index]
     orm = np.stack([occlusion, 255 * roughness + 0.5, 255.0 * metallic], axis=1).astype(np.uint8)
-    write_png(context.to_write(MATERIAL_COLOR), pad_charts(*texels.paint(_code(found.color)))[0])
+    write_png(context.to_write(MATERIAL_COLOR), pad_charts(*texels.paint(as_bytes(found.color)))[0])
     write_png(context.to_write(ORM), pad_charts(*texels.paint(orm))[0])
     write_png(context.to_write(KNOWN), texels.paint(found.told[:, None])[0][..., 0])
     write_exr(context.to_write(LIGHT), learned.light)
@@ -136,16 +137,6 @@ def _occlusion(path: Path, size: int) -> np.ndarray:
     image = _read_image(path)[..., 0]
     resized: np.ndarray = cv2.resize(image, (size, size), interpolation=cv2.INTER_LINEAR)
     return resized
-
-
-def _linear(coded: np.ndarray) -> np.ndarray:
-    return np.where(coded <= 0.04045, coded / 12.92, ((coded + 0.055) / 1.055) ** 2.4).astype(np.float32)
-
-
-def _code(linear: np.ndarray) -> np.ndarray:
-    """8-bit sRGB codes of linear values 0..1."""
-    coded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 0) ** (1 / 2.4) - 0.055)
-    return np.clip(255 * coded + 0.5, 0, 255).astype(np.uint8)
 
 
 MATERIALS: Stage[MaterialsParams] = Stage(

@@ -19,12 +19,12 @@ from stages.capture.colour import (
     SRGB,
     Colours,
     colours_of,
-    decode_srgb,
     in_srgb,
     matrix_profile,
 )
 from stages.capture.photo_reading import read_head, read_photo
 from stages.inputs.formats import register_formats
+from stages.light.srgb import decoded
 
 PROPHOTO = ((0.7347, 0.2653), (0.1596, 0.8404), (0.0366, 0.0001))
 D50 = (0.3457, 0.3585)
@@ -33,7 +33,7 @@ SPACES = {
     "p3": (
         DISPLAY_P3,
         D65,
-        decode_srgb,
+        decoded,
         lambda v: np.where(v <= 0.0031308, 12.92 * v, 1.055 * v ** (1 / 2.4) - 0.055),
     ),
     "prophoto": (PROPHOTO, D50, lambda v: v**1.8, lambda v: v ** (1 / 1.8)),
@@ -52,7 +52,7 @@ def xyz_from_rgb(primaries, white) -> np.ndarray:
 def encoded(space: str, colours: np.ndarray = COLOURS) -> np.ndarray:
     """sRGB values 0 to 255 as those of another space, 0 to 1."""
     primaries, white, _, encode = SPACES[space]
-    linear = decode_srgb(colours / 255) @ xyz_from_rgb(SRGB, D65).T @ np.linalg.inv(xyz_from_rgb(primaries, white)).T
+    linear = decoded(colours / 255) @ xyz_from_rgb(SRGB, D65).T @ np.linalg.inv(xyz_from_rgb(primaries, white)).T
     return encode(linear.clip(0, 1))
 
 
@@ -96,7 +96,7 @@ def test_the_pure_green_of_srgb_in_adobe_rgb():
 def test_srgb_by_any_name_is_left_as_it_is(tmp_path: Path):
     file = tmp_path / "z.jpg"
     Image.fromarray(patches(COLOURS).astype(np.uint8)).save(
-        file, icc_profile=matrix_profile("My camera", SRGB, decode_srgb)
+        file, icc_profile=matrix_profile("My camera", SRGB, decoded)
     )
     assert read_photo(file, 3200).as_is == (".jpg", ".jpeg")
 
@@ -175,7 +175,7 @@ def test_grey_photos_with_a_curve_of_their_own(tmp_path: Path, deep: bool):
     pixels = np.rint(linear * 65535).astype(np.uint16) if deep else np.rint(linear * 255).astype(np.uint8)
     Image.fromarray(pixels).save(tmp_path / "z.png", icc_profile=grey_profile(1.0))
     found = np.asarray(read_photo(tmp_path / "z.png", 3200).rgb)[10, :, 0] / 255
-    assert np.abs(decode_srgb(found) - linear[10]).max() < 0.01
+    assert np.abs(decoded(found) - linear[10]).max() < 0.01
 
 
 def test_inks_are_converted_by_their_profile(tmp_path: Path):

@@ -11,7 +11,7 @@ from benchmarks.materials.held_out import Y_UP, Views, write_held_out, y_up_map,
 from benchmarks.materials.true_model import write_true_model
 from benchmarks.synthetic.model import Part, Principled, Scene, plain
 from stages.light import environment
-from stages.scenes.photo_files import srgb
+from stages.light.srgb import coded
 from stages.scenes.room import sphere_directions
 from stages.scenes.viewpoints import viewpoint
 
@@ -144,7 +144,7 @@ def test_the_true_model_is_read_back_in_the_frame_of_the_truth(tmp_path):
 
 def test_linear_undoes_the_tone_curve():
     codes = np.arange(256, dtype=np.uint8)
-    np.testing.assert_allclose(srgb(linear(codes)) * 255, codes, atol=1e-3)
+    np.testing.assert_allclose(coded(linear(codes)) * 255, codes, atol=1e-3)
 
 
 # ---------------------------------------------------------------- tables

@@ -13,6 +13,7 @@ from benchmarks.materials.held_out import read_exr
 from stages import artifacts
 from stages.errors import InputError
 from stages.light import environment
+from stages.light.srgb import decoded
 from stages.scenes.room import sphere_directions
 
 LIGHT_HEIGHT = 512  # of the map that the judge lights with
@@ -129,9 +130,7 @@ def z_up_light(light: np.ndarray, rotation: np.ndarray) -> np.ndarray:
 
 def linear(srgb: np.ndarray) -> np.ndarray:
     """Linear float32 of 8-bit sRGB."""
-    coded = np.arange(256, dtype=np.float32) / 255
-    table = np.where(coded <= 0.04045, coded / 12.92, ((coded + 0.055) / 1.055) ** 2.4).astype(np.float32)
-    return table[srgb]
+    return decoded(np.arange(256) / 255).astype(np.float32)[srgb]
 
 
 def _frames(path: Path) -> Frames:

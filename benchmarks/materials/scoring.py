@@ -15,7 +15,7 @@ import numpy as np
 
 from benchmarks.synthetic.capture import WHITE_POINT
 from stages.drawing.view_scores import psnr, ssim
-from stages.scenes.photo_files import srgb
+from stages.light.srgb import as_bytes
 from stages.scenes.room import sphere_directions
 
 WHOLE = 0.999  # coverage
@@ -53,7 +53,7 @@ def coded(linear: np.ndarray) -> np.ndarray:
     """
     if not np.isfinite(linear).all():
         raise ValueError(f"expected finite values, got {int((~np.isfinite(linear)).sum())} that are not")
-    return (srgb(np.clip(linear, 0, 1)) * 255 + 0.5).astype(np.uint8)
+    return as_bytes(np.clip(linear, 0, 1))
 
 
 def picture_scores(found: np.ndarray, truth: np.ndarray, masks: np.ndarray) -> dict[str, float]:

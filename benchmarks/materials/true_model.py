@@ -11,7 +11,7 @@ from benchmarks.materials.lights import LIGHTS
 from benchmarks.materials.scenes import SUBJECTS
 from benchmarks.synthetic.mitsuba_camera import painted_mesh
 from benchmarks.synthetic.model import Scene
-from stages.scenes.photo_files import srgb
+from stages.light.srgb import coded
 
 
 def write_true_model(name: str, scene: Scene, folder: Path) -> None:
@@ -29,7 +29,7 @@ def write_true_model(name: str, scene: Scene, folder: Path) -> None:
     side = int(np.ceil(np.sqrt(count)))
     row, column = np.divmod(np.arange(count), side)
     uvs = np.repeat((np.stack([column, row], 1) + 0.5) / side, 3, axis=0)
-    textures = [_palette(np.concatenate(values), side) for values in ([srgb(c) for c in colors], kinds)]
+    textures = [_palette(np.concatenate(values), side) for values in ([coded(c) for c in colors], kinds)]
     (folder / "model.glb").write_bytes(_glb(vertices, normals, uvs, textures))
     write_exr(folder / "light.exr", y_up_map(LIGHTS[SUBJECTS[name].light]()))
 

@@ -22,7 +22,8 @@ from benchmarks.synthetic.mitsuba_camera import Photographer
 from benchmarks.synthetic.model import Scene
 from benchmarks.synthetic.scenes import RECIPES, Recipe
 from stages.evaluation.protocols.known_object import TRUTH_CAMERAS, TRUTH_MESH
-from stages.scenes.photo_files import is_complete, photo_exif, srgb, write_truth
+from stages.light.srgb import as_bytes
+from stages.scenes.photo_files import is_complete, photo_exif, write_truth
 
 SUITE_VERSION = 1  # raise it when the same recipe would give other photos
 IMAGES, MASKS = "images", "masks"
@@ -104,7 +105,7 @@ def develop(light: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     clipped = np.clip(light, 0, 1)
     sigma = np.sqrt(READ_NOISE**2 + SHOT_NOISE**2 * clipped)
     linear = np.clip(clipped + sigma * rng.standard_normal(clipped.shape), 0, 1)
-    return (srgb(linear) * 255 + 0.5).astype(np.uint8)
+    return as_bytes(linear)
 
 
 def _drift(count: int, rng: np.random.Generator) -> np.ndarray:

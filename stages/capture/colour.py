@@ -11,6 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from stages.light.srgb import decoded
+
 INTEROPERABILITY_IFD, INTEROPERABILITY_INDEX = 0xA005, 1
 DCF_OPTION = "R03"  # what cameras write into EXIF in place of a profile: Adobe RGB
 
@@ -61,7 +63,7 @@ def colours_of(info: Mapping[str, Any], exif: Any, mode: str) -> Colours:
     if mode != "RGB":
         return Colours()
     if nclx.get("color_primaries") in NCLX_PRIMARIES:
-        return _checked(matrix_profile("nclx", NCLX_PRIMARIES[nclx["color_primaries"]], decode_srgb), mode)
+        return _checked(matrix_profile("nclx", NCLX_PRIMARIES[nclx["color_primaries"]], decoded), mode)
     if _interoperability(exif).startswith(DCF_OPTION):
         return Colours(matrix_profile("Adobe RGB", ADOBE_RGB, lambda v: v**ADOBE_GAMMA), "Adobe RGB (by EXIF)")
     return Colours()
@@ -122,11 +124,6 @@ def _transform(profile: bytes, mode: str) -> Any:
         renderingIntent=ImageCms.Intent.RELATIVE_COLORIMETRIC,
         flags=ImageCms.Flags.BLACKPOINTCOMPENSATION,
     )
-
-
-def decode_srgb(values: np.ndarray) -> np.ndarray:
-    """Linear light of sRGB's values, 0 to 1."""
-    return np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
 
 
 def matrix_profile(

@@ -22,6 +22,7 @@ from stages.drawing.rasterizing import NO_FACE, corner_weights, projected, raste
 from stages.geometry.cameras import PinholeCameras
 from stages.light.ggx import DIELECTRIC, split_sum_table
 from stages.light.levels import Levels
+from stages.light.srgb import decoded
 
 # What a picture shows where there is nothing: the light itself, white, or nothing (alpha).
 BACKGROUNDS = ("light", "white", "transparent")
@@ -115,8 +116,7 @@ def _shaded(
     turn_deg: float,
 ) -> np.ndarray:
     """Radiance [P, 3] of points at barycentric `weights` [P, 3] of `faces` [P], seen from `center`."""
-    code = np.arange(256) / 255
-    decoded = np.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055) ** 2.4).astype(np.float32)
+    linear = decoded(np.arange(256) / 255).astype(np.float32)
     rows = np.array([len(level) for level in light.maps])
     out = np.empty((len(faces), 3), dtype=np.float32)
     _shade(
@@ -130,7 +130,7 @@ def _shaded(
         np.ascontiguousarray(material.base_color),
         np.ascontiguousarray(material.orm),
         np.zeros((1, 1, 3), np.uint8) if material.normal is None else np.ascontiguousarray(material.normal),
-        decoded,
+        linear,
         np.concatenate([level.reshape(-1, 3) for level in light.maps]),
         np.concatenate([[0], np.cumsum(2 * rows**2)[:-1]]),
         rows,

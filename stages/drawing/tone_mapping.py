@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from stages.light.srgb import coded
+
 NAME = "Khronos PBR Neutral"
 # Below this nothing but the reflection off what is no metal is taken away; above, the way to white begins.
 _START, _DESATURATION = 0.8 - 0.04, 0.15
@@ -34,7 +36,7 @@ def neutral(radiance: np.ndarray) -> np.ndarray:
 def on_screen(radiance: np.ndarray, exposure_ev: float = 0.0) -> np.ndarray:
     """[..., 3] float32 sRGB codes in 0..1 of linear radiance, made 2^EV times as bright before."""
     linear = np.clip(neutral(radiance * np.float32(2.0**exposure_ev)), 0, 1)
-    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055)
+    return coded(linear)
 
 
 def picture(

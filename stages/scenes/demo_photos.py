@@ -12,9 +12,10 @@ from typing import Any
 import numpy as np
 
 from stages.evaluation.protocols.known_object import TRUTH_CAMERAS, TRUTH_MESH
+from stages.light.srgb import coded
 from stages.scenes.figurine import make_figurine
 from stages.scenes.figurine_pictures import light_scene, render
-from stages.scenes.photo_files import is_complete, photo_exif, srgb, write_truth
+from stages.scenes.photo_files import is_complete, photo_exif, write_truth
 from stages.scenes.viewpoints import camera_ring
 
 SCENE_VERSION = 1  # raise it when the same seed would give other photos
@@ -77,5 +78,5 @@ def _recipe(num_photos: int, size: tuple[int, int], seed: int) -> dict[str, Any]
 def develop(radiance: np.ndarray, rng: np.random.Generator, exposure: float) -> np.ndarray:
     """8-bit sRGB picture with sensor noise from linear radiance."""
     linear = np.clip(radiance * exposure, 0.0, 1.0)
-    noisy = srgb(linear) + rng.normal(0, NOISE_SIGMA, linear.shape)
+    noisy = coded(linear) + rng.normal(0, NOISE_SIGMA, linear.shape)
     return (np.clip(noisy, 0, 1) * 255 + 0.5).astype(np.uint8)

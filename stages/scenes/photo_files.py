@@ -16,11 +16,6 @@ from stages.evaluation.protocols.known_object import TRUTH_CAMERAS
 OPENGL_FROM_OPENCV = np.diag([1.0, -1, -1, 1])
 
 
-def srgb(linear: np.ndarray) -> np.ndarray:
-    """The tone curve of sRGB for linear values in [0, 1]."""
-    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
-
-
 def photo_exif(picture: Any, index: int, model: str, focal_35mm: int) -> Any:
     """What a camera would note: maker, model, time, and the focal length SfM starts from (35 mm equivalent)."""
     from PIL import ExifTags

@@ -22,6 +22,7 @@ import torch
 from torch import Tensor
 
 from stages.light.ggx import DIELECTRIC, ROUGHNESSES
+from stages.neural.radiance import encoded_srgb
 from stages.shading.reflection import LIGHT_ROWS, Reflection, blur, blur_back
 
 LEVELS = len(ROUGHNESSES)
@@ -49,9 +50,8 @@ class Materials:
 
 
 def coded(linear: Tensor) -> Tensor:
-    """sRGB code of linear values, cut at 1; with a gradient everywhere below."""
-    value = linear.clamp(1e-6, 1.0)
-    return torch.where(value <= 0.0031308, 12.92 * value, 1.055 * value ** (1 / 2.4) - 0.055)
+    """sRGB code of linear values, cut at 0 and 1."""
+    return encoded_srgb(linear.clamp(0, 1))
 
 
 def decoded(code: Tensor) -> Tensor:

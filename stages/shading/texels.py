@@ -10,9 +10,11 @@ import numpy as np
 
 from stages.compiling import njit
 from stages.light import ggx
-from stages.light.environment import look_up
+from stages.light.environment import directions, look_up, solid_angles
+from stages.light.srgb import decoded
 from stages.shading.few_materials import COLOR_REACH, REACH
 from stages.shading.learning import Learned
+from stages.shading.reflection import matte
 from stages.shading.surroundings import ROWS as NEAR_ROWS
 from stages.shading.surroundings import Surroundings
 from stages.texture.observing import sample_points
@@ -144,22 +146,15 @@ def base_colors(
         color = np.clip(top / np.maximum(bottom, 1e-12), 0, 1)
     known = bottom.min(1) > 0
     # What no photo shows: the texture's own colour, with the light taken off that lies on the points around.
-    ratio = (learned.color / _linear(points.colors).clip(0.01)).clip(0.2, 5)
-    color[~known] = (_linear(coded[~known]) * ratio[alike[~known]]).clip(0, 1)
+    ratio = (learned.color / decoded(points.colors).clip(0.01)).clip(0.2, 5)
+    color[~known] = (decoded(coded[~known]) * ratio[alike[~known]]).clip(0, 1)
     told = np.array([Told.ALL if material.told else Told.COLOR for material in learned.materials], np.uint8)[which]
     told[~known] = Told.NOTHING
     return TexelMaterials(color.astype(np.float32), which, told)
 
 
-def _linear(coded: np.ndarray) -> np.ndarray:
-    """Linear values of sRGB codes, both 0..1."""
-    return np.where(coded <= 0.04045, coded / 12.92, ((coded + 0.055) / 1.055) ** 2.4).astype(np.float32)
-
-
 def _matte_light(light: np.ndarray) -> np.ndarray:
     """What white matte surfaces in the open show, by their normals: a map like the light's."""
-    from stages.light.environment import directions, solid_angles
-
     towards = directions(len(light)).reshape(-1, 3)
     cosine = np.maximum(towards @ towards.T, 0) * (solid_angles(len(light)).reshape(-1) / np.float32(np.pi))
     return (cosine @ light.reshape(-1, 3)).reshape(light.shape)
@@ -167,8 +162,6 @@ def _matte_light(light: np.ndarray) -> np.ndarray:
 
 def _received(points: Points, light: np.ndarray, light_from_scene: np.ndarray) -> np.ndarray:
     """What white matte points [S, 3] show where they are."""
-    from stages.shading.reflection import matte
-
     cosine, bounced = matte(points.normals, points.around, light_from_scene)
     received: np.ndarray = cosine @ light.reshape(-1, 3) + bounced
     return received
