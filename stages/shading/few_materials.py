@@ -9,7 +9,7 @@ NEIGHBORS, ROUNDS = 16, 3
 # Points that differ by so much in colour (coded, 0..1) are as far apart as points across REACH of the extent.
 COLOR_REACH, REACH = 0.08, 0.08
 # One more material must lower the cost of all points by this part, or a kind of error would be one.
-WORTH = 0.05
+WORTH = 0.03
 MOST_MATERIALS = 6
 
 
@@ -50,3 +50,46 @@ def choose_few(costs: np.ndarray) -> tuple[list[int], np.ndarray]:
         chosen.append(best)
         served = np.minimum(served, costs[:, best])
     return chosen, costs[:, chosen].argmin(1)
+
+
+# ---------------------------------------------------------------- base colours
+# Base colours within this of each other (natural log) are of one paint.
+SAME = 0.25
+# A difference in brightness counts by this part of one in colour: shading changes the one, not the other.
+BRIGHTNESS = 0.2
+# Paints that a thing has at most; what is left over is of the nearest.
+MOST_PAINTS = 16
+_ROUNDS_OF_MEANS = 5
+
+
+def few_colors(colors: np.ndarray) -> np.ndarray:
+    """For each base colour [S, 3] (linear) the paint that it may be: the median of those like it.
+
+    Reflectance is sparse over a whole thing (Gehler et al., "Recovering Intrinsic Images with a Global Sparsity Prior
+    on Reflectance", 2011), and shading keeps the ratio of the channels.
+    """
+    logs = np.log(np.maximum(colors.astype(np.float64), 0.02))
+    mean = logs.mean(1, keepdims=True)
+    features = np.concatenate([logs - mean, BRIGHTNESS * mean], axis=1)
+    centers = _crowded(features)
+    for _ in range(_ROUNDS_OF_MEANS):
+        which = ((features[:, None] - centers) ** 2).sum(2).argmin(1)
+        centers = np.stack([np.median(features[which == k], axis=0) if (which == k).any() else centers[k]
+                            for k in range(len(centers))])  # fmt: skip
+    paints = np.stack([np.median(colors[which == k], axis=0) if (which == k).any() else np.zeros(3)
+                       for k in range(len(centers))])  # fmt: skip
+    return paints[which].astype(np.float32)
+
+
+def _crowded(features: np.ndarray) -> np.ndarray:
+    """Places [C, F] where features [S, F] crowd, none within SAME of another: the fullest first."""
+    from scipy.spatial import cKDTree
+
+    some = features[:: max(len(features) // 1000, 1)]
+    crowd = np.array([len(near) for near in cKDTree(some).query_ball_point(some, SAME)])
+    left, centers = np.ones(len(some), dtype=bool), []
+    while left.any() and len(centers) < MOST_PAINTS:
+        center = some[np.argmax(np.where(left, crowd, -1))]
+        centers.append(center)
+        left &= ((some - center) ** 2).sum(1) > (2 * SAME) ** 2
+    return np.stack(centers)

@@ -30,6 +30,8 @@ LEVELS = len(ROUGHNESSES)
 SPREAD = 0.04
 # From here on (coded) a photo is clipped.
 CLIPPED = 0.98
+# A point's base colour is not its own while the light is searched, or it would explain all shading.
+PULL = 2.0
 # Base colours of real things end here: fresh snow, silver.
 BRIGHTEST = 0.95
 
@@ -81,10 +83,13 @@ def robust_weight(off: Tensor) -> Tensor:
     return (1 + (off / SPREAD) ** 2).rsqrt()
 
 
-def best_color(slope: Tensor, offset: Tensor, observed: Tensor, weights: Tensor, rounds: int = 3) -> Tensor:
+def best_color(
+    slope: Tensor, offset: Tensor, observed: Tensor, weights: Tensor, rounds: int = 3, paint: Tensor | None = None
+) -> Tensor:
     """Base colours [S, 3] that make slope · ρ + offset [S, K, 3] fit coded colours best.
 
-    By iteratively reweighted least squares, a linear difference counting by the slope of the code.
+    By iteratively reweighted least squares, a linear difference counting by the slope of the code. Where a `paint`
+    [S, 3] is given it counts PULL times as much as what the photos say.
     """
     linear = decoded(observed)
     base = weights[..., None] * _code_slope(observed) ** 2
@@ -93,6 +98,8 @@ def best_color(slope: Tensor, offset: Tensor, observed: Tensor, weights: Tensor,
     for _ in range(rounds):
         each = base * trust
         color = (each * slope * (linear - offset)).sum(1) / (each * slope**2).sum(1).clamp_min(1e-9)
+        if paint is not None:
+            color = (color + PULL * paint) / (1 + PULL)
         color = color.clamp(0, BRIGHTEST)
         off = residuals(slope * color[:, None] + offset, observed)
         trust = robust_weight(off)
@@ -202,6 +209,7 @@ class _Part:
         self.bounced = of_level(self.here.bounced)
         scale, bias = of_level(self.here.scale)[..., None], of_level(self.here.bias)[..., None]
         metallic = materials.metallic[rows][:, None, None]
+        self.paint = materials.color[rows]
         fresnel = DIELECTRIC * scale + bias
         self.of_diffuse = (1 - metallic) * (1 - fresnel)
         self.of_mirrored, self.of_tinted = (1 - metallic) * fresnel + metallic * bias, metallic * scale
@@ -212,7 +220,7 @@ class _Part:
         mirrored = torch.from_numpy(self.lobe @ blurred).reshape(self.observed.shape) + self.bounced
         diffuse = self.of_diffuse * self.here.diffuse(light)[:, None]
         slope, offset = diffuse + self.of_tinted * mirrored, self.of_mirrored * mirrored
-        color = best_color(slope, offset, self.observed, self.weights, rounds=2)
+        color = best_color(slope, offset, self.observed, self.weights, rounds=2, paint=self.paint)
         return slope * color[:, None] + offset, color
 
     def update(self, light: Tensor) -> Tensor:
@@ -241,7 +249,7 @@ class _Part:
 def radiance_of(
     reflection: Reflection, observed: Tensor, weights: Tensor, materials: Materials, light: Tensor
 ) -> Tensor:
-    """Radiance [S, K, 3] of the observations, with the base colours that fit best."""
+    """Radiance [S, K, 3] of the observations, with base colours that fit and are near `materials.color`."""
     return _Part(reflection, observed, weights, materials, torch.arange(len(observed))).radiance(light)[0]
 
 

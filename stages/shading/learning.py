@@ -12,8 +12,8 @@ from torch import Tensor
 from stages.light.environment import solid_angles
 from stages.light.ggx import ROUGHNESSES
 from stages.shading.exposures import balanced, exposures
-from stages.shading.few_materials import choose_few, heard, neighbors
-from stages.shading.fitting import LEVELS, Materials, decoded, find_light, grey_world, radiance_of, try_out
+from stages.shading.few_materials import choose_few, few_colors, heard, neighbors
+from stages.shading.fitting import BRIGHTEST, LEVELS, Materials, decoded, find_light, grey_world, radiance_of, try_out
 from stages.shading.observations import Observations
 from stages.shading.reflection import LIGHT_ROWS, Reflection
 
@@ -118,14 +118,15 @@ class _Turns:
         self.raw, self.weights = torch.from_numpy(observations.colors), torch.from_numpy(observations.weights)
         self.photos, self.num_photos = torch.from_numpy(observations.photos), num_photos
         shown = (self.raw * self.weights[..., None]).sum(1) / self.weights.sum(1, keepdim=True).clamp_min(1e-9)
-        self.near = neighbors(positions, shown.numpy())
+        self.shown, self.near = shown, neighbors(positions, shown.numpy())
 
     def start(self, metallic: float) -> _State:
         """A light that is the same from all sides, of which surfaces return half."""
         count = len(self.raw)
         mean = decoded(self.raw[self.weights > 0]).mean()
         light = torch.full((2 * LIGHT_ROWS**2, 3), 2 * float(mean))
-        materials = Materials(torch.zeros(count, 3), torch.full((count,), 0.3), torch.full((count,), metallic))
+        paints = torch.from_numpy(few_colors(decoded(self.shown).numpy())) / (2 * mean)
+        materials = Materials(paints.clamp(0, BRIGHTEST), torch.full((count,), 0.3), torch.full((count,), metallic))
         return _State(light, materials, torch.ones(self.num_photos))
 
     def turn(self, state: _State, expose: bool = False) -> _State:
@@ -139,9 +140,8 @@ class _Turns:
         chosen, which = choose_few(heard(costs.numpy(), self.near))
         best = torch.tensor(chosen)[torch.from_numpy(which)]
         rows = torch.arange(len(best))
-        materials = Materials(
-            colors.flatten(1, 2)[rows, best], torch.tensor(ROUGHNESSES)[best % LEVELS], (best // LEVELS).float()
-        )
+        paints = torch.from_numpy(few_colors(colors.flatten(1, 2)[rows, best].numpy()))
+        materials = Materials(paints, torch.tensor(ROUGHNESSES)[best % LEVELS], (best // LEVELS).float())
         gains = state.gains
         if expose:
             radiance = radiance_of(self.reflection, observed, self.weights, materials, light)
