@@ -169,7 +169,7 @@ def describe_view(
             **view3d.pack_scene(scene, captions, advice.views if advice else (), shown),
             "region": view3d.pack_region(scene, place, region),
             "overlays": overlays,
-            "dense": cloud and view3d.pack_dense(cloud, scene),
+            "dense": None if cloud is None else view3d.pack_dense(cloud, scene),
         },
         "three": THREE.read_text(encoding="utf-8"),
     }

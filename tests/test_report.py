@@ -28,6 +28,7 @@ from stages.engine.stage import StageContext
 from stages.engine.workspace import Record
 from stages.geometry.normalisation import rotation_onto
 from stages.geometry.place import ControlMark, ControlPoint, Place, given_region
+from stages.geometry.point_cloud import PointCloud
 from stages.geometry.similarity import Similarity
 from stages.geometry.up import y_up_rotation
 from stages.report import THREE, region_corners
@@ -308,6 +309,11 @@ def test_points_that_a_small_region_leaves_out_are_drawn(full):
     many = packed_times(100)
     assert many["points_each"] == 3
     assert len(decode(many["points"]["positions"], "<u2", 3)) == pytest.approx(98_000 / 3, abs=1)
+
+
+def test_a_set_without_a_single_dense_point_has_a_report(full):
+    artifacts.POINT_CLOUD.save(full.inputs["densify"], PointCloud.empty())
+    assert 'data-layer="dense"' not in page(full)
 
 
 def test_trusted_dense_points_are_packed_with_their_colours(full, monkeypatch):
