@@ -8,7 +8,7 @@ from stages.artifacts.artifact import place_artifact
 MATERIAL_COLOR = place_artifact("materials", "base_color.png", optional=True)
 # 8-bit linear RGB: occlusion, roughness and metalness, as glTF packs them.
 ORM = place_artifact("materials", "orm.png", optional=True)
-# 8-bit grey, what the photos tell of each texel, see `stages.shading.telling.Told`.
+# 8-bit grey, what the photos tell of each texel, see `stages.shading.texels.Told`.
 KNOWN = place_artifact("materials", "known.png", optional=True)
 # The light as an environment map in the frame of the GLB, see `stages.light.environment`; float32 and RGBE.
 LIGHT = place_artifact("materials", "light.exr", optional=True)

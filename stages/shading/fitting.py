@@ -8,8 +8,8 @@ once the materials are:
     metal:     (ρ scale + bias) s
 
 E: what a white matte point shows, s: what the lobe sees. So roughness and metalness are tried out on a grid, with the
-best ρ for each in closed form; the light is found by descent on its logarithm with ρ following in closed form
-(variable projection: at the best ρ its own gradient is none). Colours are compared as the eye does, coded as sRGB; what
+best ρ for each in closed form; the light is found by steps that multiply it (ISRA), with ρ following in closed form as
+in variable projection. Colours are compared as the eye does, coded as sRGB; what
 a photo shows clipped agrees with all that is brighter.
 """
 
@@ -32,6 +32,8 @@ SPREAD = 0.04
 CLIPPED = 0.98
 # A point's base colour is not its own while the light is searched, or it would explain all shading.
 PULL = 2.0
+# What agrees with a clipped photo says nothing of a base colour but where there is no other.
+FAINT = 1e-4
 # Base colours of real things end here: fresh snow, silver.
 BRIGHTEST = 0.95
 
@@ -88,21 +90,26 @@ def best_color(
 ) -> Tensor:
     """Base colours [S, 3] that make slope · ρ + offset [S, K, 3] fit coded colours best.
 
-    By iteratively reweighted least squares, a linear difference counting by the slope of the code. Where a `paint`
-    [S, 3] is given it counts PULL times as much as what the photos say.
+    By iteratively reweighted least squares, a linear difference counting by the slope of the code; a clipped photo counts
+    where it shows more than the model, not where it agrees. Where a `paint` [S, 3] is given it counts PULL times as
+    much as what the photos say.
     """
-    linear = decoded(observed)
+    wanted = decoded(observed)
     base = weights[..., None] * _code_slope(observed) ** 2
-    trust = torch.ones_like(slope)
+    clipped = observed >= CLIPPED
+    trust = torch.where(clipped, FAINT, 1.0)
     color = torch.zeros_like(slope[:, 0])
     for _ in range(rounds):
         each = base * trust
-        color = (each * slope * (linear - offset)).sum(1) / (each * slope**2).sum(1).clamp_min(1e-9)
+        color = (each * slope * (wanted - offset)).sum(1) / (each * slope**2).sum(1).clamp_min(1e-9)
         if paint is not None:
             color = (color + PULL * paint) / (1 + PULL)
         color = color.clamp(0, BRIGHTEST)
-        off = residuals(slope * color[:, None] + offset, observed)
-        trust = robust_weight(off)
+        predicted = slope * color[:, None] + offset
+        off = residuals(predicted, observed)
+        agrees = clipped & (off == 0)
+        wanted = torch.where(agrees, predicted, decoded(observed))
+        trust = torch.where(agrees, FAINT, robust_weight(off))
     return color
 
 
