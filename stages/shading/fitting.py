@@ -90,9 +90,9 @@ def best_color(
 ) -> Tensor:
     """Base colours [S, 3] that make slope · ρ + offset [S, K, 3] fit coded colours best.
 
-    By iteratively reweighted least squares, a linear difference counting by the slope of the code; a clipped photo counts
-    where it shows more than the model, not where it agrees. Where a `paint` [S, 3] is given it counts PULL times as
-    much as what the photos say.
+    By iteratively reweighted least squares, a linear difference counting by the slope of the code; a clipped photo
+    counts where it shows more than the model, not where it agrees. Where a `paint` [S, 3] is given it counts PULL times
+    as much as what the photos say.
     """
     wanted = decoded(observed)
     base = weights[..., None] * _code_slope(observed) ** 2
