@@ -87,7 +87,8 @@ def _crowded(features: np.ndarray) -> np.ndarray:
 
     some = features[:: max(len(features) // 1000, 1)]
     crowd = np.array([len(near) for near in cKDTree(some).query_ball_point(some, SAME)])
-    left, centers = np.ones(len(some), dtype=bool), []
+    left = np.ones(len(some), dtype=bool)
+    centers: list[np.ndarray] = []
     while left.any() and len(centers) < MOST_PAINTS:
         center = some[np.argmax(np.where(left, crowd, -1))]
         centers.append(center)
