@@ -311,6 +311,12 @@ class MaterialsParams(Section):
     enabled: bool = Field(
         False, description="learn base colour without light in it, roughness, metalness, and the light of the photos"
     )
+    light_turn: float | None = Field(
+        None,
+        ge=-360,
+        le=360,
+        description="degrees by which the light that is given is turned about the vertical; null: it is searched for",
+    )
 
 
 class ExportParams(Section):

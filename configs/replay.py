@@ -10,14 +10,14 @@ from configs.dotted import flatten
 from configs.load import load_config, preset_names
 from configs.params import Config
 
-OPTIONS = {"masks": "--masks", "poses": "--poses", "control points": "--control"}
+OPTIONS = {"masks": "--masks", "poses": "--poses", "control points": "--control", "light": "--light"}
 
 
 def replay_command(sources: Mapping[str, str | None], preset: str | None, config: Config, workspace: str) -> str:
     """`hineus run ...`, quoted for a shell, into a new workspace.
 
     Args:
-        sources: "photos", "masks", "poses" and "control points" -> path, None where not given.
+        sources: "photos", "masks", "poses", "control points" and "light" -> path, None where not given.
         preset: the settings started from it; one that is not known (any more) is replaced by `cpu`.
         config: all settings; those that the preset does not give are spelled out.
         workspace: folder of the new run.

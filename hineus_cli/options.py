@@ -110,6 +110,15 @@ Control = Annotated[
     ),
 ]
 NoControl = Annotated[bool, typer.Option("--no-control", help="Forget the ground control points of the last run.")]
+Light = Annotated[
+    Path | None,
+    typer.Option(
+        help="The light that the photos were taken in, where it was captured: an equirectangular .hdr or .exr. "
+        "Materials are learned with it: sets materials.enabled.",
+        show_default=False,
+    ),
+]
+NoLight = Annotated[bool, typer.Option("--no-light", help="Forget the light of the last run and learn it.")]
 Preset = Annotated[
     str | None,
     typer.Option(
@@ -198,6 +207,7 @@ def settings(
     moving_object: bool = False,
     masks: Path | None = None,
     relightable: bool = False,
+    light: Path | None = None,
 ) -> tuple[str, ...]:
     """Those of --set, then what other options stand for; an option that was not given says nothing."""
     chosen = masks is not None or any(text.startswith("ingest.auto_mask=") for text in sets or ())
@@ -206,7 +216,7 @@ def settings(
         HOLD_OUT: hold_out,
         "cleanup.remove_ground": no_ground or None,
         "cleanup.keep_closed": watertight or None,
-        "materials.enabled": relightable or None,
+        "materials.enabled": relightable or light is not None or None,
         "sfm.deterministic": deterministic or None,
         "sfm.masks": "always" if moving_object else None,
         "undistort.masks": "alone" if moving_object else None,
@@ -230,6 +240,8 @@ def of_a_run(
     no_poses: NoPoses = False,
     control: Control = None,
     no_control: NoControl = False,
+    light: Light = None,
+    no_light: NoLight = False,
     preset: Preset = None,
     config: ConfigFile = None,
     sets: Sets = None,
@@ -254,6 +266,8 @@ def of_a_run(
         no_poses=no_poses,
         control=control,
         no_control=no_control,
+        light=light,
+        no_light=no_light,
         preset=preset,
         config=config,
         sets=settings(
@@ -268,6 +282,7 @@ def of_a_run(
             moving_object,
             masks,
             relightable,
+            light,
         ),
         device=device,
         workers=workers,

@@ -1,10 +1,14 @@
-"""Photos, mesh and texture to what the surface is made of, and the light it was photographed in."""
+"""Photos, mesh and texture to what the surface is made of, and the light it was photographed in.
+
+The light is learned, too, unless it is given.
+"""
 
 from __future__ import annotations
 
+import logging
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -28,6 +32,12 @@ from stages.artifacts import (
 )
 from stages.engine.stage import Stage, StageContext
 from stages.errors import ReconstructionError
+from stages.files.light_files import GIVEN_LIGHT
+
+if TYPE_CHECKING:
+    from stages.shading.given_light import GivenLight, Placed
+
+log = logging.getLogger(__name__)
 
 # Points that materials and light are learned at, and photos that a point must be seen in.
 POINTS, FEWEST_VIEWS = 6000, 3
@@ -53,6 +63,7 @@ def run(context: StageContext[MaterialsParams]) -> dict[str, Any]:
     from stages.texture.prepared_views import PreparedViews
 
     torch.set_num_threads(context.workers)
+    given = _given_light(context)
     photos, held_out, scene = context.read(PINHOLE_PHOTOS), context.read(HELD_OUT), context.read(SCENE)
     cameras = scene.cameras.select([i for i, name in enumerate(scene.cameras.names) if name not in held_out])
     light_from_scene = gltf_from_scene(scene, context.read(WORLD_PLACE)).rotation
@@ -81,7 +92,7 @@ def run(context: StageContext[MaterialsParams]) -> dict[str, Any]:
         reflected = reflection(seen, normals, around, light_from_scene)
         learned = learn(
             seen, reflected, positions, len(cameras),
-            lambda done, total: tell(3 + 4 * done / total, 10, "materials and light in turn"),
+            lambda done, total: tell(3 + 4 * done / total, 10, "materials and light in turn"), given,
         )  # fmt: skip
         tell(7, 10, "base colour of each texel")
         points = Points(positions, normals, baked[chosen].astype(np.float32) / 255, around)
@@ -97,9 +108,11 @@ def run(context: StageContext[MaterialsParams]) -> dict[str, Any]:
     write_png(context.to_write(MATERIAL_COLOR), pad_charts(*texels.paint(as_bytes(found.color)))[0])
     write_png(context.to_write(ORM), pad_charts(*texels.paint(orm))[0])
     write_png(context.to_write(KNOWN), texels.paint(found.told[:, None])[0][..., 0])
-    write_exr(context.to_write(LIGHT), learned.light)
-    write_hdr(context.to_write(LIGHT_HDR), learned.light)
-    write_json(context.to_write(LIGHT_HARMONICS), harmonics_json(learned.light))
+    placed = learned.placed
+    light = learned.light if given is None or placed is None else given.written(placed)
+    write_exr(context.to_write(LIGHT), light)
+    write_hdr(context.to_write(LIGHT_HDR), light)
+    write_json(context.to_write(LIGHT_HARMONICS), harmonics_json(light))
     shares = np.bincount(found.which, minlength=len(learned.materials)) / max(len(found.which), 1)
     return {
         "materials": [
@@ -111,10 +124,33 @@ def run(context: StageContext[MaterialsParams]) -> dict[str, Any]:
             }
             for share, material in zip(shares, learned.materials, strict=True)
         ],
-        "light_max_over_mean": round(float(learned.light.max() / learned.light.mean()), 2),
+        "light_max_over_mean": round(float(light.max() / light.mean()), 2),
+        **({} if placed is None else _placed_numbers(placed)),
         "gain_min": round(float(learned.gains.min()), 4),
         "gain_max": round(float(learned.gains.max()), 4),
         "cost": round(learned.cost, 4),
+    }
+
+
+def _given_light(context: StageContext[MaterialsParams]) -> GivenLight | None:
+    from stages.files.light_files import read_light
+    from stages.shading.given_light import GivenLight
+
+    file = context.sources.get(GIVEN_LIGHT)
+    return None if file is None else GivenLight(read_light(file), context.params.light_turn)
+
+
+def _placed_numbers(placed: Placed) -> dict[str, Any]:
+    """How the light that was given lies, told to who cannot rely on it, too."""
+    if not placed.told:
+        log.warning(
+            "The photos do not tell how the light that was given is turned about the vertical: other turns than "
+            "%.0f degrees explain them as well. If you know it: `--set materials.light_turn=DEGREES`.", placed.degrees,
+        )  # fmt: skip
+    return {
+        "light_turn_deg": round(placed.degrees, 2),
+        "light_turn_told": placed.told,
+        "light_scale": float(f"{placed.scale:.4g}"),
     }
 
 
@@ -144,6 +180,7 @@ MATERIALS: Stage[MaterialsParams] = Stage(
     version=1,
     settings=lambda config: config.materials,
     run=run,
+    sources=(GIVEN_LIGHT,),
     reads=(PINHOLE_PHOTOS, HELD_OUT, SCENE, WORLD_PLACE, ATLAS_MESH, BASE_COLOR, OCCLUSION),
     writes=(MATERIAL_COLOR, ORM, KNOWN, LIGHT, LIGHT_HDR, LIGHT_HARMONICS),
     summary="texture + photos -> base colour, roughness, metalness, light",

@@ -24,6 +24,7 @@ from stages.capture.salient import INSTALL, find_weights
 from stages.capture.selection import Sources
 from stages.engine.fingerprint import file_sha256
 from stages.errors import InputError
+from stages.files.light_files import GIVEN_LIGHT, read_light
 from stages.limits import available_memory, nearest_existing
 from stages.posing.control_files import CONTROL, read_control
 from stages.posing.marks import foresee
@@ -140,11 +141,11 @@ def preflight(
     """Look at the photos, and at the memory and the disk of `folder`, where the workspace will lie.
 
     `decode`: whether to judge the photos' pixels, too; before a run that is left to ingest, which decodes them anyway.
-    `sources`: by name the photos, masks, known poses and control points that are given. `digests`: of photos whose
-    sha256 is known.
+    `sources`: by name the photos, masks, known poses, control points and light that are given. `digests`: of photos
+    whose sha256 is known.
 
     Raises:
-        InputError: there is no such folder or video, or the poses or control points cannot be used.
+        InputError: there is no such folder or video, or the poses, control points or light cannot be used.
         ConfigError, SystemRequirementError: the points' coordinates cannot be converted.
     """
 
@@ -176,6 +177,8 @@ def preflight(
         sizes = {photo.source: (photo.width, photo.height) for photo in seen.photos}
         more, doubts = foresee(found, found.system(config.place.control_epsg), sizes)
         refusals, warnings = refusals + more, warnings + doubts
+    if (light := sources.get(GIVEN_LIGHT)) is not None:
+        read_light(light)
     if needs.memory_gib > memory:
         shortages.append(
             f"It may take {needs.memory_gib:.1f} GiB of memory, {memory:.1f} are free: close other programs, or try "

@@ -24,6 +24,7 @@ from stages.engine.runner import Listener, StageOutcome, naming_command, run_pip
 from stages.engine.stage import Stage
 from stages.engine.workspace import Workspace, storage_errors
 from stages.errors import ConfigError, InputError, SystemRequirementError, WorkspaceError
+from stages.files.light_files import GIVEN_LIGHT
 from stages.inputs.bounded import reason
 from stages.inputs.folders import is_workspace
 from stages.kept import what_is_kept
@@ -174,7 +175,7 @@ def _check_paths(request: Request) -> None:
     Raises:
         InputError: a path that is given leads nowhere: it is too long, a link in a circle, or may not be looked at.
     """
-    for path in (request.photos, request.masks, request.poses, request.control, request.workspace):
+    for path in (request.photos, request.masks, request.poses, request.control, request.light, request.workspace):
         try:
             if path is not None:
                 path.exists()
@@ -213,12 +214,12 @@ def choose_photos(request: Request, workspace: Workspace) -> Path:
 
 
 def choose_sources(request: Request, workspace: Workspace, digests: SourceDigests) -> dict[str, Path | None]:
-    """Photos (those of `digests`), masks, poses and control points: those given, else those of the last run.
+    """Photos (those of `digests`), masks, poses, control points and light: those given, else those of the last run.
 
     Masks that the poses' format comes with are used, too.
 
     Raises:
-        InputError: the masks, poses or control points that are given are not there.
+        InputError: the masks, poses, control points or the light that are given are not there.
         ConfigError: masks are given and not wanted.
         WorkspaceError: the workspace was made of other photos.
     """
@@ -235,19 +236,23 @@ def choose_sources(request: Request, workspace: Workspace, digests: SourceDigest
         )
     if request.control is not None and not request.control.exists():
         raise InputError(f"There are no control points at {request.control}.", "Check the path with `ls`.")
+    if request.light is not None and not request.light.exists():
+        raise InputError(f"There is no light {request.light}.", "Check the path with `ls`.")
     since = _photos_since(workspace, digests)
     if not request.other_photos:
         refuse_other_photos(workspace, photos, since)
     masks = request.masks.resolve() if request.masks else None
     poses = locate_poses(request.poses).resolve() if request.poses else None
     control = request.control.resolve() if request.control else None
+    light = request.light.resolve() if request.light else None
     if _are_those_of_the_last_run(workspace, photos, since):
         masks = masks or (None if request.no_masks else find_source(workspace, "masks", photos))
         poses = poses or (None if request.no_poses else find_source(workspace, "poses", photos))
         control = control or (None if request.no_control else find_source(workspace, CONTROL, photos))
+        light = light or (None if request.no_light else find_source(workspace, GIVEN_LIGHT, photos))
     if masks is None and request.poses:
         masks = _masks_of(poses, request.no_masks)
-    return {"photos": photos, "masks": masks, "poses": poses, CONTROL: control}
+    return {"photos": photos, "masks": masks, "poses": poses, CONTROL: control, GIVEN_LIGHT: light}
 
 
 def _are_those_of_the_last_run(workspace: Workspace, photos: Path, since: PhotosSince) -> bool:
@@ -272,8 +277,19 @@ def _tell_sources(request: Request, workspace: Workspace, sources: Mapping[str, 
     """Where the workspace is that was not named, and what has become of the last run's photos, masks and poses."""
     if request.workspace is None and request.photos is not None and (why := default_workspace(request.photos).why):
         log.info("workspace: %s (%s)", workspace.root, why)
-    given = {"photos": request.photos, "masks": request.masks, "poses": request.poses, CONTROL: request.control}
-    forgotten = {"masks": request.no_masks, "poses": request.no_poses, CONTROL: request.no_control}
+    given = {
+        "photos": request.photos,
+        "masks": request.masks,
+        "poses": request.poses,
+        CONTROL: request.control,
+        GIVEN_LIGHT: request.light,
+    }
+    forgotten = {
+        "masks": request.no_masks,
+        "poses": request.no_poses,
+        CONTROL: request.no_control,
+        GIVEN_LIGHT: request.no_light,
+    }
     for name, before in workspace.record.sources.items():
         now = sources.get(name)
         if before is None or forgotten.get(name) or (given.get(name) and name != "photos"):

@@ -20,7 +20,8 @@ from stages.engine.status import replaced_inputs
 from stages.engine.workspace import DISK_FULL, Workspace
 from stages.errors import ConfigError, InputError, WorkspaceError, did_you_mean
 from stages.geometry.up import gltf_from_scene
-from stages.light.built_in import LIGHTS, MEAN, mean_radiance
+from stages.light.built_in import LIGHTS, MEAN
+from stages.light.environment import mean_radiance
 from stages.materials import MATERIALS
 
 if TYPE_CHECKING:
@@ -225,10 +226,7 @@ def _given_light(name: str, opened: Workspace) -> tuple[np.ndarray, float] | Non
             f"--light {name[:40]} is neither known nor a file.", f"{hint}There are {', '.join(known)}; or name a file."
         )
     radiance = read_light(Path(name))
-    mean = mean_radiance(radiance)
-    if mean <= 0:
-        raise InputError(f"The light {name} is black everywhere.", "Name another file.")
-    return radiance, float(np.log2(MEAN / mean))
+    return radiance, float(np.log2(MEAN / mean_radiance(radiance)))
 
 
 def _learned_light(subject: Subject, opened: Workspace) -> np.ndarray:

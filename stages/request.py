@@ -20,6 +20,7 @@ class Request:
         masks: folder of masks; kept from the last run while the photos are the same, unless `no_masks`.
         poses: file or folder of known poses; kept like the masks, unless `no_poses`.
         control: file or folder of ground control points; kept like the masks, unless `no_control`.
+        light: environment map of the captured light; kept like the masks, unless `no_light`.
         preset, config, sets: layers of settings. With neither preset nor config, a workspace keeps its own.
         from_stage, until, force: see `run_pipeline`.
         device: "auto", "cpu" or "cuda".
@@ -35,6 +36,8 @@ class Request:
     no_poses: bool = False
     control: Path | None = None
     no_control: bool = False
+    light: Path | None = None
+    no_light: bool = False
     preset: str | None = None
     config: Path | None = None
     sets: Sequence[str] = ()

@@ -23,6 +23,7 @@ from stages.capture.inspection import Inspection, Video, inspect
 from stages.capture.photo_reading import read_head
 from stages.capture.selection import Sources
 from stages.errors import InputError
+from stages.files.light_files import write_hdr
 from stages.preflight import GIB, estimate, preflight
 
 SIZE = (320, 240)
@@ -341,6 +342,18 @@ def test_control_points_that_cannot_be_used_are_refused_before_a_run(photos: Pat
     file = gcp(photos, [row], "name;x;y;z;photo;px;py" if ";" in row else "name,x,y,z,photo,px,py")
     for command in (["check"], ["run", "--workspace", str(tmp_path / "ws")]):
         result = CliRunner().invoke(app, [*command, str(photos), "--control", file, "--preset", "tiny"])
+        assert result.exit_code == InputError.exit_code
+        assert text in " ".join(result.output.split())
+
+
+@pytest.mark.parametrize(("rows", "columns", "value", "text"), [(4, 4, 1, "twice as wide"), (4, 8, 0, "is black")])
+def test_a_light_that_cannot_be_used_is_refused_before_a_run(
+    photos: Path, tmp_path: Path, rows: int, columns: int, value: float, text: str
+):
+    write_hdr(tmp_path / "studio.hdr", np.full((rows, columns, 3), value))
+    for command in (["check"], ["run", "--workspace", str(tmp_path / "ws")]):
+        light = str(tmp_path / "studio.hdr")
+        result = CliRunner().invoke(app, [*command, str(photos), "--light", light, "--preset", "tiny"])
         assert result.exit_code == InputError.exit_code
         assert text in " ".join(result.output.split())
 

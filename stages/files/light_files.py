@@ -16,6 +16,7 @@ from stages.inputs.light_maps import EXPONENT, read_light_map
 from stages.inputs.texts import read_json
 from stages.light.harmonics import project
 
+GIVEN_LIGHT = "light"  # what a run calls this input
 HARMONICS = "real spherical harmonics"
 CONVENTION = {
     "frame": "that of the exported GLB: right-handed, +Y up",

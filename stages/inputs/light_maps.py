@@ -77,6 +77,8 @@ def _checked(radiance: np.ndarray) -> np.ndarray:
             row, column = np.unravel_index(int(np.argmax(bad)), bad.shape)
             values = ", ".join(f"{value:g}" for value in radiance[row, column])
             raise ValueError(f"{count} of its pixels {what}, the first in column {column}, row {row}: {values}")
+    if not radiance.any():
+        raise ValueError("it is black everywhere")
     return np.abs(radiance)  # minus zero becomes zero
 
 

@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from stages.light.environment import directions, resized, solid_angles
+from stages.light.environment import directions, mean_radiance, resized, solid_angles
 
 MEAN = 0.6
 # Each pixel is the mean of so many by so many.
@@ -100,11 +100,6 @@ def window(height: int) -> np.ndarray:
 
 
 LIGHTS: dict[str, Callable[[int], np.ndarray]] = {"studio": studio, "sun": sun, "window": window}
-
-
-def mean_radiance(radiance: np.ndarray) -> float:
-    """Of a map [H, 2 H, 3], over the sphere and its channels."""
-    return float((radiance.mean(2) * solid_angles(len(radiance))).sum() / (4 * np.pi))
 
 
 # ---------------------------------------------------------------- brushes

@@ -28,6 +28,11 @@ def solid_angles(height: int) -> np.ndarray:
     return np.repeat(rows[:, None], 2 * height, axis=1).astype(np.float32)
 
 
+def mean_radiance(radiance: np.ndarray) -> float:
+    """Of a map [H, 2 H, 3], over the sphere and its channels."""
+    return float((radiance.mean(2) * solid_angles(len(radiance))).sum() / (4 * np.pi))
+
+
 def bilinear(towards: np.ndarray, height: int) -> tuple[np.ndarray, np.ndarray]:
     """Which pixels of a map of `height` rows answer for directions, and with which weights.
 

@@ -181,18 +181,28 @@ def find_light(
     part of the points (ordered subsets, Hudson & Larkin 1994).
     """
     chosen = torch.from_numpy(np.random.default_rng(0).permutation(len(observed)))
-    parts = [_Part(reflection, observed, weights, materials, rows) for rows in chosen.chunk(subsets)]
+    parts = [Part(reflection, observed, weights, materials, rows) for rows in chosen.chunk(subsets)]
     for _ in range(rounds):
         for part in parts:
             light = smoothed(light * part.update(light), smoothness)
     return light, sum(part.cost(light) for part in parts) / len(parts)
 
 
-class _Part:
-    """Some of the points, with what does not change while the light does."""
+class Part:
+    """Some of the points, with what does not change while the light does.
+
+    `free`: their base colours are whatever fits, as where the light's shape is known; else they stay near
+    `materials.color`.
+    """
 
     def __init__(
-        self, reflection: Reflection, observed: Tensor, weights: Tensor, materials: Materials, rows: Tensor
+        self,
+        reflection: Reflection,
+        observed: Tensor,
+        weights: Tensor,
+        materials: Materials,
+        rows: Tensor,
+        free: bool = False,
     ) -> None:
         from scipy.sparse import csr_matrix
 
@@ -216,7 +226,7 @@ class _Part:
         self.bounced = of_level(self.here.bounced)
         scale, bias = of_level(self.here.scale)[..., None], of_level(self.here.bias)[..., None]
         metallic = materials.metallic[rows][:, None, None]
-        self.paint = materials.color[rows]
+        self.paint = None if free else materials.color[rows]
         fresnel = DIELECTRIC * scale + bias
         self.of_diffuse = (1 - metallic) * (1 - fresnel)
         self.of_mirrored, self.of_tinted = (1 - metallic) * fresnel + metallic * bias, metallic * scale
@@ -257,7 +267,7 @@ def radiance_of(
     reflection: Reflection, observed: Tensor, weights: Tensor, materials: Materials, light: Tensor
 ) -> Tensor:
     """Radiance [S, K, 3] of the observations, with base colours that fit and are near `materials.color`."""
-    return _Part(reflection, observed, weights, materials, torch.arange(len(observed))).radiance(light)[0]
+    return Part(reflection, observed, weights, materials, torch.arange(len(observed))).radiance(light)[0]
 
 
 def smoothed(light: Tensor, share: float) -> Tensor:

@@ -1,9 +1,9 @@
-"""Materials of points and the light on them, from nothing but what photos say: the loop over `fitting`."""
+"""Materials of points, and the light on them unless it is given, from what photos say: the loop over `fitting`."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -13,7 +13,18 @@ from stages.light.environment import solid_angles
 from stages.light.ggx import ROUGHNESSES
 from stages.shading.exposures import balanced, exposures
 from stages.shading.few_materials import choose_few, few_colors, heard, neighbors
-from stages.shading.fitting import BRIGHTEST, LEVELS, Materials, decoded, find_light, grey_world, radiance_of, try_out
+from stages.shading.fitting import (
+    BRIGHTEST,
+    LEVELS,
+    Materials,
+    Part,
+    decoded,
+    find_light,
+    grey_world,
+    radiance_of,
+    try_out,
+)
+from stages.shading.given_light import GivenLight, Placed
 from stages.shading.observations import Observations
 from stages.shading.reflection import LIGHT_ROWS, Reflection
 
@@ -55,6 +66,7 @@ class Learned:
         color: [S, 3] float32 linear base colours.
         gains: [N] factor on each photo's linear values.
         cost: of the fit, see `fitting.robust`.
+        placed: how the light that was given lies; None where none was.
     """
 
     light: np.ndarray
@@ -63,6 +75,7 @@ class Learned:
     color: np.ndarray
     gains: np.ndarray
     cost: float
+    placed: Placed | None = None
 
 
 @dataclass(frozen=True)
@@ -71,6 +84,7 @@ class _State:
     materials: Materials
     gains: Tensor
     cost: float = np.inf
+    placed: Placed | None = None
 
 
 def learn(
@@ -79,6 +93,7 @@ def learn(
     positions: np.ndarray,
     num_photos: int,
     tell: Callable[[int, int], None] = lambda done, total: None,
+    given: GivenLight | None = None,
 ) -> Learned:
     """Learn from S points.
 
@@ -89,9 +104,12 @@ def learn(
         positions: [S, 3].
         num_photos: N.
         tell: told (turns done, all turns).
+        given: the light, of which only turn and scale are to be found.
     """
     some = np.sort(np.random.default_rng(0).permutation(len(positions))[:MOST_POINTS])
-    turns = _Turns(observations.select(some), reflection.select(torch.from_numpy(some)), positions[some], num_photos)
+    turns = _Turns(
+        observations.select(some), reflection.select(torch.from_numpy(some)), positions[some], num_photos, given
+    )
     total = 2 * FIRST_TURNS + MORE_TURNS
     states: list[_State] = []
     for metallic in (0.0, 1.0):
@@ -104,7 +122,7 @@ def learn(
     for turn in range(MORE_TURNS):
         tell(2 * FIRST_TURNS + turn, total)
         state = turns.turn(state, expose=True)
-    everything = _Turns(observations, reflection, positions, num_photos)
+    everything = _Turns(observations, reflection, positions, num_photos, given)
     return everything.end(state)
 
 
@@ -112,29 +130,44 @@ class _Turns:
     """The loop's body, and what does not change in it."""
 
     def __init__(
-        self, observations: Observations, reflection: Reflection, positions: np.ndarray, num_photos: int
+        self,
+        observations: Observations,
+        reflection: Reflection,
+        positions: np.ndarray,
+        num_photos: int,
+        given: GivenLight | None,
     ) -> None:
-        self.reflection = reflection
+        self.reflection, self.given = reflection, given
         self.raw, self.weights = torch.from_numpy(observations.colors), torch.from_numpy(observations.weights)
         self.photos, self.num_photos = torch.from_numpy(observations.photos), num_photos
         shown = (self.raw * self.weights[..., None]).sum(1) / self.weights.sum(1, keepdim=True).clamp_min(1e-9)
         self.shown, self.near = shown, neighbors(positions, shown.numpy())
 
     def start(self, metallic: float) -> _State:
-        """A light that is the same from all sides, of which surfaces return half."""
+        """The light that was given, where it fits best; else one that is the same from all sides."""
         count = len(self.raw)
         mean = decoded(self.raw[self.weights > 0]).mean()
         light = torch.full((2 * LIGHT_ROWS**2, 3), 2 * float(mean))
         paints = torch.from_numpy(few_colors(decoded(self.shown).numpy())) / (2 * mean)
         materials = Materials(paints.clamp(0, BRIGHTEST), torch.full((count,), 0.3), torch.full((count,), metallic))
-        return _State(light, materials, torch.ones(self.num_photos))
+        placed = None
+        if self.given is not None:
+            placed = self.given.find(self.reflection, self.raw, self.weights, materials)
+            light = self.given.light(placed)
+        return _State(light, materials, torch.ones(self.num_photos), placed=placed)
 
     def turn(self, state: _State, expose: bool = False) -> _State:
         """Light from materials, materials from light and, where asked, gains from both."""
         some = torch.from_numpy(np.random.default_rng(0).permutation(len(self.raw))[:LIGHT_POINTS])
         of_some = Materials(*(values[some] for values in vars(state.materials).values()))
         observed = balanced(self.raw, state.gains, self.photos)
-        light, _ = find_light(self.reflection.select(some), observed[some], self.weights[some], of_some, state.light)
+        seen = self.reflection.select(some), observed[some], self.weights[some], of_some
+        placed = state.placed
+        if self.given is None or placed is None:
+            light, _ = find_light(*seen, state.light)
+        else:
+            placed = self.given.refined(Part(*seen, torch.arange(len(some)), free=True), placed)
+            light = self.given.light(placed)
         costs, colors = try_out(self.reflection, observed, self.weights, light)
         costs = costs.flatten(1)
         chosen, which = choose_few(heard(costs.numpy(), self.near))
@@ -146,7 +179,7 @@ class _Turns:
         if expose:
             radiance = radiance_of(self.reflection, observed, self.weights, materials, light)
             gains = gains * exposures(radiance, observed, self.weights, self.photos, self.num_photos)
-        return _State(light, materials, gains, float(costs[rows, best].mean()))
+        return _State(light, materials, gains, float(costs[rows, best].mean()), placed)
 
     def end(self, state: _State) -> Learned:
         """The materials of all points under the light that was found, and the conventions for what nothing tells."""
@@ -156,11 +189,14 @@ class _Turns:
         chosen, which = choose_few(shared)
         rows, best = torch.arange(len(which)), torch.tensor(chosen)[torch.from_numpy(which)]
         color = colors.flatten(1, 2)[rows, best]
-        light, color = grey_world(state.light, color, torch.from_numpy(solid_angles(LIGHT_ROWS).reshape(-1)))
+        light, placed = state.light, state.placed
+        if placed is None:
+            light, color = grey_world(light, color, torch.from_numpy(solid_angles(LIGHT_ROWS).reshape(-1)))
         metal = (best // LEVELS).bool()
         if bool(metal.all()):
             brightness = METAL / max(float(color.amax(1).median()), 1e-3)
             light, color = light / brightness, (color * brightness).clamp(max=1.0)
+            placed = None if placed is None else replace(placed, scale=placed.scale / brightness)
         found = tuple(_material(candidate, shared[which == k]) for k, candidate in enumerate(chosen))
         return Learned(
             light=light.reshape(LIGHT_ROWS, 2 * LIGHT_ROWS, 3).numpy(),
@@ -169,6 +205,7 @@ class _Turns:
             color=color.numpy(),
             gains=state.gains.numpy(),
             cost=float(costs.flatten(1)[rows, best].mean()),
+            placed=placed,
         )
 
 

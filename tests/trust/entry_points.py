@@ -76,7 +76,7 @@ def _setting(draw: DrawFn, tiny: Tiny, folder: Path) -> Commands:
 def _words(draw: DrawFn, tiny: Tiny, folder: Path) -> Commands:
     some_photos(tiny, folder)
     options = ("--region", "--time", "--hold-out", "--preset", "--device", "--workers", "--up", "--masks", "--poses",
-               "--control", "--from", "--until", "--force", "-w", "--config")  # fmt: skip
+               "--control", "--light", "--from", "--until", "--force", "-w", "--config")  # fmt: skip
     command = draw(st.sampled_from(("run", "check", "status", "config", "view", "evaluate", "no\x1b[31mne")))
     words = [command, *(("p", *TAKING_IN) if command == "run" else ())]
     for _ in range(draw(st.integers(1, 2))):
