@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from stages.shading.fitting import coded, decoded
+from stages.shading.fitting import CLIPPED, coded, decoded
 
 # Coded colours outside of this are clipped or drowned in noise.
 DARKEST, BRIGHTEST = 0.05, 0.95
@@ -17,8 +17,8 @@ _ROUNDS = 6
 
 
 def balanced(observed: Tensor, gains: Tensor, photos: Tensor) -> Tensor:
-    """Coded colours [S, K, 3] with each photo's gain [N] on its linear values; photos [S, K] int."""
-    return torch.where(observed >= 1.0, 1.0, coded(decoded(observed) * gains[photos][..., None]))
+    """Coded colours [S, K, 3] with the gains [N] of photos [S, K] (int) on linear values; clipped ones as they are."""
+    return torch.where(observed >= CLIPPED, observed, coded(decoded(observed) * gains[photos][..., None]))
 
 
 def exposures(radiance: Tensor, observed: Tensor, weights: Tensor, photos: Tensor, num_photos: int) -> Tensor:

@@ -34,6 +34,8 @@ FIRST_TURNS, MORE_TURNS = 4, 5
 MOST_POINTS, LIGHT_POINTS = 3000, 2000
 # Where all is metal nothing tells how bright light and surface are; a metal's brightest channel is then about this.
 METAL = 0.65
+# Else mirrored light tells, not well: the brightest twentieth of a thing is not brighter than white paint.
+WHITE = 0.8
 # A roughness is told where the next but one fits worse by this part.
 TOLD_MARGIN = 0.02
 
@@ -192,9 +194,12 @@ class _Turns:
         light, placed = state.light, state.placed
         if placed is None:
             light, color = grey_world(light, color, torch.from_numpy(solid_angles(LIGHT_ROWS).reshape(-1)))
-        metal = (best // LEVELS).bool()
-        if bool(metal.all()):
+        metal, brightness = bool((best // LEVELS).all()), 1.0
+        if metal:
             brightness = METAL / max(float(color.amax(1).median()), 1e-3)
+        elif placed is None:
+            brightness = min(WHITE / max(float(color.amax(1).quantile(0.95)), 1e-3), 1.0)
+        if brightness != 1.0:
             light, color = light / brightness, (color * brightness).clamp(max=1.0)
             placed = None if placed is None else replace(placed, scale=placed.scale / brightness)
         found = tuple(_material(candidate, shared[which == k]) for k, candidate in enumerate(chosen))
