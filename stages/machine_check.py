@@ -38,6 +38,7 @@ REQUIRED = {
     "numba": "numba",
     "pycolmap": "pycolmap",
     "open3d": "open3d",
+    "OpenEXR": "openexr",
     "pymeshlab": "pymeshlab",
     "trimesh": "trimesh",
     "manifold3d": "manifold3d",

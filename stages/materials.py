@@ -145,7 +145,7 @@ def _placed_numbers(placed: Placed) -> dict[str, Any]:
     if not placed.told:
         log.warning(
             "The photos do not tell how the light that was given is turned about the vertical: other turns than "
-            "%.0f degrees explain them as well. If you know it: `--set materials.light_turn=DEGREES`.", placed.degrees,
+            "%.0f degrees explain them as well. If you know it, say it: `--set materials.light_turn=90`.", placed.degrees,
         )  # fmt: skip
     return {
         "light_turn_deg": round(placed.degrees, 2),

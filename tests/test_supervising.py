@@ -71,6 +71,8 @@ def test_the_answer_is_json_too() -> None:
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_signals_are_passed_on(number: signal.Signals) -> None:
+    if signal.getsignal(number) == signal.SIG_IGN:
+        pytest.skip("ignored by whoever runs the tests, as Ctrl-C is in the background of a script")
     process = start(f"signal.signal({number:d}, lambda *_: os._exit(7)); print('on', flush=True); time.sleep(60)")
     assert process.stdout is not None
     assert process.stdout.readline() == "on\n"
