@@ -145,8 +145,9 @@ def _placed_numbers(placed: Placed) -> dict[str, Any]:
     if not placed.told:
         log.warning(
             "The photos do not tell how the light that was given is turned about the vertical: other turns than "
-            "%.0f degrees explain them as well. If you know it, say it: `--set materials.light_turn=90`.", placed.degrees,
-        )  # fmt: skip
+            "%.0f degrees explain them as well. If you know it, say it: `--set materials.light_turn=90`.",
+            placed.degrees,
+        )
     return {
         "light_turn_deg": round(placed.degrees, 2),
         "light_turn_told": placed.told,
