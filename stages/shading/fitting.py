@@ -91,8 +91,8 @@ def best_color(
     """Base colours [S, 3] that make slope · ρ + offset [S, K, 3] fit coded colours best.
 
     By iteratively reweighted least squares, a linear difference counting by the slope of the code; a clipped photo
-    counts where it shows more than the model, not where it agrees. Where a `paint` [S, 3] is given it counts PULL times
-    as much as what the photos say.
+    counts where it shows more than the model, not where it agrees. Where a `paint` [S, 3] is given its
+    brightness counts PULL times as much as theirs, for shading leaves the ratio of the channels.
     """
     wanted = decoded(observed)
     base = weights[..., None] * _code_slope(observed) ** 2
@@ -103,7 +103,8 @@ def best_color(
         each = base * trust
         color = (each * slope * (wanted - offset)).sum(1) / (each * slope**2).sum(1).clamp_min(1e-9)
         if paint is not None:
-            color = (color + PULL * paint) / (1 + PULL)
+            own = color.mean(1, keepdim=True).clamp_min(1e-6)
+            color = color * (own + PULL * paint.mean(1, keepdim=True)) / ((1 + PULL) * own)
         color = color.clamp(0, BRIGHTEST)
         predicted = slope * color[:, None] + offset
         off = residuals(predicted, observed)
