@@ -91,12 +91,14 @@ def test_one_wrong_photo_moves_the_best_colour_little_and_an_unseen_one_not_at_a
     torch.testing.assert_close(best_color(slope, offset, observed, weights), color, atol=1e-4, rtol=1e-3)
 
 
-def test_a_paint_pulls_the_colour_to_itself():
+def test_a_paint_pulls_the_brightness_to_its_own_and_leaves_the_ratio_of_the_channels():
     slope, offset, color = linear_model()
     observed = coded(slope * color[:, None] + offset)
     paint = torch.full_like(color, 0.3)
     pulled = best_color(slope, offset, observed, torch.ones(6, 9), rounds=1, paint=paint)
-    torch.testing.assert_close(pulled, (color + PULL * paint) / (1 + PULL), atol=1e-4, rtol=1e-3)
+    brightness = (color.mean(1) + PULL * 0.3) / (1 + PULL)
+    expected = color * (brightness / color.mean(1))[:, None]
+    torch.testing.assert_close(pulled, expected.clamp(max=BRIGHTEST), atol=1e-4, rtol=1e-3)
 
 
 def test_a_highlight_that_clips_does_not_darken_the_colour():
