@@ -157,12 +157,14 @@ def _placed_numbers(placed: Placed) -> dict[str, Any]:
 
 def _read_image(path: Path) -> np.ndarray:
     """[H, W, 3] uint8 RGB of an image of our own."""
-    import cv2
+    from stages.reporting.pictures import read_rgb
 
-    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
-    if image is None:
-        raise ReconstructionError(f"{path} cannot be read.", "Make it anew: `hineus run PHOTOS --from bake`.")
-    return np.ascontiguousarray(image[..., ::-1])
+    try:
+        return read_rgb(path)
+    except ValueError as error:
+        raise ReconstructionError(
+            f"{path} cannot be read.", "Make it anew: `hineus run PHOTOS --from bake`."
+        ) from error
 
 
 def _occlusion(path: Path, size: int) -> np.ndarray:

@@ -10,8 +10,9 @@ from lit_sphere import PLASTIC, ROWS, LitSphere, lamps, lit_sphere, nothing_arou
 from stages.geometry.vectors import unit
 from stages.light import ggx
 from stages.light.environment import directions, look_up, solid_angles
+from stages.light.ggx import blur, blur_back
 from stages.shading.observations import Observations
-from stages.shading.reflection import Reflection, blur, blur_back, reflection
+from stages.shading.reflection import Reflection, reflection
 from stages.shading.surroundings import Surroundings
 
 TURN = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # from z up to y up

@@ -53,9 +53,17 @@ def lobe_matrices(rows_out: int, rows_in: int) -> np.ndarray:
 def blurred(radiance: np.ndarray) -> np.ndarray:
     """A map [H, 2 H, 3] blurred by each of ROUGHNESSES [R, H, 2 H, 3]."""
     height = len(radiance)
-    flat = radiance.reshape(-1, 3)
-    levels = [lobe_matrix(roughness, height, height) @ flat for roughness in ROUGHNESSES]
-    return np.stack(levels).reshape(len(ROUGHNESSES), *radiance.shape)
+    return blur(lobe_matrices(height, height), radiance.reshape(-1, 3)).reshape(len(ROUGHNESSES), *radiance.shape)
+
+
+def blur(lobes: np.ndarray, light: np.ndarray) -> np.ndarray:
+    """A light [P, 3] blurred by lobes [R, P, P]: [R, P, 3]."""
+    return np.stack([lobe @ light for lobe in lobes])
+
+
+def blur_back(lobes: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """The transposed `blur`: [P, 3] from [R, P, 3]."""
+    return np.sum([lobe.T @ each for lobe, each in zip(lobes, values, strict=True)], axis=0)
 
 
 @cache

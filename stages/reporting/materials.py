@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 
 from stages.drawing.tone_mapping import on_screen
+from stages.errors import InputError
+from stages.files.light_files import read_light
 from stages.reporting.pictures import jpeg_uri, read_rgb, shrink
 
 MAP_SIDE = 512
@@ -43,11 +45,11 @@ def light_picture(file: Path) -> str | None:
     """An environment map, exposed by its mean and tone-mapped, as a data URI; None where it is missing or damaged."""
     import cv2
 
-    found = cv2.imdecode(np.frombuffer(file.read_bytes(), np.uint8), cv2.IMREAD_UNCHANGED) if file.exists() else None
-    if found is None or found.dtype != np.float32 or found.ndim != 3:
+    try:
+        found = read_light(file)
+    except InputError:
         return None
-    exposure = np.log2(MIDDLE_GREY / max(float(found.mean()), 1e-9))
-    shown = (255 * on_screen(cv2.cvtColor(found, cv2.COLOR_BGR2RGB), exposure) + 0.5).astype(np.uint8)
+    shown = (255 * on_screen(found, np.log2(MIDDLE_GREY / float(found.mean()))) + 0.5).astype(np.uint8)
     return jpeg_uri(cv2.resize(shown, (LIGHT_WIDTH, LIGHT_WIDTH // 2), interpolation=cv2.INTER_LINEAR))
 
 

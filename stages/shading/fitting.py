@@ -9,8 +9,8 @@ once the materials are:
 
 E: what a white matte point shows, s: what the lobe sees. So roughness and metalness are tried out on a grid, with the
 best ρ for each in closed form; the light is found by steps that multiply it (ISRA), with ρ following in closed form as
-in variable projection. Colours are compared as the eye does, coded as sRGB; what
-a photo shows clipped agrees with all that is brighter.
+in variable projection. Colours are compared as the eye does, coded as sRGB; what a photo shows clipped agrees with all
+that is brighter.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from stages.light.ggx import DIELECTRIC, ROUGHNESSES
+from stages.light.ggx import DIELECTRIC, ROUGHNESSES, blur, blur_back
 from stages.neural.radiance import encoded_srgb
-from stages.shading.reflection import LIGHT_ROWS, Reflection, blur, blur_back
+from stages.shading.reflection import LIGHT_ROWS, Reflection
 
 LEVELS = len(ROUGHNESSES)
 # Coded colours differ by so much for reasons of their own: noise, poses, normals.
@@ -171,8 +171,8 @@ def find_light(
     rounds: int = 4,
     subsets: int = 6,
     smoothness: float = 0.02,
-) -> tuple[Tensor, float]:
-    """The light [P, 3] that fits best, from a start that is nowhere 0, and the fit's cost.
+) -> Tensor:
+    """The light [P, 3] that fits best, from a start that is nowhere 0.
 
     The radiance of the observations is A L + b with A >= 0, and base colours follow in closed form. L takes steps
 
@@ -186,7 +186,7 @@ def find_light(
     for _ in range(rounds):
         for part in parts:
             light = smoothed(light * part.update(light), smoothness)
-    return light, sum(part.cost(light) for part in parts) / len(parts)
+    return light
 
 
 class Part:

@@ -81,6 +81,27 @@ class Learned:
 
 
 @dataclass(frozen=True)
+class _Choice:
+    """Of the candidates of `fitting.try_out`, 2 R of them.
+
+    Attributes:
+        chosen: the few.
+        which: [S] a place among them for each point.
+        best: [S] the candidate of each.
+        color: [S, 3] the base colour of each with it.
+        shared: [S, 2 R] costs of all, heard among neighbours.
+        cost: mean cost of the best.
+    """
+
+    chosen: list[int]
+    which: np.ndarray
+    best: Tensor
+    color: Tensor
+    shared: np.ndarray
+    cost: float
+
+
+@dataclass(frozen=True)
 class _State:
     light: Tensor
     materials: Materials
@@ -166,35 +187,26 @@ class _Turns:
         seen = self.reflection.select(some), observed[some], self.weights[some], of_some
         placed = state.placed
         if self.given is None or placed is None:
-            light, _ = find_light(*seen, state.light)
+            light = find_light(*seen, state.light)
         else:
             placed = self.given.refined(Part(*seen, torch.arange(len(some)), free=True), placed)
             light = self.given.light(placed)
-        costs, colors = try_out(self.reflection, observed, self.weights, light)
-        costs = costs.flatten(1)
-        chosen, which = choose_few(heard(costs.numpy(), self.near))
-        best = torch.tensor(chosen)[torch.from_numpy(which)]
-        rows = torch.arange(len(best))
-        paints = torch.from_numpy(few_colors(colors.flatten(1, 2)[rows, best].numpy()))
-        materials = Materials(paints, torch.tensor(ROUGHNESSES)[best % LEVELS], (best // LEVELS).float())
+        choice = self._choose(observed, light)
+        paints = torch.from_numpy(few_colors(choice.color.numpy()))
+        materials = Materials(paints, torch.tensor(ROUGHNESSES)[choice.best % LEVELS], (choice.best // LEVELS).float())
         gains = state.gains
         if expose:
             radiance = radiance_of(self.reflection, observed, self.weights, materials, light)
             gains = gains * exposures(radiance, observed, self.weights, self.photos, self.num_photos)
-        return _State(light, materials, gains, float(costs[rows, best].mean()), placed)
+        return _State(light, materials, gains, choice.cost, placed)
 
     def end(self, state: _State) -> Learned:
         """The materials of all points under the light that was found, and the conventions for what nothing tells."""
-        observed = balanced(self.raw, state.gains, self.photos)
-        costs, colors = try_out(self.reflection, observed, self.weights, state.light)
-        shared = heard(costs.flatten(1).numpy(), self.near)
-        chosen, which = choose_few(shared)
-        rows, best = torch.arange(len(which)), torch.tensor(chosen)[torch.from_numpy(which)]
-        color = colors.flatten(1, 2)[rows, best]
-        light, placed = state.light, state.placed
+        choice = self._choose(balanced(self.raw, state.gains, self.photos), state.light)
+        light, placed, color = state.light, state.placed, choice.color
         if placed is None:
             light, color = grey_world(light, color, torch.from_numpy(solid_angles(LIGHT_ROWS).reshape(-1)))
-        metal, brightness = bool((best // LEVELS).all()), 1.0
+        metal, brightness = bool((choice.best // LEVELS).all()), 1.0
         if metal:
             brightness = METAL / max(float(color.amax(1).median()), 1e-3)
         elif placed is None:
@@ -202,16 +214,28 @@ class _Turns:
         if brightness != 1.0:
             light, color = light / brightness, (color * brightness).clamp(max=1.0)
             placed = None if placed is None else replace(placed, scale=placed.scale / brightness)
-        found = tuple(_material(candidate, shared[which == k]) for k, candidate in enumerate(chosen))
+        found = tuple(
+            _material(candidate, choice.shared[choice.which == k]) for k, candidate in enumerate(choice.chosen)
+        )
         return Learned(
             light=light.reshape(LIGHT_ROWS, 2 * LIGHT_ROWS, 3).numpy(),
             materials=found,
-            which=which,
+            which=choice.which,
             color=color.numpy(),
             gains=state.gains.numpy(),
-            cost=float(costs.flatten(1)[rows, best].mean()),
+            cost=choice.cost,
             placed=placed,
         )
+
+    def _choose(self, observed: Tensor, light: Tensor) -> _Choice:
+        """The few candidates that explain all points best."""
+        costs, colors = try_out(self.reflection, observed, self.weights, light)
+        costs = costs.flatten(1)
+        shared = heard(costs.numpy(), self.near)
+        chosen, which = choose_few(shared)
+        best = torch.tensor(chosen)[torch.from_numpy(which)]
+        rows = torch.arange(len(best))
+        return _Choice(chosen, which, best, colors.flatten(1, 2)[rows, best], shared, float(costs[rows, best].mean()))
 
 
 def _material(candidate: int, costs: np.ndarray) -> Material:

@@ -58,19 +58,9 @@ class Reflection:
 
     def mirrored(self, light: Tensor) -> Tensor:
         """What the lobes see of a light [P, 3]: [S, K, R, 3]."""
-        blurred = torch.from_numpy(blur(self.lobes, light.numpy())).transpose(0, 1)  # [P, R, 3]
+        blurred = torch.from_numpy(ggx.blur(self.lobes, light.numpy())).transpose(0, 1)  # [P, R, 3]
         seen = torch.einsum("skf,skfrc->skrc", self.shares, blurred[self.pixels])
         return seen * self.open[..., None] + self.bounced
-
-
-def blur(lobes: np.ndarray, light: np.ndarray) -> np.ndarray:
-    """A light [P, 3] blurred by lobes [R, P, P]: [R, P, 3]."""
-    return np.stack([lobe @ light for lobe in lobes])
-
-
-def blur_back(lobes: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """The transposed `blur`: [P, 3] from [R, P, 3]."""
-    return np.sum([lobe.T @ each for lobe, each in zip(lobes, values, strict=True)], axis=0)
 
 
 def reflection(
@@ -92,7 +82,7 @@ def reflection(
         for c in range(3):
             bounced[:, level, c] = (near_shares * (around.bounced[..., c] @ lobe.T)[own, near_pixels]).sum(1)
     scale, bias = ggx.split_sum(facing[..., None], np.array(ggx.ROUGHNESSES, np.float32))
-    cosine, bounced_diffuse = matte(normals, around, light_from_scene)
+    cosine, bounced_diffuse = matte_weights(normals, around, light_from_scene)
     return Reflection(
         cosine=torch.from_numpy(cosine),
         bounced_diffuse=torch.from_numpy(bounced_diffuse),
@@ -106,7 +96,9 @@ def reflection(
     )
 
 
-def matte(normals: np.ndarray, around: Surroundings, light_from_scene: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def matte_weights(
+    normals: np.ndarray, around: Surroundings, light_from_scene: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """`Reflection.cosine` and `.bounced_diffuse`."""
     turned = (normals @ light_from_scene.T).astype(np.float32)
     finer = LIGHT_ROWS // NEAR_ROWS

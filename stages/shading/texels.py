@@ -10,11 +10,13 @@ import numpy as np
 
 from stages.compiling import njit
 from stages.light import ggx
-from stages.light.environment import directions, look_up, solid_angles
+from stages.light.environment import look_up
+from stages.light.levels import matte
 from stages.light.srgb import decoded
 from stages.shading.few_materials import COLOR_REACH, REACH
+from stages.shading.fitting import CLIPPED
 from stages.shading.learning import Learned
-from stages.shading.reflection import matte
+from stages.shading.reflection import matte_weights
 from stages.shading.surroundings import ROWS as NEAR_ROWS
 from stages.shading.surroundings import Surroundings
 from stages.texture.observing import sample_points
@@ -25,7 +27,6 @@ NEAREST = 4
 # The first round takes all photos, the second those that agree with its answer.
 ROUNDS = 2
 SPREAD = 0.06
-CLIPPED = 0.98
 # Clipped photos say little about a base colour: nothing, but where there are no others.
 FAINT = 0.02
 
@@ -100,13 +101,10 @@ def base_colors(
     alike = cKDTree(features(points.positions, points.colors)).query(features(positions, coded), workers=workers)[1]
     which = learned.which[alike].astype(np.int32)
     distance, near = cKDTree(points.positions).query(positions, k=NEAREST, workers=workers)
-    share = (
-        1
-        / (distance + 1e-3 * extent) ** 2
-        * (0.05 + np.clip(np.einsum("tc,tkc->tk", normals, points.normals[near]), 0, 1))
-    )
+    facing = np.clip(np.einsum("tc,tkc->tk", normals, points.normals[near]), 0, 1)
+    share = (0.05 + facing) / (distance + 1e-3 * extent) ** 2
     share = (share / share.sum(1, keepdims=True)).astype(np.float32)
-    matte_light = _matte_light(learned.light)
+    matte_light = matte(learned.light)
     turned = (normals @ light_from_scene.T).astype(np.float32)
     # How much of what it would receive in the open a point receives, and so the texels around it.
     openness = _received(points, learned.light, light_from_scene) / look_up(
@@ -123,10 +121,9 @@ def base_colors(
         around[rows, :, 3] = points.around.open[rows] @ lobes[level].T
         for c in range(3):
             around[rows, :, c] = points.around.bounced[rows, :, c] @ lobes[level].T
-    table = ggx.split_sum_table()
     metallic = np.array([float(material.metallic) for material in learned.materials], np.float32)
-    table_rows = np.clip(np.array(ggx.ROUGHNESSES)[levels] * len(table), 0, len(table) - 1).astype(np.int64)
-    of_material = np.ascontiguousarray(table[table_rows])  # [M, side, 2]
+    columns = (np.arange(ggx.TABLE_SIDE) + 0.5) / ggx.TABLE_SIDE
+    of_material = np.stack(ggx.split_sum(columns, np.array(ggx.ROUGHNESSES)[levels, None]), axis=2)  # [M, side, 2]
 
     count = len(positions)
     color = np.zeros((count, 3), np.float32)
@@ -153,16 +150,9 @@ def base_colors(
     return TexelMaterials(color.astype(np.float32), which, told)
 
 
-def _matte_light(light: np.ndarray) -> np.ndarray:
-    """What white matte surfaces in the open show, by their normals: a map like the light's."""
-    towards = directions(len(light)).reshape(-1, 3)
-    cosine = np.maximum(towards @ towards.T, 0) * (solid_angles(len(light)).reshape(-1) / np.float32(np.pi))
-    return (cosine @ light.reshape(-1, 3)).reshape(light.shape)
-
-
 def _received(points: Points, light: np.ndarray, light_from_scene: np.ndarray) -> np.ndarray:
     """What white matte points [S, 3] show where they are."""
-    cosine, bounced = matte(points.normals, points.around, light_from_scene)
+    cosine, bounced = matte_weights(points.normals, points.around, light_from_scene)
     received: np.ndarray = cosine @ light.reshape(-1, 3) + bounced
     return received
 
