@@ -13,7 +13,6 @@ import numpy as np
 from stages.errors import InputError
 from stages.inputs.bounded import reason
 from stages.inputs.light_maps import EXPONENT, read_light_map
-from stages.inputs.texts import read_json
 from stages.light.harmonics import project
 
 GIVEN_LIGHT = "light"  # what a run calls this input
@@ -29,7 +28,6 @@ CONVENTION = {
 }
 # Degrees whose coefficients are written, by how many these are.
 DEGREES = {9: 2, 16: 3}
-LARGEST = 1e12  # of a coefficient
 
 
 def write_exr(file: Path, radiance: np.ndarray) -> None:
@@ -61,23 +59,6 @@ def harmonics_json(radiance: np.ndarray) -> dict[str, Any]:
     """Spherical harmonics of a map [H, 2 H, 3] up to degree 2 (9 RGB values) and 3 (16), and what they mean."""
     values = {str(count): np.round(project(radiance, degree), 7).tolist() for count, degree in DEGREES.items()}
     return {"light": HARMONICS, "convention": CONVENTION, "coefficients": values}
-
-
-def read_harmonics(file: Path, count: int = 9) -> np.ndarray:
-    """The 9 or 16 coefficients [count, 3] float64 of a file that holds `harmonics_json`.
-
-    Raises:
-        InputError: it does not.
-    """
-    try:
-        found = np.asarray(read_json(file)["coefficients"][str(count)], dtype=np.float64)
-        if found.shape != (count, 3) or not (np.abs(found) <= LARGEST).all():
-            raise ValueError(f"expected {count} x 3 numbers, got {' x '.join(map(str, found.shape)) or 'one'}")
-    except Exception as error:  # trees of other shapes raise nearly anything
-        raise InputError(
-            f"{file} cannot be read as harmonics of a light: {reason(error)}.", "Name a `light.json` of `materials`."
-        ) from error
-    return found
 
 
 def read_light(file: Path) -> np.ndarray:
