@@ -14,12 +14,11 @@ import numpy as np
 
 from stages.geometry.cameras import PinholeCameras, PosedScene
 from stages.geometry.normalisation import rotation_onto
+from stages.geometry.place import Place
 from stages.geometry.similarity import Similarity
 
 if TYPE_CHECKING:
     from jaxtyping import Float
-
-    from stages.geometry.place import Place
 
 IRLS_STEPS = 30
 TINY = 1e-12  # keeps divisions finite; far below any length that occurs
