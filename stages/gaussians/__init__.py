@@ -1,0 +1,1 @@
+"""Gaussians on the surface: placing them, their colours, drawing them and what refines them."""
