@@ -32,7 +32,7 @@ quick: venv
 	OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(BIN)/python -m pytest -m "not slow" -n auto --maxprocesses 4
 
 test: venv
-	$(BIN)/python -m pytest --check-shapes
+	.ci/test.sh
 
 trust: venv
 	OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(BIN)/python -m pytest --whole tests/trust tests/test_view.py
