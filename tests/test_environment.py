@@ -78,14 +78,20 @@ def test_weights_sum_to_one_in_any_direction():
     assert pixels.max() < 50
 
 
-@pytest.mark.parametrize(("height", "peak", "error"), [(4, 1000, 1e-5), (3, 1000, 1e-5), (8, 1, 0.01)])
-def test_a_smaller_map_holds_as_much_light(height: int, peak: float, error: float):
+@pytest.mark.parametrize("height", [1, 3, 4, 5, 8, 11])
+@pytest.mark.parametrize("place", [(0, 0), (11, 23), (5, 7)])
+def test_a_smaller_map_holds_as_much_light(height: int, place: tuple[int, int]):
     light = some_light(12)
-    light[0, 0] = peak
+    light[place] = 1000
     small = resized(light, height)
     assert small.shape == (height, 2 * height, 3)
+    assert small.dtype == np.float32
     held = (small * solid_angles(height)[..., None]).sum((0, 1))
-    np.testing.assert_allclose(held, (light * solid_angles(12)[..., None]).sum((0, 1)), rtol=error)
+    np.testing.assert_allclose(held, (light * solid_angles(12)[..., None]).sum((0, 1)), rtol=1e-5)
+
+
+def test_a_smaller_map_of_an_even_light_is_as_even():
+    np.testing.assert_allclose(resized(np.full((12, 24, 3), 0.7, np.float32), 5), 0.7, rtol=1e-6)
 
 
 def test_a_larger_map_shows_the_same():

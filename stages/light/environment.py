@@ -63,15 +63,29 @@ def look_up(radiance: np.ndarray, towards: np.ndarray) -> np.ndarray:
 
 def resized(radiance: np.ndarray, height: int) -> np.ndarray:
     """A map [H, 2 H, C] at another size; where it shrinks, a pixel is the mean, by solid angle, of what it covers."""
-    import cv2
-
-    if height >= len(radiance):
+    full = len(radiance)
+    if height >= full:
         return look_up(radiance, directions(height))
-    angles = solid_angles(len(radiance))[..., None]
-    both = np.concatenate([radiance * angles, angles], axis=2).astype(np.float32)
-    # by channels, for OpenCV resizes four at most
-    small = [cv2.resize(both[..., c], (2 * height, height), interpolation=cv2.INTER_AREA) for c in range(both.shape[2])]
-    return np.stack([channel / small[-1] for channel in small[:-1]], axis=2)
+    from scipy.sparse import csr_matrix
+
+    # Solid angle is an area in cos θ and φ, so that shares of rows and columns multiply, and no light is lost.
+    rows = _shares(np.cos(np.pi * np.arange(height + 1) / height), np.cos(np.pi * np.arange(full + 1) / full))
+    columns = _shares(np.arange(2 * height + 1) / height, np.arange(2 * full + 1) / full)
+    fewer_rows = (csr_matrix(rows) @ radiance.reshape(full, -1)).reshape(height, 2 * full, -1)
+    by_column = fewer_rows.swapaxes(0, 1)
+    small = (csr_matrix(columns) @ by_column.reshape(2 * full, -1)).reshape(2 * height, height, -1)
+    return np.ascontiguousarray(small.swapaxes(0, 1), dtype=np.float32)
+
+
+def _shares(bounds: np.ndarray, fine: np.ndarray) -> np.ndarray:
+    """Part [n, m] float32 that each of m intervals has of each of n; rows sum to 1.
+
+    Args:
+        bounds, fine: [n + 1], [m + 1] bounds of the intervals, both ascending or both descending.
+    """
+    low, high = np.minimum(bounds[:-1], bounds[1:]), np.maximum(bounds[:-1], bounds[1:])
+    inside = np.clip(fine, low[:, None], high[:, None])
+    return (np.abs(np.diff(inside, axis=1)) / (high - low)[:, None]).astype(np.float32)
 
 
 def turned(radiance: np.ndarray, degrees: float) -> np.ndarray:
