@@ -180,7 +180,7 @@ def _occlusion(path: Path, size: int) -> np.ndarray:
 
 MATERIALS: Stage[MaterialsParams] = Stage(
     name="materials",
-    version=1,
+    version=2,
     settings=lambda config: config.materials,
     run=run,
     sources=(GIVEN_LIGHT,),

@@ -46,7 +46,7 @@ def test_matte_points_show_the_sum_over_all_directions():
 def test_lobes_look_where_a_mirror_would():
     found, seen, normals = few_points()
     mirrored = found.mirrored(torch.from_numpy(lamps().reshape(-1, 3))).numpy()
-    levels = ggx.blurred(lamps())
+    levels = [ggx.blurred(lamps(), roughness) for roughness in ggx.ROUGHNESSES]
     for point, normal in enumerate(normals):
         for photo, towards in enumerate(seen.towards[point]):
             facing = max(float(normal @ towards), 1e-3)

@@ -50,10 +50,10 @@ def lobe_matrices(rows_out: int, rows_in: int) -> np.ndarray:
     return np.stack([lobe_matrix(roughness, rows_out, rows_in) for roughness in ROUGHNESSES])
 
 
-def blurred(radiance: np.ndarray) -> np.ndarray:
-    """A map [H, 2 H, 3] blurred by each of ROUGHNESSES [R, H, 2 H, 3]."""
+def blurred(radiance: np.ndarray, roughness: float) -> np.ndarray:
+    """A map [H, 2 H, 3] blurred by the lobe of one roughness, which may lie between ROUGHNESSES."""
     height = len(radiance)
-    return blur(lobe_matrices(height, height), radiance.reshape(-1, 3)).reshape(len(ROUGHNESSES), *radiance.shape)
+    return (lobe_matrix(roughness, height, height) @ radiance.reshape(-1, 3)).reshape(radiance.shape)
 
 
 def blur(lobes: np.ndarray, light: np.ndarray) -> np.ndarray:

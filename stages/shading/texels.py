@@ -112,18 +112,17 @@ def base_colors(
     ).clip(1e-6)
     received = look_up(matte_light, turned) * np.einsum("tk,tkc->tc", share, openness[near])
 
-    lobes = ggx.lobe_matrices(NEAR_ROWS, NEAR_ROWS)
-    levels = np.array([material.level for material in learned.materials])
-    mirrored = ggx.blurred(learned.light)[levels]
+    roughness = np.array([material.roughness for material in learned.materials])
+    mirrored = np.stack([ggx.blurred(learned.light, each) for each in roughness])
     around = np.empty((len(points.positions), 2 * NEAR_ROWS**2, 4), np.float32)
-    for k, level in enumerate(levels):
-        rows = learned.which == k
-        around[rows, :, 3] = points.around.open[rows] @ lobes[level].T
+    for k, each in enumerate(roughness):
+        rows, lobe = learned.which == k, ggx.lobe_matrix(each, NEAR_ROWS, NEAR_ROWS)
+        around[rows, :, 3] = points.around.open[rows] @ lobe.T
         for c in range(3):
-            around[rows, :, c] = points.around.bounced[rows, :, c] @ lobes[level].T
+            around[rows, :, c] = points.around.bounced[rows, :, c] @ lobe.T
     metallic = np.array([float(material.metallic) for material in learned.materials], np.float32)
     columns = (np.arange(ggx.TABLE_SIDE) + 0.5) / ggx.TABLE_SIDE
-    of_material = np.stack(ggx.split_sum(columns, np.array(ggx.ROUGHNESSES)[levels, None]), axis=2)  # [M, side, 2]
+    of_material = np.stack(ggx.split_sum(columns, roughness[:, None]), axis=2)  # [M, side, 2]
 
     count = len(positions)
     color = np.zeros((count, 3), np.float32)
