@@ -282,7 +282,7 @@ class AtlasParams(Section):
         120.0,
         gt=0,
         le=1_000_000,
-        description="seconds for each way to charts, then the next takes over: uvatlas, xatlas, projection",
+        description="seconds of CPU time for each way to charts, then the next takes over: uvatlas, xatlas, projection",
     )
 
 

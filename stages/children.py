@@ -7,19 +7,25 @@ which `python -m` and `python -c` put before all other places.
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+
+# Its CPU time takes a process so many times as long at most, on a machine that is busy with other things.
+PATIENCE = 10
 
 HOME = str(Path(__file__).resolve().parents[1])
 
 
 def module_command(module: str, *arguments: str) -> list[str]:
     """The command that runs one of our modules."""
-    return program_command(
-        f"import runpy; runpy.run_module({module!r}, run_name='__main__', alter_sys=True)", *arguments
-    )
+    return program_command(_program_of(module), *arguments)
+
+
+def _program_of(module: str) -> str:
+    return f"import runpy; runpy.run_module({module!r}, run_name='__main__', alter_sys=True)"
 
 
 def program_command(program: str, *arguments: str) -> list[str]:
@@ -41,3 +47,21 @@ def run(words: Sequence[str], time_limit: float) -> subprocess.CompletedProcess[
     """
     # what a crash leaves on stderr may be no text
     return subprocess.run(words, capture_output=True, text=True, errors="replace", timeout=time_limit, check=False)
+
+
+def run_module(module: str, *arguments: str, cpu_limit: float) -> subprocess.CompletedProcess[str]:
+    """Run one of our modules for so many seconds of CPU time at most, so that a busy machine changes no result.
+
+    Windows has no such limit: there they are seconds on the clock.
+
+    Raises:
+        subprocess.TimeoutExpired: it was killed then, or after `PATIENCE` times as long on the clock.
+    """
+    if sys.platform == "win32":
+        return run(module_command(module, *arguments), cpu_limit)
+    limited = f"import signal; signal.setitimer(signal.ITIMER_PROF, {cpu_limit!r}); {_program_of(module)}"
+    words = program_command(limited, *arguments)
+    done = run(words, PATIENCE * cpu_limit)
+    if done.returncode == -signal.SIGPROF:
+        raise subprocess.TimeoutExpired(words, cpu_limit)
+    return done

@@ -470,6 +470,21 @@ def test_a_child_finds_what_this_process_does(tmp_path: Path, monkeypatch: pytes
     assert children.run(children.program_command("import stages, their_own"), 60).stdout == "found\n"
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="it has no limit of CPU time")
+def test_a_module_is_stopped_by_its_cpu_time_and_not_while_it_waits(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "waits.py").write_text("import time; time.sleep(0.5); print('done')", encoding="utf-8")
+    (tmp_path / "works.py").write_text("while True: pass", encoding="utf-8")
+    (tmp_path / "hangs.py").write_text("import time; time.sleep(60)", encoding="utf-8")
+    monkeypatch.syspath_prepend(tmp_path)
+    assert children.run_module("waits", cpu_limit=0.3).stdout == "done\n"
+    with pytest.raises(subprocess.TimeoutExpired, match=r"after 0\.3 seconds"):
+        children.run_module("works", cpu_limit=0.3)
+    with pytest.raises(subprocess.TimeoutExpired):
+        children.run_module("hangs", cpu_limit=0.5 / children.PATIENCE)
+
+
 def test_doctor_names_packages_that_share_our_modules_names(monkeypatch: pytest.MonkeyPatch) -> None:
     owners = {"stages": ["hineus", "stages-of-grief"], "configs": ["hineus"], "numpy": ["numpy"]}
     monkeypatch.setattr(machine_check.metadata, "packages_distributions", lambda: owners)

@@ -59,7 +59,7 @@ class UvLayout:
 def unwrap_uvatlas(
     vertices: np.ndarray, faces: np.ndarray, texture_size: int, padding: int, time_limit: float
 ) -> UvLayout:
-    """Charts by UVAtlas, in a subprocess that is killed after `time_limit` seconds: few, large, none mirrored.
+    """Charts by UVAtlas, in a process that is killed after `time_limit` CPU seconds: few, large, none mirrored.
 
     UVAtlas refuses or crashes on what is no manifold, so it is given a copy whose faces are cut apart there, without
     those that name a vertex twice.
@@ -88,7 +88,7 @@ def unwrap_uvatlas(
 def unwrap_xatlas(
     vertices: np.ndarray, faces: np.ndarray, texture_size: int, padding: int, time_limit: float
 ) -> UvLayout:
-    """Charts by xatlas, in a subprocess that is killed after `time_limit` seconds: many, small, some mirrored.
+    """Charts by xatlas, in a process that is killed after `time_limit` CPU seconds: many, small, some mirrored.
 
     Raises:
         ChartsError: the limit was reached, xatlas crashed, or its charts do not fit.
@@ -132,14 +132,14 @@ def _in_child(who: str, module: str, time_limit: float, **job: np.ndarray | floa
     """What one of our modules, run on its own, makes of arrays.
 
     Raises:
-        ChartsError: it needed longer than `time_limit` seconds, or ended without a result.
+        ChartsError: it needed more than `time_limit` seconds of CPU time, or ended without a result.
     """
     with tempfile.TemporaryDirectory(prefix="atlas-") as folder:
         source, target = Path(folder) / "in.npz", Path(folder) / "out.npz"
         arrays: dict[str, Any] = dict(job)
         np.savez(source, **arrays)
         try:
-            done = children.run(children.module_command(module, str(source), str(target)), time_limit)
+            done = children.run_module(module, str(source), str(target), cpu_limit=time_limit)
         except subprocess.TimeoutExpired as error:
             raise ChartsError(
                 f"{who} needed more than {time_limit:g} s for {len(np.asarray(job['faces']))} faces"
