@@ -19,6 +19,7 @@ from hineus_cli.options import (
     NoMasks,
     Poses,
     Preset,
+    Relightable,
     Sets,
     Time,
     Workers,
@@ -46,6 +47,7 @@ def check(
     device: Device = "auto",
     workers: Workers = None,
     time: Time = None,
+    relightable: Relightable = False,
     moving_object: MovingObject = False,
     as_json: Json = False,
 ) -> None:
@@ -62,7 +64,16 @@ def check(
         light=light,
         preset=preset,
         config=config,
-        sets=settings(sets, time, moving_object=moving_object, masks=masks, no_masks=no_masks, black_keeps=black_keeps),
+        sets=settings(
+            sets,
+            time,
+            moving_object=moving_object,
+            masks=masks,
+            no_masks=no_masks,
+            black_keeps=black_keeps,
+            relightable=relightable,
+            light=light,
+        ),
         device=device,
         workers=workers,
     )
