@@ -11,9 +11,10 @@ from typing import Literal
 from pydantic import Field, field_validator
 
 from configs.section import Section
-from configs.texts import REGION_FORMS, read_distance, read_region
+from configs.texts import BALL_FORM, REGION_FORMS, read_ball, read_distance, read_region
 from configs.training import MOST_PHOTOS, MOST_SEED, TrainParams
 
+MOST_BALLS = 1000
 MOST_SIDE = 65_536  # pixels: a gigapixel picture is 32,768 high
 
 
@@ -315,8 +316,22 @@ class MaterialsParams(Section):
         None,
         ge=-360,
         le=360,
-        description="degrees by which the light that is given is turned about the vertical; null: it is searched for",
+        description="degrees by which the light that is given is turned about the vertical; null: it is searched for, "
+        "and 0 for the light of balls",
     )
+    balls: tuple[str, ...] = Field(
+        (),
+        max_length=MOST_BALLS,
+        description=f"balls in photos that tell the light, each as {BALL_FORM}: the circle around it in pixels of the "
+        "upright photo, from its upper left corner, in its full size",
+    )
+
+    @field_validator("balls")
+    @classmethod
+    def _are_balls(cls, texts: tuple[str, ...]) -> tuple[str, ...]:
+        for text in texts:
+            read_ball(text)
+        return texts
 
 
 class ExportParams(Section):

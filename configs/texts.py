@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 LEAST, MOST = 1e-6, 1e9  # of lengths, and of coordinates: those around the Earth's centre reach 6.4e6 metres
+BALL_FORM = "KIND:PHOTO:X,Y,RADIUS with chrome or grey as KIND"
 REGION_FORMS = "auto, 'sphere X Y Z RADIUS' or 'box X0 Y0 Z0 X1 Y1 Z1'"
 
 
@@ -37,6 +40,22 @@ def read_distance(text: str) -> tuple[tuple[float, ...], tuple[float, ...], floa
     if metres < LEAST:
         raise ValueError(f"the distance must be at least {LEAST:g} metres, not {metres:g}")
     return first, second, metres
+
+
+def read_ball(text: str) -> tuple[Literal["chrome", "grey"], str, tuple[float, ...]]:
+    """Kind, photo, and (x, y, radius) of the circle in it, pixels, from 'chrome:IMG_1.jpg:1520,840,120'.
+
+    Raises:
+        ValueError: it is not that, or the radius is not positive.
+    """
+    kind, _, rest = text.strip().partition(":")
+    photo, _, circle = rest.rpartition(":")
+    if kind not in ("chrome", "grey") or not photo.strip():
+        raise ValueError(f"a ball is {BALL_FORM}, not {text[:80]!r}")
+    numbers = _numbers(circle.split(","), 3, "a ball's 'X,Y,RADIUS'")
+    if numbers[2] <= 0:
+        raise ValueError(f"a ball's radius must be positive, not {numbers[2]:g}")
+    return "chrome" if kind == "chrome" else "grey", photo.strip(), numbers
 
 
 def _numbers(words: list[str], expected: int, what: str) -> tuple[float, ...]:

@@ -118,7 +118,19 @@ Light = Annotated[
         show_default=False,
     ),
 ]
-NoLight = Annotated[bool, typer.Option("--no-light", help="Forget the light of the last run and learn it.")]
+Balls = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--ball",
+        metavar="KIND:PHOTO:X,Y,RADIUS",
+        help="A ball in a photo that tells the light, chrome or grey, and the circle around it in pixels, like "
+        "chrome:IMG_0012.jpg:1520,840,120. Repeatable. Sets materials.balls and materials.enabled.",
+        show_default=False,
+    ),
+]
+NoLight = Annotated[
+    bool, typer.Option("--no-light", help="Forget the light, or the balls, of the last run and learn it.")
+]
 Preset = Annotated[
     str | None,
     typer.Option(
@@ -208,15 +220,25 @@ def settings(
     masks: Path | None = None,
     relightable: bool = False,
     light: Path | None = None,
+    balls: list[str] | None = None,
+    no_light: bool = False,
 ) -> tuple[str, ...]:
-    """Those of --set, then what other options stand for; an option that was not given says nothing."""
+    """Those of --set, then what other options stand for; an option that was not given says nothing.
+
+    Raises:
+        ConfigError: the light is given as a file and by balls.
+    """
+    if light is not None and balls:
+        raise ConfigError("Both `--light` and `--ball` are given.", "Leave one of them away.")
     chosen = masks is not None or any(text.startswith("ingest.auto_mask=") for text in sets or ())
     stood_for = {
         "train.minutes": time,
         HOLD_OUT: hold_out,
         "cleanup.remove_ground": no_ground or None,
         "cleanup.keep_closed": watertight or None,
-        "materials.enabled": relightable or light is not None or None,
+        "materials.enabled": relightable or light is not None or bool(balls) or None,
+        # what is given last counts, be it balls or a file
+        "materials.balls": balls or ([] if light is not None or no_light else None),
         "sfm.deterministic": deterministic or None,
         "sfm.masks": "always" if moving_object else None,
         "undistort.masks": "alone" if moving_object else None,
@@ -241,6 +263,7 @@ def of_a_run(
     control: Control = None,
     no_control: NoControl = False,
     light: Light = None,
+    ball: Balls = None,
     no_light: NoLight = False,
     preset: Preset = None,
     config: ConfigFile = None,
@@ -267,7 +290,7 @@ def of_a_run(
         control=control,
         no_control=no_control,
         light=light,
-        no_light=no_light,
+        no_light=no_light or bool(ball),
         preset=preset,
         config=config,
         sets=settings(
@@ -283,6 +306,8 @@ def of_a_run(
             masks,
             relightable,
             light,
+            ball,
+            no_light,
         ),
         device=device,
         workers=workers,

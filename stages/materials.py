@@ -6,6 +6,7 @@ The light is learned, too, unless it is given.
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,13 +18,16 @@ from stages.artifacts import (
     ATLAS_MESH,
     BASE_COLOR,
     HELD_OUT,
+    IMAGE_SET,
     KNOWN,
     LIGHT,
     LIGHT_HARMONICS,
     LIGHT_HDR,
     MATERIAL_COLOR,
+    MODEL,
     OCCLUSION,
     ORM,
+    PHOTOS,
     PINHOLE_PHOTOS,
     SCENE,
     WORLD_PLACE,
@@ -31,10 +35,11 @@ from stages.artifacts import (
     write_png,
 )
 from stages.engine.stage import Stage, StageContext
-from stages.errors import ReconstructionError
+from stages.errors import ConfigError, ReconstructionError
 from stages.files.light_files import GIVEN_LIGHT
 
 if TYPE_CHECKING:
+    from stages.shading.ball_light import BallLight
     from stages.shading.given_light import GivenLight, Placed
 
 log = logging.getLogger(__name__)
@@ -63,10 +68,10 @@ def run(context: StageContext[MaterialsParams]) -> dict[str, Any]:
     from stages.texture.prepared_views import PreparedViews
 
     torch.set_num_threads(context.workers)
-    given = _given_light(context)
     photos, held_out, scene = context.read(PINHOLE_PHOTOS), context.read(HELD_OUT), context.read(SCENE)
     cameras = scene.cameras.select([i for i, name in enumerate(scene.cameras.names) if name not in held_out])
     light_from_scene = gltf_from_scene(scene, context.read(WORLD_PLACE)).rotation
+    given, of_balls = _given_light(context, light_from_scene @ scene.poses_from_scene.rotation.T)
     atlas = context.read(ATLAS_MESH)
     texture = _read_image(context.read(BASE_COLOR))
     texels = rasterize_atlas(atlas.uvs, atlas.faces, atlas.texture_size)
@@ -126,18 +131,65 @@ def run(context: StageContext[MaterialsParams]) -> dict[str, Any]:
         ],
         "light_max_over_mean": round(float(light.max() / light.mean()), 2),
         **({} if placed is None else _placed_numbers(placed)),
+        **of_balls,
         "gain_min": round(float(learned.gains.min()), 4),
         "gain_max": round(float(learned.gains.max()), 4),
         "cost": round(learned.cost, 4),
     }
 
 
-def _given_light(context: StageContext[MaterialsParams]) -> GivenLight | None:
+def _given_light(
+    context: StageContext[MaterialsParams], light_from_poses: np.ndarray
+) -> tuple[GivenLight | None, dict[str, Any]]:
+    """The light of a file or of balls, where there is one, and what balls leave open of it, in numbers.
+
+    Args:
+        light_from_poses: rotation [3, 3].
+
+    Raises:
+        ConfigError: both are given.
+        InputError: it cannot be used.
+    """
     from stages.files.light_files import read_light
     from stages.shading.given_light import GivenLight
 
-    file = context.sources.get(GIVEN_LIGHT)
-    return None if file is None else GivenLight(read_light(file), context.params.light_turn)
+    file, params = context.sources.get(GIVEN_LIGHT), context.params
+    if file is not None and params.balls:
+        raise ConfigError(
+            f"The light is given twice: as {file} and by balls in photos.",
+            "`--no-light --ball ...` forgets the file, `--set materials.balls=[]` the balls.",
+        )
+    if params.balls:
+        found = _light_of_balls(context, light_from_poses)
+        numbers = {"light_unseen": round(found.unseen, 4), "light_clipped": round(found.clipped, 4)}
+        return GivenLight(found.radiance, params.light_turn or 0.0), numbers
+    return None if file is None else GivenLight(read_light(file), params.light_turn), {}
+
+
+def _light_of_balls(context: StageContext[MaterialsParams], light_from_poses: np.ndarray) -> BallLight:
+    import pycolmap
+
+    from stages.posing.undistortion import png_names, registered_photos
+    from stages.shading.named_balls import light_of_balls
+
+    model = pycolmap.Reconstruction(str(context.read(MODEL)))
+    names = [photo.name for photo in registered_photos(model)]
+    held_out: Sequence[str] = context.read(HELD_OUT)
+    found = light_of_balls(
+        context.params.balls,
+        context.read(IMAGE_SET).images,
+        context.read(PHOTOS),
+        model,
+        [name for name, pinhole in zip(names, png_names(names), strict=True) if pinhole in held_out],
+        light_from_poses,
+    )
+    if found.clipped:
+        log.warning(
+            "The balls are clipped where the light is brightest, over %.2g %% of all directions: the light is only a "
+            "lower bound there. Name a ball in a photo with a shorter exposure, too, or a grey ball.",
+            100 * found.clipped,
+        )
+    return found
 
 
 def _placed_numbers(placed: Placed) -> dict[str, Any]:
@@ -184,7 +236,7 @@ MATERIALS: Stage[MaterialsParams] = Stage(
     settings=lambda config: config.materials,
     run=run,
     sources=(GIVEN_LIGHT,),
-    reads=(PINHOLE_PHOTOS, HELD_OUT, SCENE, WORLD_PLACE, ATLAS_MESH, BASE_COLOR, OCCLUSION),
+    reads=(PHOTOS, IMAGE_SET, MODEL, PINHOLE_PHOTOS, HELD_OUT, SCENE, WORLD_PLACE, ATLAS_MESH, BASE_COLOR, OCCLUSION),
     writes=(MATERIAL_COLOR, ORM, KNOWN, LIGHT, LIGHT_HDR, LIGHT_HARMONICS),
     summary="texture + photos -> base colour, roughness, metalness, light",
 )

@@ -29,6 +29,7 @@ from stages.limits import available_memory, nearest_existing
 from stages.posing.control_files import CONTROL, read_control
 from stages.posing.marks import foresee
 from stages.posing.reading import read_poses
+from stages.shading.named_balls import named_balls
 
 Verdict = Literal["go", "go with warnings", "no-go"]
 
@@ -146,7 +147,7 @@ def preflight(
     whose sha256 is known.
 
     Raises:
-        InputError: there is no such folder or video, or the poses, control points or light cannot be used.
+        InputError: there is no such folder or video, or the poses, control points, light or balls cannot be used.
         ConfigError, SystemRequirementError: the points' coordinates cannot be converted.
     """
 
@@ -173,9 +174,11 @@ def preflight(
     warnings = _warnings(seen, config)
     if control is None:
         warnings += _unused_control(seen, source)
-    if control is not None and not seen.videos:  # frames have no names yet
+    sizes = {photo.source: (photo.width, photo.height) for photo in seen.photos}
+    if not seen.videos:  # their frames have no names yet
+        named_balls(config.materials.balls, sizes)
+    if control is not None and not seen.videos:
         found = read_control(control)
-        sizes = {photo.source: (photo.width, photo.height) for photo in seen.photos}
         more, doubts = foresee(found, found.system(config.place.control_epsg), sizes)
         refusals, warnings = refusals + more, warnings + doubts
     if (light := sources.get(GIVEN_LIGHT)) is not None:

@@ -28,7 +28,7 @@ Kind = tuple[tuple[float, float, float], float, float]
 
 def use_small_maps(monkeypatch: pytest.MonkeyPatch) -> None:
     """Lights of `ROWS` rows throughout."""
-    for module in (reflecting, fitting, learning):
+    for module in (reflecting, learning):
         monkeypatch.setattr(module, "LIGHT_ROWS", ROWS)
 
 

@@ -5,21 +5,26 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import ball_photos
 import cv2
 import numpy as np
 import pytest
 from lit_sphere import ROWS, use_small_maps
 from rigs import capture, look_at, scene_without_points
+from scipy.spatial.transform import Rotation
 
 from configs.params import MaterialsParams
 from stages import artifacts, materials
-from stages.artifacts import AtlasMesh, write_png
+from stages.artifacts import AtlasMesh, ImageRecord, ImageSet, write_png
 from stages.engine.stage import StageContext
-from stages.errors import ReconstructionError
-from stages.files.light_files import read_light
+from stages.errors import ConfigError, InputError, ReconstructionError
+from stages.files.light_files import GIVEN_LIGHT, read_light
 from stages.geometry.place import Place
 from stages.geometry.similarity import Similarity
+from stages.geometry.up import gltf_from_scene
+from stages.light.environment import mean_radiance, resized
 from stages.materials import MATERIALS
+from stages.shading import given_light
 from stages.shading.texels import Told
 
 GREY = 120
@@ -81,6 +86,60 @@ def test_a_texture_that_cannot_be_read_is_named(tmp_path: Path):
     context = workspace(tmp_path, photos=1)
     artifacts.BASE_COLOR.load(context.inputs["bake"]).write_bytes(b"no image")
     with pytest.raises(ReconstructionError, match="cannot be read"):
+        MATERIALS.run(context)
+
+
+def with_a_ball(context: StageContext, light: np.ndarray) -> StageContext:
+    """The same with a chrome ball in the first photo, as ingest took it, and poses found in another frame."""
+    import pycolmap
+
+    turn = Rotation.from_euler("xyz", [40, -100, 15], degrees=True).as_matrix()
+    cameras = artifacts.SCENE.load(context.inputs["train"]).cameras
+    scene = scene_without_points(cameras, Similarity(2.0, turn, np.array([1.0, 2, 3])))
+    artifacts.SCENE.save(context.inputs["train"], scene)
+    names = [f"{i:03d}.jpg" for i in range(len(cameras))]
+    records = [ImageRecord(name, name, *ball_photos.SIZE, None, "", 1.0, False, "") for name in names]
+    artifacts.IMAGE_SET.save(context.inputs["ingest"], ImageSet(tuple(records)))
+    model, lens = pycolmap.Reconstruction(), ball_photos.lens()
+    model.add_camera_with_trivial_rig(lens)
+    for i, name in enumerate(names):
+        cam_from_poses = pycolmap.Rigid3d(pycolmap.Rotation3d(cameras.extrinsics[i][:, :3] @ turn.T), np.zeros(3))
+        model.add_image_with_trivial_frame(pycolmap.Image(name, pycolmap.Point2DList([]), 1, i + 1), cam_from_poses)
+    folder = artifacts.MODEL.load(context.inputs["sfm"])
+    folder.mkdir()
+    model.write(folder)
+    light_from_scene = gltf_from_scene(scene, Place(Similarity.identity())).rotation
+    light_from_cam = light_from_scene @ cameras.extrinsics[0][:, :3].T
+    taken = ball_photos.drawn("chrome", light, light_from_cam, np.array([0.2, 0.1, 1.0]), 0.13, lens, 0.3)
+    path = artifacts.PHOTOS.load(context.inputs["ingest"]).path(names[0])
+    path.parent.mkdir()
+    cv2.imwrite(str(path), taken.pixels[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 98])
+    ball = f"chrome:{names[0]}:{taken.center[0]},{taken.center[1]},{taken.radius}"
+    return replace(context, params=MaterialsParams(enabled=True, balls=(ball,)))
+
+
+@pytest.mark.slow
+def test_the_light_of_a_ball_is_the_light_that_is_written(tmp_path: Path, monkeypatch):
+    use_small_maps(monkeypatch)
+    monkeypatch.setattr(given_light, "LIGHT_ROWS", ROWS)
+    monkeypatch.setattr(materials, "POINTS", 300)
+    truth = ball_photos.lamps(2.5)
+    context = with_a_ball(workspace(tmp_path, photos=6), truth)
+    numbers = MATERIALS.run(context)
+    light = read_light(artifacts.LIGHT.load(context.out))
+    assert ball_photos.apart_deg(ball_photos.main_source(light), ball_photos.LAMPS[0]) < 6
+    share = resized(light, 8) / mean_radiance(light) - resized(truth, 8) / mean_radiance(truth)
+    assert np.abs(share).mean() < 0.05
+    assert (numbers["light_turn_deg"], numbers["light_turn_told"], numbers["light_clipped"]) == (0, True, 0)
+    assert 0 < numbers["light_unseen"] < 0.15
+
+
+def test_balls_in_photos_held_out_and_two_lights_are_refused(tmp_path: Path):
+    context = with_a_ball(workspace(tmp_path, photos=6), ball_photos.lamps(2.5))
+    with pytest.raises(ConfigError, match=r"given twice: as studio\.hdr and by balls"):
+        MATERIALS.run(replace(context, sources={GIVEN_LIGHT: Path("studio.hdr")}))
+    artifacts.HELD_OUT.save(context.inputs["train"], ("000.png",))
+    with pytest.raises(InputError, match="is held out"):
         MATERIALS.run(context)
 
 

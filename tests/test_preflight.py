@@ -359,6 +359,18 @@ def test_a_light_that_cannot_be_used_is_refused_before_a_run(
         assert text in " ".join(result.output.split())
 
 
+def test_balls_that_cannot_be_used_are_refused_before_a_run(photos: Path, tmp_path: Path):
+    for command in (["check"], ["run", "--workspace", str(tmp_path / "ws")]):
+        result = CliRunner().invoke(
+            app, [*command, str(photos), "--ball", "chrome:00.jpg:300,20,50", "--preset", "tiny"]
+        )
+        assert result.exit_code == InputError.exit_code
+        said = " ".join(result.output.split())
+        assert "50 pixels around 300 20, reaches out of 00.jpg, which has 320 x 240 pixels" in said
+    good = json.loads(check(str(photos), "--json", "--ball", "chrome:00.jpg:160,120,50").stdout)
+    assert good["verdict"] == "go"
+
+
 def test_a_list_of_control_points_among_the_photos_is_noticed(photos: Path):
     (photos / "gcp_list.txt").write_text("EPSG:32632\n")
     assert f"which are used with `--control {photos / 'gcp_list.txt'}`" in warned(photos)

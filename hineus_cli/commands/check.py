@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from hineus_cli.options import (
+    Balls,
     BlackKeeps,
     ConfigFile,
     Control,
@@ -41,6 +42,7 @@ def check(
     poses: Poses = None,
     control: Control = None,
     light: Light = None,
+    ball: Balls = None,
     preset: Preset = None,
     config: ConfigFile = None,
     sets: Sets = None,
@@ -62,6 +64,7 @@ def check(
         poses=poses,
         control=control,
         light=light,
+        no_light=bool(ball),
         preset=preset,
         config=config,
         sets=settings(
@@ -73,6 +76,7 @@ def check(
             black_keeps=black_keeps,
             relightable=relightable,
             light=light,
+            balls=ball,
         ),
         device=device,
         workers=workers,

@@ -33,7 +33,7 @@ def match_sightings(
         by_stem[stem(source.lower())].append(source)
     found, missing = [], set()
     for mark in control.sightings:
-        fitting = _fitting(mark.photo, by_stem[stem(mark.photo.lower())])
+        fitting = photos_named(mark.photo, by_stem[stem(mark.photo.lower())])
         if len(fitting) > 1:
             raise InputError(
                 f"{mark.photo} in {control.origin} fits {len(fitting)} photos: {fitting[0]}, {fitting[1]}.",
@@ -53,7 +53,7 @@ def match_sightings(
     return found, missing
 
 
-def _fitting(name: str, photos: Collection[str]) -> list[str]:
+def photos_named(name: str, photos: Collection[str]) -> list[str]:
     """The photos that a name may mean: that one, or those that fit it best whatever the case of their letters."""
     if name in photos:
         return [name]

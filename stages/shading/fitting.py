@@ -15,6 +15,7 @@ that is brighter.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,7 +24,7 @@ from torch import Tensor
 
 from stages.light.ggx import DIELECTRIC, ROUGHNESSES, blur, blur_back
 from stages.neural.radiance import encoded_srgb
-from stages.shading.reflection import LIGHT_ROWS, Reflection
+from stages.shading.reflection import Reflection
 
 LEVELS = len(ROUGHNESSES)
 # Coded colours differ by so much for reasons of their own: noise, poses, normals.
@@ -272,8 +273,9 @@ def radiance_of(
 
 
 def smoothed(light: Tensor, share: float) -> Tensor:
-    """A light [P, 3] with a share of each pixel's logarithm taken from its four neighbours'."""
-    grid = light.clamp_min(1e-6).log().reshape(LIGHT_ROWS, 2 * LIGHT_ROWS, 3)
+    """A light [P, 3] of any size with a share of each pixel's logarithm taken from its four neighbours'."""
+    rows = math.isqrt(len(light) // 2)
+    grid = light.clamp_min(1e-6).log().reshape(rows, 2 * rows, 3)
     above, below = torch.cat([grid[:1], grid[:-1]]), torch.cat([grid[1:], grid[-1:]])
     mean = (grid.roll(1, 1) + grid.roll(-1, 1) + above + below) / 4
     return ((1 - share) * grid + share * mean).exp().reshape(-1, 3)
