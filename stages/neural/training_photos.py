@@ -6,7 +6,7 @@ Shapes: I photos, T pixels of all photos together, R rays.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -39,6 +39,11 @@ class RayBatch(Rays):
     images: Int[Tensor, " r"]
     colors: Float[Tensor, "r 3"]
     masks: Float[Tensor, " r"] | None
+
+    def select(self, rows: slice) -> RayBatch:
+        """Some of the rays."""
+        values = ((each.name, getattr(self, each.name)) for each in fields(self))
+        return RayBatch(**{name: None if value is None else value[rows] for name, value in values})
 
 
 class Photos:
