@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -42,8 +42,8 @@ class RayBatch(Rays):
 
     def select(self, rows: slice) -> RayBatch:
         """Some of the rays."""
-        values = ((each.name, getattr(self, each.name)) for each in fields(self))
-        return RayBatch(**{name: None if value is None else value[rows] for name, value in values})
+        values: dict[str, Any] = {each.name: getattr(self, each.name) for each in fields(self)}
+        return RayBatch(**{name: None if value is None else value[rows] for name, value in values.items()})
 
 
 class Photos:

@@ -41,7 +41,7 @@ def test_wrong_input_gets_a_sentence(entry: EntryPoint, tiny: Tiny, whole: bool,
         place, commands = laid
         bad = False
         for command in commands:
-            ended = run_hineus(command, place, entry.seconds)
+            ended = run_hineus(command, place, entry.seconds, first=entry.first)
             record_trust(entry.name, ended)
             if fault := ended.fault():
                 bad = True
