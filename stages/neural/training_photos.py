@@ -42,8 +42,11 @@ class RayBatch(Rays):
 
     def select(self, rows: slice) -> RayBatch:
         """Some of the rays."""
-        values: dict[str, Any] = {each.name: getattr(self, each.name) for each in fields(self)}
-        return RayBatch(**{name: None if value is None else value[rows] for name, value in values.items()})
+
+        def part(values: Any) -> Any:
+            return None if values is None else values[rows]
+
+        return RayBatch(*(part(getattr(self, each.name)) for each in fields(self)))
 
 
 class Photos:
