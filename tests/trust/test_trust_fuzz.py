@@ -14,7 +14,7 @@ from trust_runs import run_hineus
 
 pytestmark = pytest.mark.slow
 
-WHOLE, SHARE = 12, 1  # inputs for each unit of an entry point's share
+WHOLE, SHARE = 12, 0.5  # inputs for each unit of an entry point's share
 PLANTED = "from pathlib import Path\nPath(__file__).with_name('executed').touch()\n"
 
 
@@ -31,7 +31,7 @@ def test_wrong_input_gets_a_sentence(entry: EntryPoint, tiny: Tiny, whole: bool,
 
     @seed(1)
     @settings(
-        max_examples=entry.share * (WHOLE if whole else SHARE),
+        max_examples=int(entry.share * (WHOLE if whole else SHARE)),
         database=None,
         phases=[Phase.generate],
         suppress_health_check=list(HealthCheck),
