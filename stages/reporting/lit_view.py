@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from stages.artifacts import read_texture
 from stages.errors import InputError
 from stages.files.contents import ROUGHNESS
 from stages.files.light_files import read_light
@@ -16,7 +15,7 @@ from stages.geometry.place import Place
 from stages.geometry.up import gltf_from_scene, y_up_rotation
 from stages.light.built_in import LIGHTS
 from stages.light.environment import resized
-from stages.reporting.pictures import data_uri, jpeg_uri, shrink
+from stages.reporting.pictures import data_uri, jpeg_uri, read_rgb, shrink
 from stages.reporting.view3d import encode
 
 ROWS = 32
@@ -44,8 +43,8 @@ def pack_material(color: Path, orm: Path) -> dict[str, Any] | None:
     """Base colour, and occlusion, roughness and metalness; None where there are none, or they are damaged."""
     try:
         return {
-            "color": jpeg_uri(shrink(read_texture(color), MATERIAL_SIDE), 88),
-            "orm": data_uri(shrink(read_texture(orm), MATERIAL_SIDE), ".png"),
+            "color": jpeg_uri(shrink(read_rgb(color), MATERIAL_SIDE), 88),
+            "orm": data_uri(shrink(read_rgb(orm), MATERIAL_SIDE), ".png"),
         }
     except (OSError, ValueError):
         return None
