@@ -27,6 +27,7 @@ from stages.artifacts import (
     POINT_CLOUD,
     SCENE,
     WORLD_PLACE,
+    texture_bytes,
 )
 from stages.engine.stage import Stage, StageContext
 from stages.engine.system import installed_version
@@ -328,9 +329,11 @@ def load_textures(context: StageContext[ExportParams]) -> Textures:
     from stages.files.contents import Textures
 
     optional = (NORMAL_MAP, OCCLUSION, MATERIAL_COLOR, ORM)
-    normal, occlusion, color, orm = (_bytes_where_made(context.read(artifact)) for artifact in optional)
+    normal, occlusion, color, orm = (
+        texture_bytes(path) if (path := context.read(artifact)).exists() else None for artifact in optional
+    )
     if color is None or orm is None:
-        return Textures(context.read(BASE_COLOR).read_bytes(), normal, occlusion)
+        return Textures(texture_bytes(context.read(BASE_COLOR)), normal, occlusion)
     return Textures(color, normal, orm=orm)
 
 

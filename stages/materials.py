@@ -31,6 +31,7 @@ from stages.artifacts import (
     PINHOLE_PHOTOS,
     SCENE,
     WORLD_PLACE,
+    read_texture,
     write_json,
     write_png,
 )
@@ -73,7 +74,7 @@ def run(context: StageContext[MaterialsParams]) -> dict[str, Any]:
     light_from_scene = gltf_from_scene(scene, context.read(WORLD_PLACE)).rotation
     given, of_balls = _given_light(context, light_from_scene @ scene.poses_from_scene.rotation.T)
     atlas = context.read(ATLAS_MESH)
-    texture = _read_image(context.read(BASE_COLOR))
+    texture = read_texture(context.read(BASE_COLOR))
     texels = rasterize_atlas(atlas.uvs, atlas.faces, atlas.texture_size)
     baked = texture.reshape(-1, 3)[texels.index]
     views = PreparedViews(atlas, len(texels), cameras, lambda index: photos.masked(cameras.names[index]))
@@ -207,25 +208,13 @@ def _placed_numbers(placed: Placed) -> dict[str, Any]:
     }
 
 
-def _read_image(path: Path) -> np.ndarray:
-    """[H, W, 3] uint8 RGB of an image of our own."""
-    from stages.reporting.pictures import read_rgb
-
-    try:
-        return read_rgb(path)
-    except ValueError as error:
-        raise ReconstructionError(
-            f"{path} cannot be read.", "Make it anew: `hineus run PHOTOS --from bake`."
-        ) from error
-
-
 def _occlusion(path: Path, size: int) -> np.ndarray:
     """[size, size] uint8; all open where there is no such map."""
     import cv2
 
     if not path.exists():
         return np.full((size, size), 255, np.uint8)
-    image = _read_image(path)[..., 0]
+    image = read_texture(path)[..., 0]
     resized: np.ndarray = cv2.resize(image, (size, size), interpolation=cv2.INTER_LINEAR)
     return resized
 

@@ -179,7 +179,6 @@ def read_subject(opened: Workspace) -> Subject:
     """The asset: with its materials, or with the photos' colours and the roughness that exported files say."""
     from stages.drawing.relighting import Material
     from stages.files.contents import ROUGHNESS
-    from stages.reporting.pictures import read_rgb
     from stages.surface.placing import placed
     from stages.texture.tangents import vertex_tangents
 
@@ -189,18 +188,20 @@ def read_subject(opened: Workspace) -> Subject:
     scene = artifacts.SCENE.load(opened.stage_folder(artifacts.SCENE.stage))
     place = artifacts.WORLD_PLACE.load(opened.stage_folder(artifacts.WORLD_PLACE.stage))
     mesh = placed(artifacts.ATLAS_MESH.load(opened.stage_folder("atlas")), gltf_from_scene(scene, place))
-    normal = read_rgb(path(artifacts.NORMAL_MAP)) if path(artifacts.NORMAL_MAP).exists() else None
+    normal = artifacts.read_texture(path(artifacts.NORMAL_MAP)) if path(artifacts.NORMAL_MAP).exists() else None
     tangents = None if normal is None else vertex_tangents(mesh)
     if path(artifacts.MATERIAL_COLOR).exists() and not replaced_inputs(MATERIALS, opened):
-        material = Material(read_rgb(path(artifacts.MATERIAL_COLOR)), read_rgb(path(artifacts.ORM)), normal)
+        material = Material(
+            artifacts.read_texture(path(artifacts.MATERIAL_COLOR)), artifacts.read_texture(path(artifacts.ORM)), normal
+        )
         return Subject(mesh, tangents, material, path(artifacts.LIGHT))
     orm = np.full((1, 1, 3), (255, round(255 * ROUGHNESS), 0), np.uint8)
     if path(artifacts.OCCLUSION).exists():
-        occlusion = read_rgb(path(artifacts.OCCLUSION))
+        occlusion = artifacts.read_texture(path(artifacts.OCCLUSION))
         orm = np.stack(
             [occlusion[..., 0], *(np.full(occlusion.shape[:2], value, np.uint8) for value in orm[0, 0, 1:])], 2
         )
-    return Subject(mesh, tangents, Material(read_rgb(path(artifacts.BASE_COLOR)), orm, normal), None)
+    return Subject(mesh, tangents, Material(artifacts.read_texture(path(artifacts.BASE_COLOR)), orm, normal), None)
 
 
 def _tell_of_no_materials(opened: Workspace) -> None:

@@ -41,6 +41,7 @@ from stages.artifacts import (
     AtlasMesh,
     VertexQuality,
     given_mask_of,
+    read_texture,
 )
 from stages.drawing.overview import overview_svg
 from stages.engine.stage import Stage, StageContext
@@ -65,7 +66,7 @@ def run(context: StageContext[ReportParams]) -> dict[str, Any]:
 
     scene, place, atlas = context.read(SCENE), context.read(WORLD_PLACE), context.read(ATLAS_MESH)
     scene = replace(scene, up=scene.up_in(place))
-    texture = pictures.read_rgb(context.read(BASE_COLOR))
+    texture = read_texture(context.read(BASE_COLOR))
     held_out, pinholes, outlines = context.read(HELD_OUT), context.read(PINHOLE_PHOTOS), context.read(OUTLINES)
     manifests = context.manifests
     steps = 5

@@ -11,6 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from stages import blocks
 from stages.artifacts import AtlasMesh
 from stages.drawing.rasterizing import (
     NO_FACE,
@@ -22,6 +23,7 @@ from stages.drawing.rasterizing import (
 )
 from stages.drawing.rendering import look_at, render_textured, turntable
 from stages.geometry.cameras import PinholeCameras
+from stages.texture import baking
 from stages.texture.baking import Baked, Provenance, bake_texture
 from stages.texture.filling import face_neighbors, harmonic_offsets
 from stages.texture.gains import solve_gains
@@ -441,6 +443,25 @@ def test_a_texture_done_in_parts_is_the_same(capture, baked, monkeypatch):
     again = bake(*capture)
     assert (again.base_color == baked.base_color).all()
     assert again.numbers == baked.numbers
+
+
+def test_where_memory_runs_out_fewer_texels_are_done_at_once(capture, baked, monkeypatch):
+    blend, sizes, visited = baking._blend, [], []
+
+    def scarce(pool, points, normals, gains, sharpness, prepared, *rest):
+        sizes.append(len(points))
+        if len(points) > 3000:
+            next(prepared)
+            raise MemoryError
+        return blend(pool, points, normals, gains, sharpness, prepared, *rest)
+
+    monkeypatch.setattr(blocks, "_enough", {})
+    monkeypatch.setattr(baking, "_blend", scarce)
+    again = bake(*capture, visit=lambda index, view, gains: visited.append(index))
+    assert max(sizes) > 3000
+    assert (again.base_color == baked.base_color).all()
+    assert again.numbers == baked.numbers
+    assert visited == list(range(len(capture[1])))
 
 
 def test_a_blurred_photo_counts_less(capture):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import struct
 import sys
@@ -303,6 +304,28 @@ def test_raw_files_without_rawpy_are_left_out_with_the_package_to_install(photos
     write_photos(photos, 3)
     write_dng(photos / "z.dng", 9000)
     assert "pip install 'hineus[raw]'" in reasons(ingest(photos)[0])["z.dng"]
+
+
+def test_raw_files_that_are_no_good_are_told_by_name_and_jpegs_under_their_names_are_read(photos: Path, monkeypatch):
+    class LibRawError(Exception):
+        pass
+
+    def imread(path: str):
+        raise LibRawError(b"Input/output error")  # as rawpy words it
+
+    monkeypatch.setitem(sys.modules, "rawpy", SimpleNamespace(imread=imread, LibRawError=LibRawError))
+    write_photos(photos, 3)
+    (photos / "000.jpg").rename(photos / "renamed.CR2")
+    write_dng(photos / "cut.NEF", 9000)
+    os.truncate(photos / "cut.NEF", 9000)
+    (photos / "empty.ARW").touch()
+    image_set, _, _ = ingest(photos)
+    assert "renamed.CR2" in {record.source for record in image_set.images}
+    found = reasons(image_set)
+    assert found.keys() == {"cut.NEF", "empty.ARW"}
+    assert "cut off, damaged" in found["cut.NEF"]
+    assert "(Input/output error): copy it from the card once more" in found["cut.NEF"]
+    assert "empty" in found["empty.ARW"]
 
 
 def test_the_clip_of_a_live_photo_is_no_video(photos: Path):

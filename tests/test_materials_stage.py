@@ -17,7 +17,7 @@ from configs.params import MaterialsParams
 from stages import artifacts, materials
 from stages.artifacts import AtlasMesh, ImageRecord, ImageSet, write_png
 from stages.engine.stage import StageContext
-from stages.errors import ConfigError, InputError, ReconstructionError
+from stages.errors import ConfigError, InputError, ReconstructionError, WorkspaceError
 from stages.files.light_files import GIVEN_LIGHT, read_light
 from stages.geometry.place import Place
 from stages.geometry.similarity import Similarity
@@ -85,8 +85,9 @@ def test_points_that_too_few_photos_see_are_refused_with_numbers(tmp_path: Path)
 def test_a_texture_that_cannot_be_read_is_named(tmp_path: Path):
     context = workspace(tmp_path, photos=1)
     artifacts.BASE_COLOR.load(context.inputs["bake"]).write_bytes(b"no image")
-    with pytest.raises(ReconstructionError, match="cannot be read"):
+    with pytest.raises(WorkspaceError, match=r"base_color\.png cannot be read") as caught:
         MATERIALS.run(context)
+    assert "--force bake" in caught.value.hint
 
 
 def with_a_ball(context: StageContext, light: np.ndarray) -> StageContext:

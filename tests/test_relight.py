@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -190,11 +191,28 @@ def test_a_workspace_without_a_texture_or_with_one_of_another_mesh(tmp_path: Pat
     with pytest.raises(WorkspaceError, match="no texture of its present mesh") as caught:
         drawn(workspace, tmp_path / "a.png")
     assert "--until bake" in caught.value.hint
+    manifest.write_bytes(kept[:-9])
+    with pytest.raises(WorkspaceError, match="bake is not as it was published: manifest damaged") as caught:
+        drawn(workspace, tmp_path / "a.png")
+    assert "--force bake" in caught.value.hint
     manifest.write_bytes(kept)
     texture = artifacts.BASE_COLOR.load(Workspace.open(workspace).stage_folder("bake"))
     texture.write_bytes(texture.read_bytes()[:-4] + b"abcd")
     with pytest.raises(WorkspaceError, match="not as it was published"):
         drawn(workspace, tmp_path / "a.png")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["base_color.png", "orm.png", "light.exr"])
+def test_materials_that_are_damaged_are_named(learned: Path, tmp_path: Path, name: str) -> None:
+    workspace = shutil.copytree(learned, tmp_path / "ws")
+    file = workspace / "materials" / name
+    data = bytearray(file.read_bytes())
+    data[len(data) // 2] ^= 1  # of the same size
+    file.write_bytes(data)
+    with pytest.raises(WorkspaceError, match=f"output {name} damaged") as caught:
+        drawn(workspace, tmp_path / "a.png", "learned")
+    assert "--force materials" in caught.value.hint
 
 
 # ---------------------------------------------------------------- the command

@@ -84,15 +84,41 @@ class Pictures:
                 check_png(path)
             pixels = cv2.imread(str(path), flags)
         if pixels is None:
-            raise WorkspaceError(
-                f"The {what} {path} cannot be read.", f"Make it again: `hineus run PHOTOS --force {self.folder.name}`."
-            )
+            raise _unreadable(what, path, self.folder.name)
         return pixels
+
+
+def _unreadable(what: str, path: Path, stage: str) -> WorkspaceError:
+    return WorkspaceError(f"The {what} {path} cannot be read.", f"Make it again: `hineus run PHOTOS --force {stage}`.")
 
 
 def pictures_of(stage: str) -> Artifact[Pictures]:
     """The pictures and masks that `stage` publishes."""
     return in_folder(stage, (f"{IMAGES}/*", f"{MASKS}/*"), Pictures)
+
+
+def texture_bytes(path: Path) -> bytes:
+    """A PNG that lies in a stage's folder.
+
+    Raises:
+        WorkspaceError: it is damaged.
+    """
+    try:
+        check_png(path)
+    except ValueError as error:
+        raise _unreadable("texture", path, path.parent.name) from error
+    return path.read_bytes()
+
+
+def read_texture(path: Path) -> np.ndarray:
+    """The same as [H, W, 3] uint8 RGB."""
+    import cv2
+
+    image = cv2.imdecode(np.frombuffer(texture_bytes(path), np.uint8), cv2.IMREAD_COLOR)
+    if image is None:
+        raise _unreadable("texture", path, path.parent.name)
+    pixels: np.ndarray = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+    return pixels
 
 
 def write_png(path: Path, pixels: np.ndarray, compression: int | None = None) -> None:

@@ -145,7 +145,7 @@ def read_head(file: Path, source: str, max_side: int) -> PhotoFile:
     colours = Colours()
     with telling_damage():
         if _is_raw(file):
-            with import_rawpy().imread(str(file)) as raw:
+            with _opened_raw(file) as raw:
                 exif, stored_size = _raw_exif(file, raw), (raw.sizes.width, raw.sizes.height)
                 size = stored_size[::-1] if raw.sizes.flip in RAW_TURNED else stored_size
                 needed = _bytes_of(stored_size)
@@ -410,7 +410,7 @@ def _develop(file: Path, max_side: int) -> Photo:
     """A raw file with its camera's white balance; without automatic brightness, which would differ between photos."""
     from PIL import Image
 
-    with import_rawpy().imread(str(file)) as raw:
+    with _opened_raw(file) as raw:
         _check_memory((raw.sizes.width, raw.sizes.height), _bytes_of((raw.sizes.width, raw.sizes.height)), file)
         exif = _raw_exif(file, raw)
         rgb = Image.fromarray(raw.postprocess(use_camera_wb=True, no_auto_bright=True, output_bps=8))
@@ -419,6 +419,26 @@ def _develop(file: Path, max_side: int) -> Photo:
     if scale < 1:
         rgb = rgb.resize([max(1, round(side * scale)) for side in size], Image.Resampling.LANCZOS)
     return Photo(rgb, None, exif, size, size, 1, lossy=False, as_is=(), colours=Colours())
+
+
+@contextmanager
+def _opened_raw(file: Path) -> Iterator[Any]:
+    """rawpy's object, in which LibRaw decodes the file when it is asked to.
+
+    Raises:
+        UnusableError: LibRaw cannot read it, or rawpy is not installed.
+    """
+    rawpy = import_rawpy()
+    try:
+        with rawpy.imread(str(file)) as raw:
+            yield raw
+    except rawpy.LibRawError as error:
+        said = error.args[0] if error.args else type(error).__name__
+        said = said.decode("ascii", "replace") if isinstance(said, bytes) else said
+        raise UnusableError(
+            f"a camera raw file that is cut off, damaged, or of a camera that LibRaw does not know ({said}): copy it "
+            "from the card once more, or develop it to JPEG or TIFF"
+        ) from error
 
 
 def import_rawpy() -> Any:

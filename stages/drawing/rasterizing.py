@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from stages.artifacts import AtlasMesh
+from stages.blocks import in_blocks
 from stages.compiling import njit
 from stages.geometry.cameras import PinholeCameras
 from stages.geometry.vectors import unit
@@ -174,10 +175,12 @@ def rasterize_atlas(uvs: np.ndarray, faces: np.ndarray, size: int) -> Texels:
     index = np.flatnonzero(face_map != NO_FACE)
     face_ids = face_map[index]
     corner = np.empty((len(index), 3), dtype=np.float32)
-    for start in range(0, len(index), _CHUNK):
-        part = slice(start, start + _CHUNK)
+
+    def weigh(part: slice) -> None:
         centers = np.stack([index[part] % size, index[part] // size], 1) + 0.5
         corner[part] = corner_weights(xy, ones, faces, face_ids[part], centers)
+
+    in_blocks(weigh, len(index), _CHUNK, "texels in their triangles")
     return Texels(size, index, face_ids, corner)
 
 

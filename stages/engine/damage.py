@@ -6,7 +6,7 @@ import shlex
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 
-from stages.engine.manifest import ManifestDamaged, output_problem
+from stages.engine.manifest import Manifest, ManifestDamaged, output_problem
 from stages.engine.workspace import Workspace
 from stages.errors import WorkspaceError
 
@@ -30,16 +30,36 @@ def damage_named(workspace: Workspace, stages: Collection[str]) -> Iterator[None
         raise
 
 
+def published_whole(workspace: Workspace, stage: str) -> Manifest | None:
+    """The manifest of a stage that is published.
+
+    Raises:
+        WorkspaceError: it is damaged; it names the stage to run again.
+    """
+    try:
+        return workspace.published(stage)
+    except ManifestDamaged as error:
+        raise _damaged(workspace, stage, _of_manifest(error)) from error
+
+
+def _of_manifest(error: ManifestDamaged) -> str:
+    return f"manifest damaged ({error})"
+
+
 def _refuse_damage(
     workspace: Workspace, stages: Collection[str], most: int | None, cause: Exception | None = None
 ) -> None:
     for stage in stages:
         if problem := _problem(workspace, stage, most):
-            root = workspace.root
-            raise WorkspaceError(
-                f"{root / stage} is not as it was published: {problem}.",
-                f"Make it again: `hineus run --workspace {shlex.quote(str(root))} --force {stage}`.",
-            ) from cause
+            raise _damaged(workspace, stage, problem) from cause
+
+
+def _damaged(workspace: Workspace, stage: str, problem: str) -> WorkspaceError:
+    root = workspace.root
+    return WorkspaceError(
+        f"{root / stage} is not as it was published: {problem}.",
+        f"Make it again: `hineus run --workspace {shlex.quote(str(root))} --force {stage}`.",
+    )
 
 
 def _problem(workspace: Workspace, stage: str, most: int | None) -> str | None:
@@ -47,7 +67,7 @@ def _problem(workspace: Workspace, stage: str, most: int | None) -> str | None:
     try:
         manifest = workspace.published(stage)
     except ManifestDamaged as error:
-        return f"manifest damaged ({error})"
+        return _of_manifest(error)
     if manifest is None:
         return None if folder.is_dir() else "it is gone"
     return output_problem(folder, manifest, most)

@@ -6,17 +6,12 @@ import errno
 import re
 from collections.abc import Iterator
 
+from stages.blocks import is_out_of_memory
 from stages.engine.workspace import show_bytes
 from stages.errors import SystemRequirementError
 from stages.limits import memory_bounds, open_files
 
 _OF_CUDA = re.compile(r"CUDA|CUBLAS|CUDNN", re.IGNORECASE)
-# numpy, torch on the CPU and on CUDA, OpenCV, Python, the C++ library, the loader of shared libraries.
-_OF_MEMORY = re.compile(
-    r"out of memory|bad.?alloc|insufficient memory|not enough memory|(cannot|can't|unable to|failed to) allocate"
-    r"|failed to map segment|alloc_failed|error return without exception set",
-    re.IGNORECASE,
-)
 _OF_THREADS = re.compile(
     r"can't (start|create).* thread|thread creation failed|resource temporarily unavailable", re.IGNORECASE
 )
@@ -41,7 +36,7 @@ def shortage(error: BaseException, who: str) -> SystemRequirementError | None:
             return _too_many_files(who)
         if _OF_THREADS.search(text):
             return too_many_threads(who)
-        if isinstance(each, MemoryError) or number == errno.ENOMEM or _OF_MEMORY.search(text):
+        if is_out_of_memory(each):
             return _out_of_cuda(who, text) if _OF_CUDA.search(text) else _out_of_memory(who, text)
     return None
 

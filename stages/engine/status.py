@@ -9,6 +9,7 @@ from typing import Any, Literal
 from pydantic import BaseModel
 
 from configs.renames import section_with_new_names
+from stages.engine.damage import published_whole
 from stages.engine.fingerprint import RUN_KEY, FileDigests, Identity, SourceDigests, digest, manifest_key
 from stages.engine.manifest import CHEAP_BYTES, Manifest, ManifestDamaged, jsonable, output_problem
 from stages.engine.stage import Stage
@@ -122,13 +123,13 @@ def replaced_inputs(stage: Stage[Any], workspace: Workspace) -> list[str]:
     """The artifacts that the publication of `stage` was made from and that are no longer those in the workspace.
 
     Raises:
-        ManifestDamaged: of a manifest that cannot be read.
+        WorkspaceError: a manifest is damaged; it names the stage to run again.
     """
-    manifest = workspace.published(stage.name)
+    manifest = published_whole(workspace, stage.name)
     made_from = manifest.identity.inputs if manifest else {}
     replaced = []
     for artifact in stage.reads:
-        now = workspace.published(artifact.stage)
+        now = published_whole(workspace, artifact.stage)
         if now is None or made_from.get(artifact.name) != now.artifact_digest(artifact):
             replaced.append(artifact.name)
     return replaced

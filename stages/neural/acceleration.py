@@ -20,6 +20,8 @@ log = logging.getLogger(__name__)
 SHORT_CAPABILITY = (8, 0)
 # Devices that work while the host goes on. To ask for a number, or for how many rows pass a test, is to wait for them.
 ASYNCHRONOUS = {"cuda"}
+# Rays rendered at once where nothing is learned from them, and what they are called where memory runs out.
+RAYS_AT_ONCE, RENDERED = 4096, "rays of a picture"
 
 
 def takes_kernel(*tensors: Tensor) -> bool:

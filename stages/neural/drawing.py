@@ -10,7 +10,9 @@ import torch
 from torch import Tensor
 
 from configs.training import TrainParams
+from stages.blocks import in_blocks
 from stages.geometry.cameras import PinholeCameras
+from stages.neural.acceleration import RAYS_AT_ONCE, RENDERED
 from stages.neural.fields import Fields
 from stages.neural.renderer import Renderer
 from stages.neural.sampling import SdfCache, intersect_unit_sphere
@@ -19,8 +21,6 @@ from stages.neural.training_photos import RayBatch
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Float32, UInt8
-
-_RAYS = 4096  # rendered at a time
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,9 @@ class FieldDrawer:
         x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
         rays = cameras.rays(index, np.stack([x.ravel(), y.ravel()], 1))
         origins, directions = (torch.from_numpy(each).float().to(self.device) for each in rays)
-        parts = [self._rays(*each) for each in zip(origins.split(_RAYS), directions.split(_RAYS), strict=True)]
+        parts = in_blocks(
+            lambda part: self._rays(origins[part], directions[part]), len(origins), RAYS_AT_ONCE, RENDERED
+        )
         colors, opacity, crossing = (torch.cat(each).cpu().numpy() for each in zip(*parts, strict=True))
         return FieldDrawing(
             (255 * colors.clip(0, 1) + 0.5).astype(np.uint8).reshape(height, width, 3),

@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from stages.blocks import in_blocks
 from stages.errors import ConfigError
+from stages.neural.acceleration import RAYS_AT_ONCE, RENDERED
 from stages.neural.training_photos import Photos, RayBatch
 
 if TYPE_CHECKING:
@@ -17,7 +19,6 @@ if TYPE_CHECKING:
 
 MIN_TRAINING = 3  # photos
 PIXELS = 20_000  # of a photo at most; its PSNR barely moves with more
-_RAYS = 4096  # rendered at a time
 _SMALLEST_ERROR = 1e-10  # a photo met exactly has 100 dB
 
 
@@ -56,11 +57,15 @@ def photo_psnr(photos: Photos, image: int, render: Callable[[RayBatch], Tensor])
     grid = torch.stack([x, y], 2).view(-1, 2).to(photos.device)
     if photos.masks is not None:
         grid = grid[photos.masks[photos.first[image] + grid[:, 1] * width + grid[:, 0]] > 127]
-    total, count = 0.0, 0
-    for pixels in grid.float().split(_RAYS):
+
+    def squares(rows: slice) -> tuple[float, int]:
+        pixels = grid[rows].float()
         batch = photos.rays(torch.full((len(pixels),), image, device=photos.device), pixels)
         error = ((render(batch).clamp(0, 1) - batch.colors) ** 2).mean(1)
-        total, count = total + float(error.sum()), count + len(error)
+        return float(error.sum()), len(error)
+
+    parts = in_blocks(squares, len(grid), RAYS_AT_ONCE, RENDERED)
+    total, count = sum(part for part, _ in parts), sum(number for _, number in parts)
     return -10 * float(torch.tensor(max(total / count, _SMALLEST_ERROR)).log10()) if count else None
 
 

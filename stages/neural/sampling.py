@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from stages.blocks import in_blocks
 from stages.neural.acceleration import fixed_shapes, points_at_a_time, takes_kernel
 from stages.neural.density import FLAT, section_optical_depth
 from stages.neural.rendering import weights_from_optical_depth
@@ -135,8 +136,11 @@ class SdfCache:
             else:
                 nearest = torch.nonzero(sizes < band).squeeze(1)
             rows = rows[nearest]
-        for chunk in rows.split(points_at_a_time(flat.device)):
-            flat[chunk] = sdf(self.points(chunk))
+
+        def evaluate(part: slice) -> None:
+            flat[rows[part]] = sdf(self.points(rows[part]))
+
+        in_blocks(evaluate, len(rows), points_at_a_time(flat.device), "points of the sampler's grid")
         return len(rows)
 
     def lookup(self, points: Float[Tensor, "*any 3"]) -> Float[Tensor, "*any"]:

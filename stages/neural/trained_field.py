@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from stages.blocks import in_blocks
 from stages.neural.acceleration import points_at_a_time
 from stages.neural.encoding_shapes import Encoding, Frequencies, HashGrid
 from stages.neural.fields import Fields, FieldShape
@@ -59,12 +60,12 @@ class TrainedField:
 
     @torch.no_grad()
     def _chunked(self, function, *arrays: np.ndarray) -> np.ndarray:
-        parts = []
-        count = points_at_a_time(self.device)
-        for first in range(0, max(len(arrays[0]), 1), count):
-            chunk = [torch.from_numpy(np.ascontiguousarray(a[first : first + count], dtype=np.float32)) for a in arrays]
-            parts.append(function(*(c.to(self.device) for c in chunk)).cpu().numpy())
-        return np.concatenate(parts)
+        def evaluate(rows: slice) -> np.ndarray:
+            chunk = [torch.from_numpy(np.ascontiguousarray(a[rows], dtype=np.float32)) for a in arrays]
+            return function(*(c.to(self.device) for c in chunk)).cpu().numpy()
+
+        at_once = points_at_a_time(self.device)
+        return np.concatenate(in_blocks(evaluate, max(len(arrays[0]), 1), at_once, "points of the field"))
 
 
 def field_state(fields: Fields) -> dict[str, Any]:

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from configs.training import TrainParams
+from stages.blocks import in_blocks, with_less
 from stages.neural import losses, schedules
-from stages.neural.acceleration import is_mixed, points_at_a_time, short_products
+from stages.neural.acceleration import RAYS_AT_ONCE, RENDERED, is_mixed, points_at_a_time, short_products
 from stages.neural.encoding_shapes import Frequencies, HashGrid
 from stages.neural.evidence import Evidence
 from stages.neural.fields import Fields, FieldShape
@@ -22,7 +24,7 @@ from stages.neural.renderer import Renderer
 from stages.neural.replaying import Replay
 from stages.neural.sampling import SdfCache
 from stages.neural.schedules import Moment
-from stages.neural.sightings import Sightings, sighting_loss
+from stages.neural.sightings import Drawn, Sightings, sighting_loss
 from stages.neural.terms import Terms
 from stages.neural.terms.planar import has_feature_mlp
 from stages.neural.training_photos import Photos, RayBatch
@@ -34,6 +36,35 @@ if TYPE_CHECKING:
 HULL_STEPS, HULL_POINTS = 200, 2048
 # Rays go where they are needed once there is a shape that says where; that is asked at each so many refreshes.
 NEEDED_FROM, LOOK_EVERY = 0.1, 2
+# Where memory runs out, a step renders its rays in parts, but never fewer than this at once.
+FEWEST_RAYS = 16
+
+
+class _Extra(NamedTuple):
+    """Points of a step besides those on its rays."""
+
+    sparse: Drawn
+    dense: Drawn
+    anywhere: Float[Tensor, "f 3"]
+
+    @property
+    def places(self) -> Float[Tensor, "e 3"]:
+        return torch.cat([self.sparse.places, self.dense.places, self.anywhere])
+
+
+class _Part(NamedTuple):
+    """What some of a step's rays give.
+
+    Attributes:
+        numbers: their shares of the step's losses and means, which add up over its parts.
+        ray_error: colour error, which says where rays are needed. squared: mean of the channels' squares.
+        trust: the least of their weights.
+    """
+
+    numbers: dict[str, Tensor]
+    ray_error: Float[Tensor, " r"]
+    squared: Float[Tensor, " r"]
+    trust: Float[Tensor, ""]
 
 
 def field_shape(params: TrainParams, num_images: int, background: bool) -> FieldShape:
@@ -149,52 +180,99 @@ class Trainer:
         self._set_rates(decay(progress, schedule.lr_warm_up, schedule.lr_final))
         sparse_weight = weights.sparse * schedules.fade_out(progress, weights.sparse_until)
         if self.replay is None:
-            numbers = self._update(moment, sparse_weight)
+            numbers = self._with_rays_that_fit(lambda rays: self._gradients(moment, sparse_weight, rays))
+            self.optimizer.step()
         else:
             self._scale.fill_(moment.scale)
             self._outlined.fill_(moment.outlined)
             self._sparse_weight.fill_(sparse_weight)
             current = replace(moment, scale=self._scale, outlined=self._outlined)
             kind = moment.levels, moment.samples, moment.deferred, self.terms.begun(moment)
-            numbers = self.replay(lambda: self._update(current, self._sparse_weight), kind)
+            replay, weight = self.replay, self._sparse_weight
+            numbers = self._with_rays_that_fit(
+                lambda rays: replay(lambda: self._update(current, weight, rays), (*kind, rays))
+            )
         self.step_index += 1
         return numbers
 
-    def _update(self, moment: Moment, sparse_weight: Tensor | float) -> dict[str, Tensor]:
+    def _with_rays_that_fit(self, work: Callable[[int], dict[str, Tensor]]) -> dict[str, Tensor]:
+        """`work`, told how many rays to render at once: those of the step, or fewer where memory runs out.
+
+        It draws the same rays each time.
+        """
+        drawn_from, most = self.generator.get_state(), self.params.sampling.rays
+
+        def attempt(rays: int) -> dict[str, Tensor]:
+            if rays < most:
+                self.generator.set_state(drawn_from)
+            return work(rays)
+
+        return with_less(attempt, most, "rays of a training step", FEWEST_RAYS)
+
+    def _update(self, moment: Moment, sparse_weight: Tensor | float, rays_at_once: int) -> dict[str, Tensor]:
         """Rays, losses, gradients, and the optimiser's step."""
+        numbers = self._gradients(moment, sparse_weight, rays_at_once)
+        self.optimizer.step()
+        return numbers
+
+    def _gradients(self, moment: Moment, sparse_weight: Tensor | float, rays_at_once: int) -> dict[str, Tensor]:
+        """Rays, losses, and their gradients, which add up over parts of the rays; returns the step's numbers."""
         sampling, weights = self.params.sampling, self.params.losses
         batch, cells = self.needed.draw(sampling.rays, self.generator)
-        sparse = self.sightings.draw(weights.sparse_batch, weights.sparse_step, self.generator)
-        dense = self.dense.draw(weights.dense_batch, weights.dense_step, self.generator)
-        anywhere = torch.rand(sampling.free_points, 3, generator=self.generator, device=self.device) * 2 - 1
-        extra = torch.cat([sparse.places, dense.places, anywhere])
-        rendered = self.renderer.render(batch, moment, extra, self.generator)
-        exposed = rendered.colors * torch.exp(self.fields.log_gains[batch.images])
-        nothing = torch.zeros((), device=self.device)
-
-        ray_error = losses.rgb_error(exposed, batch.colors)
-        mask_loss = nothing
-        if batch.masks is not None:  # outside the masks nothing is known of the colour
-            ray_error = ray_error * batch.masks
-            mask_loss = losses.mask_error(rendered.opacity, batch.masks).mean()
+        extra = _Extra(
+            self.sightings.draw(weights.sparse_batch, weights.sparse_step, self.generator),
+            self.dense.draw(weights.dense_batch, weights.dense_step, self.generator),
+            torch.rand(sampling.free_points, 3, generator=self.generator, device=self.device) * 2 - 1,
+        )
+        self._forget_gradients()
+        parts = [
+            self._part(batch, slice(first, first + rays_at_once), extra, moment, sparse_weight)
+            for first in range(0, max(len(batch), 1), rays_at_once)
+        ]
+        ray_error, squared = (torch.cat(each) for each in zip(*((p.ray_error, p.squared) for p in parts), strict=True))
         self.needed.learn(cells, ray_error)
+        masks = batch.masks
+        mse = squared.mean() if masks is None else (masks * squared).sum() / masks.sum().clamp(min=1)
+        numbers = {
+            name: sum((part.numbers[name] for part in parts[1:]), of_first)
+            for name, of_first in parts[0].numbers.items()
+        }
+        psnr, trust = -10 * torch.log10(mse.clamp(min=1e-10)), torch.stack([part.trust for part in parts]).min()
+        return {**numbers, "psnr": psnr, "trust": trust}
+
+    def _part(
+        self, batch: RayBatch, rows: slice, extra: _Extra, moment: Moment, sparse_weight: Tensor | float
+    ) -> _Part:
+        """Render some rows of the batch, with the first of them the extra points; add their gradients of the loss."""
+        weights = self.params.losses
+        is_first, is_all = rows.start == 0, rows.stop >= len(batch)
+        part = batch if is_first and is_all else batch.select(rows)
+        places = extra.places if is_first else None
+        rendered = self.renderer.render(part, moment, places, self.generator)
+        exposed = rendered.colors * torch.exp(self.fields.log_gains[part.images])
+        nothing = torch.zeros((), device=self.device)
+        share = len(part) / max(len(batch), 1)
+
+        ray_error = losses.rgb_error(exposed, part.colors)
+        mask_loss = nothing
+        if part.masks is not None:  # outside the masks nothing is known of the colour
+            ray_error = ray_error * part.masks
+            mask_loss = share * losses.mask_error(rendered.opacity, part.masks).mean()
         trust = self.terms.color_weight(rendered, exposed, moment)
-        rgb_loss = (ray_error * trust).mean()
+        rgb_loss = share * (ray_error * trust).mean()
         omega = self.terms.eikonal_weight(rendered, ray_error, trust, moment)
-        eikonal_loss = torch.cat(
+        eikonal_errors = torch.cat(
             [omega * losses.eikonal_error(rendered.gradients), losses.eikonal_error(rendered.extra_gradients)]
-        ).mean()
-        of_terms = self.terms.losses(rendered, moment)
-        first, last = len(sparse.places), len(sparse.places) + len(dense.places)
-        sparse_loss = sighting_loss(
-            rendered.extra_sdf[:first], sparse.weights, weights.sparse_tolerance, weights.sparse_step
         )
-        dense_loss = sighting_loss(
-            rendered.extra_sdf[first:last], dense.weights, weights.dense_tolerance, weights.dense_step
-        )
-        gloss_loss = rendered.gloss.mean()
-        exposure_loss = losses.exposure_error(self.fields.log_gains).mean()
-        proposal_loss = self._proposal_loss(rendered)
+        num_points = len(batch) * rendered.weights.shape[1] + len(extra.places)
+        eikonal_loss = len(eikonal_errors) / max(num_points, 1) * eikonal_errors.mean()
+        of_terms = {name: (w, share * loss) for name, (w, loss) in self.terms.losses(rendered, moment).items()}
+        sparse_loss = dense_loss = exposure_loss = nothing
+        if is_first:
+            sparse_loss, dense_loss = self._sighting_losses(rendered, extra)
+            exposure_loss = losses.exposure_error(self.fields.log_gains).mean()
+        gloss_loss = share * rendered.gloss.mean()
+        proposal_loss = share * self._proposal_loss(rendered)
 
         loss = (
             rgb_loss
@@ -207,17 +285,10 @@ class Trainer:
             + weights.gloss * gloss_loss
             + proposal_loss
         )
-        self._forget_gradients()
         with short_products(self.mixed, self.device):
             loss.backward()
-        self.optimizer.step()
         with torch.no_grad():
-            squared = ((exposed - batch.colors) ** 2).mean(1)
-            if batch.masks is None:
-                mse = squared.mean()
-            else:
-                mse = (batch.masks * squared).sum() / batch.masks.sum().clamp(min=1)
-            return {
+            numbers = {
                 "loss": loss.detach(),
                 "rgb": rgb_loss.detach(),
                 "eikonal": eikonal_loss.detach(),
@@ -226,13 +297,22 @@ class Trainer:
                 "dense": dense_loss.detach(),
                 "mask": mask_loss.detach(),
                 "proposal": proposal_loss.detach(),
-                "psnr": -10 * torch.log10(mse.clamp(min=1e-10)),
-                "gradient_norm": torch.linalg.vector_norm(rendered.gradients, dim=1).mean(),
-                "opacity": rendered.opacity.detach().mean(),
-                "gloss": rendered.gloss.detach().mean(),
-                "reflected": rendered.reflected.mean(),
-                "trust": trust.detach().min(),
+                "gradient_norm": share * torch.linalg.vector_norm(rendered.gradients, dim=1).mean(),
+                "opacity": share * rendered.opacity.detach().mean(),
+                "gloss": gloss_loss.detach(),
+                "reflected": share * rendered.reflected.mean(),
             }
+            squared = ((exposed - part.colors) ** 2).mean(1)
+            return _Part(numbers, ray_error.detach(), squared, trust.detach().min())
+
+    def _sighting_losses(self, rendered: Rendered, extra: _Extra) -> tuple[Tensor, Tensor]:
+        """Of the sparse points and of the dense ones, at the extra points."""
+        weights, sparse, dense = self.params.losses, extra.sparse, extra.dense
+        of_sparse, of_dense, _ = rendered.extra_sdf.split([len(sparse.places), len(dense.places), len(extra.anywhere)])
+        return (
+            sighting_loss(of_sparse, sparse.weights, weights.sparse_tolerance, weights.sparse_step),
+            sighting_loss(of_dense, dense.weights, weights.dense_tolerance, weights.dense_step),
+        )
 
     def _replays(self) -> bool:
         """Whether steps can be a CUDA graph: few things change in how they go, each a few times.
@@ -299,9 +379,13 @@ class Trainer:
     @torch.no_grad()
     def distances(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
         """The SDF at points, with all levels."""
-        parts = torch.from_numpy(points).float().to(self.device).split(points_at_a_time(self.device))
-        levels = self.params.field.levels
-        return torch.cat([self.fields.sdf.sdf(part, levels) for part in parts]).cpu().numpy()
+        places, levels = torch.from_numpy(points).float().to(self.device), self.params.field.levels
+
+        def evaluate(rows: slice) -> Tensor:
+            return self.fields.sdf.sdf(places[rows], levels)
+
+        parts = in_blocks(evaluate, len(places), points_at_a_time(self.device), "points of the field")
+        return torch.cat(parts).cpu().numpy()
 
     def coarse_surface(self) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:
         """Vertices of the surface in the sampler's grid; its faces that lie within the region, turned outwards."""
@@ -326,7 +410,10 @@ class Trainer:
         y, x = torch.meshgrid(torch.arange(0, photo_height, step), torch.arange(0, photo_width, step), indexing="ij")
         pixels = torch.stack([x, y], 2).view(-1, 2).float().to(self.device)
         photo, color, normal = (torch.zeros(len(pixels), 3) for _ in range(3))
-        for part in torch.arange(len(pixels), device=self.device).split(4096):
+        every = torch.arange(len(pixels), device=self.device)
+
+        def draw(some: slice) -> None:
+            part = every[some]
             batch = self.photos.rays(torch.full_like(part, image), pixels[part])
             rendered = self.render(batch, progress)
             rows = part[batch.drawn].cpu()
@@ -334,6 +421,8 @@ class Trainer:
             photo[rows] = batch.colors.cpu()
             color[rows] = (rendered.colors * torch.exp(self.fields.log_gains[image])).clamp(0, 1).cpu()
             normal[rows] = (normals * 0.5 + 0.5).cpu()
+
+        in_blocks(draw, len(pixels), RAYS_AT_ONCE, RENDERED)
         panels = [panel.view(*x.shape, 3) for panel in (photo, color, normal)]
         return (255 * torch.cat(panels, 1)).byte().numpy()
 

@@ -6,8 +6,8 @@ Shapes: I photos, T pixels of all photos together, R rays.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -39,6 +39,14 @@ class RayBatch(Rays):
     images: Int[Tensor, " r"]
     colors: Float[Tensor, "r 3"]
     masks: Float[Tensor, " r"] | None
+
+    def select(self, rows: slice) -> RayBatch:
+        """Some of the rays."""
+
+        def part(values: Any) -> Any:
+            return None if values is None else values[rows]
+
+        return RayBatch(*(part(getattr(self, each.name)) for each in fields(self)))
 
 
 class Photos:

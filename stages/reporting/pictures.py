@@ -21,7 +21,8 @@ def read_rgb(path: Path) -> np.ndarray:
     """[H, W, 3] uint8 RGB. Raises ValueError where the file is no image."""
     import cv2
 
-    image = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_COLOR)
+    data = np.frombuffer(path.read_bytes(), np.uint8)
+    image = cv2.imdecode(data, cv2.IMREAD_COLOR) if len(data) else None
     if image is None:
         raise ValueError(f"expected an image, got {path}")
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)

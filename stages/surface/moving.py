@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from stages.blocks import in_blocks
 from stages.compiling import njit
 from stages.geometry.vectors import unit
-from stages.surface.triangle_mesh import MAX_RAYS, face_normals, raycaster, vertex_normals
+from stages.surface.triangle_mesh import MAX_RAYS, RAYS, face_normals, raycaster, vertex_normals
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
@@ -75,10 +76,13 @@ def within_gaps(
     """The moves, shortened to `GAP_PART` of the way to the next surface that is turned the other way."""
     scene, moves = raycaster(vertices, faces), moves.copy()
     moving = np.flatnonzero(moves.any(1))
-    for first in range(0, len(moving), MAX_RAYS):
-        part = moving[first : first + MAX_RAYS]
+
+    def shorten(some: slice) -> None:
+        part = moving[some]
         gaps = _gaps(scene, vertices, faces, directions, moves, part, RAY_START * cell)
         moves[part] *= np.minimum(1, GAP_PART * gaps / np.linalg.norm(moves[part], axis=1))[:, None]
+
+    in_blocks(shorten, len(moving), MAX_RAYS, RAYS)
     return moves
 
 

@@ -10,9 +10,11 @@ from typing import Any
 
 import numpy as np
 
+from stages.blocks import in_blocks
 from stages.geometry.cameras import PinholeCameras
 from stages.surface.triangle_mesh import (
     MAX_RAYS,
+    RAYS,
     face_adjacency,
     face_areas,
     label_pieces,
@@ -72,10 +74,12 @@ def count_views(
         facing = cosines[open_vertices, camera] > MIN_COSINE
         open_vertices, camera = open_vertices[facing], camera[facing]
         cosines[open_vertices, camera] = -1
-        for begin in range(0, len(open_vertices), MAX_RAYS):
-            part = slice(begin, begin + MAX_RAYS)
-            index = open_vertices[part]
-            views[index[~_hidden(scene, starts[index], cameras.centers[camera[part]])]] += 1
+
+        def hidden(part: slice, index: np.ndarray = open_vertices, camera: np.ndarray = camera) -> np.ndarray:
+            return _hidden(scene, starts[index[part]], cameras.centers[camera[part]])
+
+        parts = in_blocks(hidden, len(open_vertices), MAX_RAYS, RAYS)
+        views[open_vertices[~np.concatenate([np.zeros(0, bool), *parts])]] += 1
         open_vertices = open_vertices[views[open_vertices] < enough]
         if progress is not None:
             progress(rank + 1, len(cameras))

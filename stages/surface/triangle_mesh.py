@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-# Rays cast in one call, to bound memory.
-MAX_RAYS = 1 << 20
+# Rays cast in one call, to bound memory, and what they are called where it runs out.
+MAX_RAYS, RAYS = 1 << 20, "rays at a mesh"
 
 
 def face_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:

@@ -20,6 +20,7 @@ from functools import partial
 import numpy as np
 
 from stages.artifacts import AtlasMesh
+from stages.blocks import in_blocks
 from stages.drawing.rasterizing import Texels, surface_points
 from stages.geometry.cameras import PinholeCameras
 from stages.texture.filling import face_neighbors, harmonic_offsets, vertex_means
@@ -126,16 +127,25 @@ def bake_texture(
         gains, sharpness = _compare(atlas, texels, views_of.in_order(pool, workers), num_views, tell)
         if not gain:
             gains = np.ones((num_views, 3))
-        bands = _bands(num_texels, views, SMALL_BAND_BYTES if len(views_of.kept) == num_views else BAND_BYTES)
+        room = SMALL_BAND_BYTES if len(views_of.kept) == num_views else BAND_BYTES
         blend = partial(blend_texels, detail=detail, robust_sigma=robust_sigma, diffuse=diffuse)
-        for number, band in enumerate(bands):
-            prepared = views_of.in_order(pool, workers)
-            if visit is not None and number == 0:
-                prepared = _visited(prepared, visit, gains)
-            _blend(
+        unvisited = set(range(num_views)) if visit is not None else set()
+
+        def prepared() -> Iterator[View]:
+            for index, view in enumerate(views_of.in_order(pool, workers)):
+                if visit is not None and index in unvisited:
+                    visit(index, view, gains[index])
+                    unvisited.remove(index)
+                yield view
+
+        def blend_band(band: slice) -> None:
+            share = (band.stop - band.start) / num_texels
+            colors[band], seen_by[band] = _blend(
                 pool, *surface_points(atlas, texels.face_ids[band], texels.corner[band]), gains, sharpness,
-                prepared, views, blend, colors[band], seen_by[band], partial(tell, "blending photos", 1 / len(bands)),
+                prepared(), views, blend, partial(tell, "blending photos", share),
             )  # fmt: skip
+
+        in_blocks(blend_band, num_texels, max(room // (16 * (views + 1)), _CHUNK), "texels blended")
         views_of.kept.clear()
 
     seen = seen_by > 0
@@ -162,18 +172,6 @@ def bake_texture(
             "blurred_photos": int((sharpness < BLURRED).sum()),
         },
     )
-
-
-def _bands(num_texels: int, views: int, room: int) -> list[slice]:
-    """Texels that are blended together, within `room` bytes."""
-    length = max(room // (16 * (views + 1)), _CHUNK)
-    return [slice(start, min(start + length, num_texels)) for start in range(0, num_texels, length)]
-
-
-def _visited(prepared: Iterator[View], visit: Visitor, gains: np.ndarray) -> Iterator[View]:
-    for index, view in enumerate(prepared):
-        visit(index, view, gains[index])
-        yield view
 
 
 def _compare(
@@ -207,12 +205,11 @@ def _blend(
     prepared: Iterator[View],
     keep: int,
     blend: Callable[..., None],
-    colors: np.ndarray,
-    seen_by: np.ndarray,
     tell: Callable[[], None],
-) -> None:
-    """Fill colors [T, 3] uint8 and the number of photos that see each texel [T]."""
+) -> tuple[np.ndarray, np.ndarray]:
+    """Colors [T, 3] uint8 and the number of photos that see each texel [T] uint16."""
     count = len(points)
+    colors, seen_by = np.zeros((count, 3), dtype=np.uint8), np.zeros(count, dtype=np.uint16)
     # One view more than is blended: the others' weights are measured against it.
     best_weights = np.zeros((count, keep + 1), dtype=np.float32)
     best_lows = np.zeros((count, keep + 1, 3), dtype=np.uint16)
@@ -234,6 +231,7 @@ def _blend(
         blend(best_weights[part], best_lows[part], best_highs[part], colors=colors[part])
 
     list(pool.map(finish, chunks))
+    return colors, seen_by
 
 
 def _fill_unseen(
@@ -260,11 +258,14 @@ def _fill_unseen(
         offsets[ids] = photo_means - 255.0 * color_field(centers, center_normals, -center_normals)
     spread = harmonic_offsets(known, offsets, face_neighbors(atlas.vertices, atlas.faces))
     at_vertices = vertex_means(spread, atlas.vertices, atlas.faces)
-    for start in range(0, len(unseen), _CHUNK):
-        part = unseen[start : start + _CHUNK]
+
+    def fill(rows: slice) -> None:
+        part = unseen[rows]
         faces, corner = texels.face_ids[part], texels.corner[part]
         points, normals = surface_points(atlas, faces, corner)
         answer = 255.0 * color_field(points, normals, -normals)
         for k in range(3):
             answer = answer + corner[:, k, None] * at_vertices[atlas.faces[faces, k]]
         colors[part] = np.clip(answer + 0.5, 0, 255).astype(np.uint8)
+
+    in_blocks(fill, len(unseen), _CHUNK, "texels that no photo saw")

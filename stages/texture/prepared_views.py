@@ -9,14 +9,16 @@ import numpy as np
 
 from stages.artifacts import AtlasMesh
 from stages.geometry.cameras import PinholeCameras
+from stages.limits import available_memory
 from stages.surface.triangle_mesh import face_areas
 from stages.texture.photo_views import View, prepare_view
 
 # (photo index) -> [H, W, 3] uint8 RGB and [H, W] bool mask or None.
 LoadPhoto = Callable[[int], tuple[np.ndarray, np.ndarray | None]]
 
-# Prepared photos that stay in memory for the next pass; the others are made again.
-KEPT_BYTES = 1 << 30
+# Prepared photos that stay in memory for the next pass: bytes at most, and part of what is free at most. The others are
+# made again.
+KEPT_BYTES, KEPT_SHARE = 1 << 30, 0.25
 # Photos made ready ahead of use.
 MOST_AHEAD = 8
 
@@ -29,7 +31,7 @@ class PreparedViews:
         # mean, scene units
         self.texel_side = float(np.sqrt(face_areas(atlas.vertices, atlas.faces).sum() / num_texels))
         self.kept: dict[int, View] = {}
-        self.room = KEPT_BYTES
+        self.room = min(KEPT_BYTES, int(KEPT_SHARE * available_memory()))
 
     def __len__(self) -> int:
         return len(self.cameras)

@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 
 from stages.artifacts import AtlasMesh
+from stages.blocks import in_blocks
 from stages.drawing.rasterizing import Texels, rasterize_atlas, surface_points
 from stages.geometry.vectors import unit
-from stages.surface.triangle_mesh import MAX_RAYS, face_areas, median_edge, raycaster, vertex_normals
+from stages.surface.triangle_mesh import MAX_RAYS, RAYS, face_areas, median_edge, raycaster, vertex_normals
 from stages.texture.padding import pad_charts
 from stages.texture.tangents import to_tangent_space, vertex_tangents
 
@@ -77,16 +78,17 @@ def bake_normals(
     scene, full_normals = raycaster(vertices, faces), vertex_normals(vertices, faces).astype(np.float32)
     colors = np.empty((len(texels), 3), dtype=np.uint8)
     colors[:] = FLAT
-    met = 0
-    for begin in range(0, len(texels), MAX_RAYS // 2):
-        part = slice(begin, begin + MAX_RAYS // 2)
+
+    def look(part: slice) -> int:
         ids, weights = texels.face_ids[part], texels.corner[part]
         points, normals = surface_points(atlas, ids, weights)
         found, normals_there = _normals_near(scene, full_normals, faces, points, normals, reach[ids])
         frame = np.einsum("tk,tkc->tc", weights[found], tangents[atlas.faces[ids[found]]])
         colors[part][found] = encode(to_tangent_space(normals_there[found], normals[found], frame))
-        met += int(np.count_nonzero(found))
-        tell(begin + len(ids), len(texels))
+        tell(part.stop, len(texels))
+        return int(np.count_nonzero(found))
+
+    met = sum(in_blocks(look, len(texels), MAX_RAYS // 2, RAYS))
     filled, _ = pad_charts(*texels.paint(colors))
     return filled, met / max(len(texels), 1)
 
@@ -144,11 +146,13 @@ def bake_occlusion(
     points, normals = surface_points(atlas, texels.face_ids[chosen], texels.corner[chosen])
     openness = sky_seen(atlas.vertices, atlas.faces, points, normals, rays, reach, listener)
     grey = np.empty((len(texels), 1), dtype=np.uint8)
-    for begin in range(0, len(texels), SPREAD):
-        part = slice(begin, begin + SPREAD)
+
+    def carry(part: slice) -> None:
         there, _ = surface_points(atlas, texels.face_ids[part], texels.corner[part])
         spread = spread_samples(openness, points, cell_of, texels.index[part], there, texels.size, side)
         grey[part, 0] = np.clip(255 * spread + 0.5, 0, 255)
+
+    in_blocks(carry, len(texels), SPREAD, "texels that take their occlusion")
     image, inside = texels.paint(np.repeat(grey, 3, axis=1))
     return pad_charts(image, inside)[0][..., 0].copy()
 
@@ -180,8 +184,8 @@ def sky_seen(
     order = np.arange(rays) + 0.5
     radius, angle = np.sqrt(order / rays), np.pi * (1 + np.sqrt(5)) * order
     free = np.zeros(len(points))
-    for begin in range(0, len(points), max(MAX_RAYS // rays, 1)):
-        part = slice(begin, begin + max(MAX_RAYS // rays, 1))
+
+    def look(part: slice) -> None:
         turned = angle + turns[part, None]
         x, y = radius * np.cos(turned), radius * np.sin(turned)
         z = np.sqrt(1 - radius**2)
@@ -191,7 +195,9 @@ def sky_seen(
         bundle = np.concatenate([np.broadcast_to(starts[part, None], directions.shape), directions], axis=2)
         hidden = scene.test_occlusions(o3d.core.Tensor(bundle.astype(np.float32)), tnear=0.0, tfar=reach).numpy()
         free[part] = 1 - hidden.mean(1)
-        tell(begin + len(hidden), len(points))
+        tell(part.stop, len(points))
+
+    in_blocks(look, len(points), max(MAX_RAYS // rays, 1), "points that look at the sky", least=1)
     return free
 
 

@@ -9,15 +9,17 @@ import json
 import os
 import shutil
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from hypothesis import strategies as st
 from hypothesis.strategies import DrawFn, SearchStrategy
 from mutations import NUMBERS, WORDS, encoded, wrong_bytes, wrong_text, wrong_tree
-from tiny import RUN, STAGES, WITHIN_S, Tiny
+from tiny import RELIGHTABLE, RUN, STAGES, WITHIN_S, Tiny, make_up_materials
 from trust_runs import SECONDS
+
+from stages.engine.manifest import describe_outputs, load_manifest
 
 Commands = Sequence[Sequence[str]]
 TAKING_IN = ("-w", "w", "--until", "ingest", *RUN)
@@ -31,12 +33,14 @@ class EntryPoint:
         share: its part of all inputs, relative to the others'.
         lay: draws an input into a folder, and gives the commands to try there.
         seconds: that a command may take.
+        first: called in the command's process before it.
     """
 
     name: str
     share: int
     lay: Callable[[DrawFn, Tiny, Path], Commands]
     seconds: float = SECONDS
+    first: Callable[[], None] | None = None
 
 
 def wrong_file(draw: DrawFn, valid: Path, place: Path) -> None:
@@ -212,6 +216,25 @@ def _artifact(draw: DrawFn, tiny: Tiny, folder: Path) -> Commands:
     return [["run", str(tiny.photos), "-w", "w", "--from", after, "--until", after, *RUN]]
 
 
+def _materials(draw: DrawFn, tiny: Tiny, folder: Path) -> Commands:
+    """What is drawn, exported and shown; half of the time it says itself that it is as it was published."""
+    shutil.copytree(tiny.relightable, folder / "w")
+    stage = folder / "w" / "materials"
+    name = draw(st.sampled_from(("base_color.png", "orm.png", "known.png", "light.exr", "light.hdr", "light.json")))
+    (stage / name).unlink()
+    wrong_file(draw, tiny.relightable / "materials" / name, stage / name)
+    if draw(st.booleans()):
+        manifest = load_manifest(stage)
+        (stage / "manifest.json").unlink()
+        outputs = {**manifest.outputs, **describe_outputs(stage)}
+        (stage / "manifest.json").write_text(replace(manifest, outputs=outputs).to_json(sealed=True))
+    run = ("run", str(tiny.photos), "-w", "w", *RUN, *RELIGHTABLE)
+    return [
+        ["relight", "w", "--light", "learned", "--out", "a.png", "--size", "32x32"],
+        [*run, "--from", "export", "--until", draw(st.sampled_from(("export", "report")))],
+    ]
+
+
 _word: SearchStrategy[Any] = st.sampled_from((*NUMBERS, *WORDS, "[1, 2", "{a: 1}", "- 1", "1, 2, 3", "0.0"))
 
 ENTRY_POINTS = (
@@ -229,6 +252,7 @@ ENTRY_POINTS = (
     EntryPoint("light", 6, _light),
     EntryPoint("record of a workspace", 8, _record),
     EntryPoint("artifact of a stage", 6, _artifact, WITHIN_S),
+    EntryPoint("materials of a workspace", 2, _materials, first=make_up_materials),
 )
 
 

@@ -14,7 +14,7 @@ from trust_runs import run_hineus
 
 pytestmark = pytest.mark.slow
 
-WHOLE, SHARE = 12, 1  # inputs for each unit of an entry point's share
+WHOLE, SHARE = 12, 0.5  # inputs for each unit of an entry point's share
 PLANTED = "from pathlib import Path\nPath(__file__).with_name('executed').touch()\n"
 
 
@@ -31,7 +31,7 @@ def test_wrong_input_gets_a_sentence(entry: EntryPoint, tiny: Tiny, whole: bool,
 
     @seed(1)
     @settings(
-        max_examples=entry.share * (WHOLE if whole else SHARE),
+        max_examples=int(entry.share * (WHOLE if whole else SHARE)),
         database=None,
         phases=[Phase.generate],
         suppress_health_check=list(HealthCheck),
@@ -41,7 +41,7 @@ def test_wrong_input_gets_a_sentence(entry: EntryPoint, tiny: Tiny, whole: bool,
         place, commands = laid
         bad = False
         for command in commands:
-            ended = run_hineus(command, place, entry.seconds)
+            ended = run_hineus(command, place, entry.seconds, first=entry.first)
             record_trust(entry.name, ended)
             if fault := ended.fault():
                 bad = True
@@ -80,11 +80,12 @@ def test_what_went_wrong_once_does_no_more(case: Path, tiny: Tiny, tmp_path: Pat
         assert not ended.fault(), ended.output
 
 
-def test_code_that_lies_about_is_not_run(tiny: Tiny, tmp_path: Path):
+def test_code_that_lies_about_is_not_run(tiny: Tiny, whole: bool, tmp_path: Path):
     place = tmp_path / "here"
     shutil.copytree(tiny.workspace, place / "w")
     for name in ("numpy", "torch", "cv2", "xatlas", "pymeshlab", "secrets", "stages", "sitecustomize"):
         (place / f"{name}.py").write_text(PLANTED)
-    for command in (["doctor"], ["run", str(tiny.photos), "-w", "w", "--from", "atlas", "--until", "atlas", *RUN]):
+    commands = [["run", str(tiny.photos), "-w", "w", "--from", "atlas", "--until", "atlas", *RUN]]
+    for command in [["doctor"], *commands] if whole else commands:  # the doctor takes seconds
         ended = run_hineus(command, place, 120, environment={"PYTHONPATH": f":{place}"})
         assert not (place / "executed").exists(), ended.output

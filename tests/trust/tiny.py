@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from trust_runs import Ended, run_hineus, run_in_child
 
+from configs.params import MaterialsParams
+from stages.engine.stage import StageContext
 from stages.pipeline import PIPELINE
 
 PHOTOS, SIZE = 12, (480, 360)
@@ -22,6 +25,7 @@ SETTINGS = {
 }
 RUN = ["--preset", "tiny", "--deterministic", "--workers", "1", "--device", "cpu"]
 RUN += [word for name, value in SETTINGS.items() for word in ("--set", f"{name}={value}")]
+RELIGHTABLE = ["--set", "materials.enabled=true"]
 WITHIN_S = 300.0
 STAGES = [stage.name for stage in PIPELINE]
 HOLD_TIMES = ("manifest.json", "report.html")
@@ -32,7 +36,7 @@ class Tiny:
     """A finished run.
 
     Attributes:
-        folder: holds `photos` (and the truth beside them), `workspace` and `inputs`.
+        folder: holds `photos` (and the truth beside them), `workspace`, `relightable` and `inputs`.
     """
 
     folder: Path
@@ -45,9 +49,22 @@ class Tiny:
     def workspace(self) -> Path:
         return self.folder / "workspace"
 
+    @property
+    def relightable(self) -> Path:
+        """The same with materials and a light, which are made up: to learn them takes a minute."""
+        return self.folder / "relightable"
+
     def input(self, name: str) -> Path:
         """A valid input of the kind that the name says."""
         return self.folder / "inputs" / name
+
+    def begun(self, workspace: Path, stages: Sequence[str]) -> Path:
+        """A workspace in which these stages, the first ones, are done."""
+        workspace.mkdir()
+        shutil.copy(self.workspace / "workspace.json", workspace)
+        for stage in stages:
+            shutil.copytree(self.workspace / stage, workspace / stage)
+        return workspace
 
     def run(self, workspace: Path, *more: str, seconds: float = WITHIN_S, **extra: object) -> Ended:
         """The same run in another workspace."""
@@ -61,12 +78,39 @@ def make_tiny(folder: Path) -> Tiny:
     _child(folder, _photos, folder)
     ended = tiny.run(tiny.workspace)
     assert ended.code == 0, ended.output
+    shutil.copytree(tiny.workspace, tiny.relightable)
+    ended = tiny.run(tiny.relightable, *RELIGHTABLE, first=make_up_materials)
+    assert ended.code == 0, ended.output
     tiny.input("").mkdir()
     for command, name in (("export-colmap", "colmap"), ("export-transforms", "nerfstudio")):
         ended = run_hineus([command, str(tiny.workspace), str(tiny.input(name))], folder, WITHIN_S)
         assert ended.code == 0, ended.output
     _child(folder, _inputs, tiny)
     return tiny
+
+
+def make_up_materials() -> None:
+    """Let the stage of the materials leave a matte thing in the light of a window, in this process."""
+    from stages import artifacts
+    from stages.files.light_files import harmonics_json, write_exr, write_hdr
+    from stages.light.built_in import LIGHTS
+    from stages.materials import MATERIALS
+
+    def run(context: StageContext[MaterialsParams]) -> dict[str, Any]:
+        if not context.params.enabled:
+            return {}
+        light = LIGHTS["window"](32)
+        shutil.copy(context.read(artifacts.BASE_COLOR), context.to_write(artifacts.MATERIAL_COLOR))
+        side = context.read(artifacts.ATLAS_MESH).texture_size
+        artifacts.write_png(context.to_write(artifacts.ORM), np.full((side, side, 3), (255, 200, 0), np.uint8))
+        artifacts.write_png(context.to_write(artifacts.KNOWN), np.full((side, side), 255, np.uint8))
+        write_exr(context.to_write(artifacts.LIGHT), light)
+        write_hdr(context.to_write(artifacts.LIGHT_HDR), light)
+        artifacts.write_json(context.to_write(artifacts.LIGHT_HARMONICS), harmonics_json(light))
+        of_all = {"share": 1.0, "metallic": False, "roughness": 0.784, "roughness_told": True}
+        return {"materials": [of_all], "light_max_over_mean": 9.0, "gain_min": 1.0, "gain_max": 1.0, "cost": 0.1}
+
+    object.__setattr__(MATERIALS, "run", run)  # the record is frozen, and all know this one
 
 
 def _child(folder: Path, work: object, *arguments: object) -> None:

@@ -20,7 +20,6 @@ from stages.evaluation.photos.regions import WHITE, judge
 from stages.geometry.cameras import PinholeCameras
 from stages.neural.drawing import FieldDrawer
 from stages.neural.trained_field import load_field
-from stages.reporting.pictures import read_rgb
 
 log = logging.getLogger(__name__)
 
@@ -53,7 +52,7 @@ def score_photos(
     drawer = field_drawer(workspace, device)
     if textured:
         atlas = artifacts.ATLAS_MESH.load(workspace.stage_folder("atlas"))
-        texture = read_rgb(artifacts.BASE_COLOR.load(workspace.stage_folder("bake")))
+        texture = artifacts.read_texture(artifacts.BASE_COLOR.load(workspace.stage_folder("bake")))
     kinds = ("field", "mesh") if textured else ("field",)
     photos: list[dict[str, Any]] = []
     for index in indices:

@@ -157,14 +157,17 @@ def _share_poses(first: Path, place: Path) -> None:
     if place.exists() or not is_workspace(first):
         return
     partial = place.with_name(f"{place.name}.partial")
-    with storage_errors(place, "copying the poses"):
+    shutil.rmtree(partial, ignore_errors=True)
+    try:
+        with storage_errors(place, "copying the poses"):
+            for name in SHARED:
+                if (first / name).is_dir():
+                    shutil.copytree(first / name, partial / name)
+            for name in (WORKSPACE_RECORD, "config.yaml"):
+                shutil.copyfile(first / name, partial / name)
+            partial.rename(place)
+    finally:
         shutil.rmtree(partial, ignore_errors=True)
-        for name in SHARED:
-            if (first / name).is_dir():
-                shutil.copytree(first / name, partial / name)
-        for name in (WORKSPACE_RECORD, "config.yaml"):
-            shutil.copyfile(first / name, partial / name)
-        partial.rename(place)
 
 
 def _costs(done: Reconstruction) -> dict[str, Any]:
