@@ -221,7 +221,7 @@ def _occlusion(path: Path, size: int) -> np.ndarray:
 
 MATERIALS: Stage[MaterialsParams] = Stage(
     name="materials",
-    version=2,
+    version=3,
     settings=lambda config: config.materials,
     run=run,
     sources=(GIVEN_LIGHT,),

@@ -22,6 +22,7 @@ from stages.shading.fitting import (
     decoded,
     find_light,
     grey_world,
+    greyed,
     levels_of,
     radiance_of,
     residuals,
@@ -157,7 +158,7 @@ def test_the_light_is_found_from_materials_and_stays_above_zero():
     costs = []
     for _ in range(4):
         light = find_light(
-            sphere.reflection, sphere.observed, sphere.weights, sphere.materials, light, rounds=2, smoothness=0.0
+            sphere.reflection, sphere.observed, sphere.weights, sphere.materials, light, rounds=2, smoothness=0, grey=0
         )
         assert light.min() > 0
         costs.append(whole.cost(light))
@@ -166,7 +167,14 @@ def test_the_light_is_found_from_materials_and_stays_above_zero():
     assert np.corrcoef(light.log().flatten(), sphere.light.log().flatten())[0, 1] > 0.7
     # from the true light there is nowhere to go
     at_truth = find_light(
-        sphere.reflection, sphere.observed, sphere.weights, sphere.materials, sphere.light, rounds=1, smoothness=0.0
+        sphere.reflection,
+        sphere.observed,
+        sphere.weights,
+        sphere.materials,
+        sphere.light,
+        rounds=1,
+        smoothness=0,
+        grey=0,
     )
     assert whole.cost(at_truth) < 1e-4
 
@@ -209,3 +217,17 @@ def test_points_of_no_material_do_not_break_the_light():
     light = find_light(sphere.reflection, nothing, sphere.weights, black, sphere.light)
     assert torch.isfinite(light).all()
     assert np.isfinite(Part(sphere.reflection, nothing, sphere.weights, black, torch.arange(20)).cost(light))
+
+
+def test_a_tint_that_only_one_side_has_fades_and_brightness_stays():
+    light = torch.ones(8, 3)
+    light[0] = torch.tensor([8.0, 1.0, 1.0])
+    after = greyed(light, 0.5)
+    torch.testing.assert_close(after.log().mean(1), light.log().mean(1))
+    assert 1 < after[0, 0] / after[0, 1] < 8
+    torch.testing.assert_close(greyed(light, 0.0), light)
+
+
+def test_a_tint_that_all_of_a_light_has_stays():
+    light = torch.tensor([[2.0, 1.0, 0.5]]) * torch.linspace(0.1, 4, 8)[:, None]
+    torch.testing.assert_close(greyed(light, 0.5), light)

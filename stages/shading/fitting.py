@@ -29,6 +29,9 @@ from stages.shading.reflection import Reflection
 LEVELS = len(ROUGHNESSES)
 # Coded colours differ by so much for reasons of their own: noise, poses, normals.
 SPREAD = 0.04
+# Part of a pixel's tint that each step takes from the whole light's: what is matte shows no tint of the light apart
+# from its own, so nothing else would hold it.
+GREY = 0.03
 # From here on (coded) a photo is clipped.
 CLIPPED = 0.98
 # A point's base colour is not its own while the light is searched, or it would explain all shading.
@@ -172,6 +175,7 @@ def find_light(
     rounds: int = 4,
     subsets: int = 6,
     smoothness: float = 0.02,
+    grey: float = GREY,
 ) -> Tensor:
     """The light [P, 3] that fits best, from a start that is nowhere 0.
 
@@ -186,7 +190,7 @@ def find_light(
     parts = [Part(reflection, observed, weights, materials, rows) for rows in chosen.chunk(subsets)]
     for _ in range(rounds):
         for part in parts:
-            light = smoothed(light * part.update(light), smoothness)
+            light = greyed(smoothed(light * part.update(light), smoothness), grey)
     return light
 
 
@@ -279,6 +283,13 @@ def smoothed(light: Tensor, share: float) -> Tensor:
     above, below = torch.cat([grid[:1], grid[:-1]]), torch.cat([grid[1:], grid[-1:]])
     mean = (grid.roll(1, 1) + grid.roll(-1, 1) + above + below) / 4
     return ((1 - share) * grid + share * mean).exp().reshape(-1, 3)
+
+
+def greyed(light: Tensor, share: float) -> Tensor:
+    """A light [P, 3] with a share of each pixel's tint (the ratios of its channels) taken from that of the whole."""
+    grid, whole = light.clamp_min(1e-6).log(), light.mean(0).clamp_min(1e-6).log()
+    tint, of_whole = grid - grid.mean(1, keepdim=True), whole - whole.mean()
+    return (grid + share * (of_whole - tint)).exp()
 
 
 def grey_world(light: Tensor, color: Tensor, solid_angles: Tensor) -> tuple[Tensor, Tensor]:
