@@ -202,6 +202,22 @@ def test_relightable_asks_for_materials_and_the_workspace_remembers_it(folder: P
     assert "materials:\n  enabled: true" in config.read_text()
 
 
+def test_splats_asks_for_them_and_the_workspace_remembers_it(folder: Path) -> None:
+    config = folder / "photos_hineus" / "config.yaml"
+    hineus("run", "photos")
+    assert "splats:\n  enabled: false" in config.read_text()
+    hineus("run", "photos", "--splats")
+    hineus("run", "photos")
+    assert "splats:\n  enabled: true" in config.read_text()
+
+
+def test_a_stage_that_is_off_is_turned_on_by_its_own_command(folder: Path) -> None:
+    config = folder / "photos_hineus" / "config.yaml"
+    hineus("splats", "photos")
+    assert "splats:\n  enabled: true" in config.read_text()
+    assert "materials:\n  enabled: false" in config.read_text()
+
+
 def test_watertight_sets_the_closed_mesh(folder: Path) -> None:
     hineus("run", "photos", "--watertight")
     assert "keep_closed: true" in (folder / "photos_hineus" / "config.yaml").read_text()

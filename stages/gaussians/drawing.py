@@ -89,7 +89,7 @@ class Drawing:
 
 @dataclass(frozen=True)
 class Gradients:
-    """Of a loss to the M Gaussians in an image, as `Gaussians` has them.
+    """Of a loss to the M Gaussians that show in an image, as `Gaussians` has them.
 
     Attributes:
         ids: [M] int32 which Gaussians.
@@ -176,16 +176,19 @@ def gradients(
     d_transmittance: Float32[np.ndarray, "h w"],
 ) -> Gradients:
     """Gradients to what was drawn, from those to the image over its background, and to the transmittance."""
-    found, camera, count = drawing.ellipses, drawing.camera, len(drawing.ellipses.ids)
+    found, camera = drawing.ellipses, drawing.camera
     parts = np.empty((len(found.members), kernels.PARTS), np.float32)
     kernels.blend_backward(
         found.starts, found.members, found.columns, found.means, found.conics, found.opacities, found.colors,
         found.boxes, drawing.image, drawing.transmittance, d_image, d_transmittance, parts,
     )  # fmt: skip
-    sums = np.empty((count, kernels.PARTS), np.float32)
+    sums = np.empty((len(found.ids), kernels.PARTS), np.float32)
     kernels.add_parts(found.first, found.places, parts, sums)
+    shows = sums.any(1)
+    ids, sums = found.ids[shows], sums[shows]
+    count = len(ids)
     answer = Gradients(
-        ids=found.ids,
+        ids=ids,
         centers=np.empty((count, 3), np.float32),
         rotations=np.empty((count, 4), np.float32),
         log_scales=np.empty((count, 3), np.float32),
@@ -194,7 +197,7 @@ def gradients(
         means=sums[:, :2],
     )
     kernels.project_backward(
-        found.ids, sums, gaussians.centers, gaussians.rotations, gaussians.log_scales, found.opacities,
+        ids, sums, gaussians.centers, gaussians.rotations, gaussians.log_scales, found.opacities,
         gaussians.harmonics, found.conics, found.colors, camera.pose, camera.position, camera.focal, camera.reach,
         answer.centers, answer.rotations, answer.log_scales, answer.opacity_logits, answer.harmonics,
     )  # fmt: skip
