@@ -18,6 +18,7 @@ from typer.testing import CliRunner, Result
 from configs.load import describe_settings
 from hineus_cli import options
 from hineus_cli.app import build_app
+from hineus_cli.commands.run import turned_on
 from hineus_cli.console import key_numbers, outcome_table, status_table
 from stages import machine_check as doctor
 from stages import reconstruct
@@ -26,6 +27,7 @@ from stages.engine.status import StageStatus
 from stages.engine.workspace import Workspace
 from stages.errors import ConfigError, InputError, ReconstructionError
 from stages.machine_check import Finding
+from stages.pipeline import PIPELINE
 
 REPOSITORY = Path(__file__).parents[1]
 
@@ -211,11 +213,12 @@ def test_splats_asks_for_them_and_the_workspace_remembers_it(folder: Path) -> No
     assert "splats:\n  enabled: true" in config.read_text()
 
 
-def test_a_stage_that_is_off_is_turned_on_by_its_own_command(folder: Path) -> None:
-    config = folder / "photos_hineus" / "config.yaml"
-    hineus("splats", "photos")
-    assert "splats:\n  enabled: true" in config.read_text()
-    assert "materials:\n  enabled: false" in config.read_text()
+def test_a_stage_that_is_off_is_turned_on_by_its_own_command() -> None:
+    asked = {stage.name: turned_on(stage) for stage in PIPELINE}
+    assert {name: sets for name, sets in asked.items() if sets} == {
+        "materials": ("materials.enabled=true",),
+        "splats": ("splats.enabled=true",),
+    }
 
 
 def test_watertight_sets_the_closed_mesh(folder: Path) -> None:

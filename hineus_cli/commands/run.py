@@ -54,14 +54,14 @@ def stage_command(stage: Stage) -> Callable[..., None]:
         as_json: Json = False,
         verbose: Verbose = False,
     ) -> None:
-        sets = (*_turned_on(stage), *request.sets)
+        sets = (*turned_on(stage), *request.sets)
         _run(context.obj, replace(request, sets=sets, until=stage.name, force=(stage.name,) if force else ()), verbose)
 
     command.__doc__ = f"Stage: {stage.summary or stage.name}."
     return command
 
 
-def _turned_on(stage: Stage) -> tuple[str, ...]:
+def turned_on(stage: Stage) -> tuple[str, ...]:
     """What is set where a stage that is off by default is asked for by its name."""
     from configs.params import Config
 
