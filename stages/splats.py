@@ -39,6 +39,7 @@ def run(context: StageContext[SplatsParams]) -> dict[str, Any]:
     import numba
 
     from stages.drawing.rasterizing import rasterize_atlas
+    from stages.gaussians import drawing, drawing_cuda
     from stages.gaussians.colours import degree_for, sweep
     from stages.gaussians.keeping import write_gaussians
     from stages.gaussians.placing import count_for, place
@@ -86,6 +87,7 @@ def run(context: StageContext[SplatsParams]) -> dict[str, Any]:
         gaussians, errors = refine(
             gaussians, anchors, targets, params.steps, round(GROWTH * count),
             lambda done, total, note: tell(_COLORED + (1 - _COLORED) * done / total, 1, note),
+            drawing_cuda if context.device == "cuda" and drawing_cuda.is_there() else drawing,
         )  # fmt: skip
     write_gaussians(context.to_write(SPLATS), gaussians)
     tell(1, 1, "done")

@@ -189,3 +189,25 @@ def test_the_number_of_threads_changes_nothing():
         numba.set_num_threads(before)
     for one, other in zip(*answers, strict=True):
         np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.gpu
+def test_gsplat_draws_the_same_and_leads_back_the_same():
+    pytest.importorskip("gsplat")
+    from stages.gaussians import drawing_cuda
+
+    cameras = some_cameras(160, 120)
+    cameras.intrinsics[0] = [[150, 0, 83], [0, 155, 58], [0, 0, 1]]
+    gaussians, camera = some_gaussians(2000), camera_of(cameras, 0)
+    rng = np.random.default_rng(1)
+    d_image, d_open = rng.normal(0, 1, (120, 160, 3)).astype(np.float32), np.zeros((120, 160), np.float32)
+    ours, theirs = render(gaussians, camera, BACKGROUND), drawing_cuda.render(gaussians, camera, BACKGROUND)
+    # A pixel that one of both is done with an ellipse earlier differs by less than what was left open.
+    assert np.quantile(np.abs(ours.image - theirs.image), 0.999) < 1e-3
+    found = gradients(gaussians, ours, d_image, d_open)
+    other = drawing_cuda.gradients(gaussians, theirs, d_image, d_open)
+    for name in FIELDS:
+        dense = [np.zeros_like(getattr(gaussians, name)) for _ in range(2)]
+        for array, each in zip(dense, (found, other), strict=True):
+            array[each.ids] = getattr(each, name)
+        assert np.quantile(np.abs(dense[0] - dense[1]), 0.99) < 1e-2 * np.abs(dense[0]).max()

@@ -107,9 +107,11 @@ def sweep(
         parts = np.empty((len(found.members), 4), np.float32)
         kernels.weigh(
             found.starts, found.members, found.columns, found.means, found.conics, found.opacities, found.boxes,
-            photo.shape[:2], residual, trust, parts,
+            residual, trust, parts,
         )  # fmt: skip
-        _take_in(found.ids, found.first, found.places, parts, gaussians.centers, camera.position, normal, right)
+        sums = np.empty((len(found.ids), 4), np.float32)
+        kernels.add_parts(found.first, found.places, parts, sums)
+        _take_in(found.ids, sums, gaussians.centers, camera.position, normal, right)
     harmonics = gaussians.harmonics.copy()
     _solve_all(normal, right, ridges(gaussians.degree), prior, np.float32(step), harmonics)
     return replace(gaussians, harmonics=harmonics), total / max(pixels, 1e-12)
@@ -184,18 +186,15 @@ def _fit_each(colors, weights, towards, ridge, huber, harmonics):  # pragma: no 
 
 
 @njit(parallel=True, cache=True, nogil=True)
-def _take_in(ids, first, places, parts, centers, position, normal, right):  # pragma: no cover - compiled
-    """Add one photo to the normal equations, lower parts [N, K (K + 1) / 2] and right sides [N, K, 3], of `ids`."""
+def _take_in(ids, sums, centers, position, normal, right):  # pragma: no cover - compiled
+    """Add one photo, see `kernels.weigh`, to the normal equations of `ids`.
+
+    normal: [N, K (K + 1) / 2] their lower parts; right: [N, K, 3] their right sides.
+    """
     terms = right.shape[1]
     for m in prange(ids.shape[0]):
         n = ids[m]
-        total, red, green, blue = 0.0, 0.0, 0.0, 0.0
-        for pair in range(first[m], first[m + 1]):
-            row = parts[places[pair]]
-            total += row[0]
-            red += row[1]
-            green += row[2]
-            blue += row[3]
+        total = sums[m, 0]
         if total <= 0:
             continue
         x, y, z = centers[n, 0] - position[0], centers[n, 1] - position[1], centers[n, 2] - position[2]
@@ -204,9 +203,8 @@ def _take_in(ids, first, places, parts, centers, position, normal, right):  # pr
         fill_basis(x / length, y / length, z / length, basis)
         at = 0
         for i in range(terms):
-            right[n, i, 0] += basis[i] * red
-            right[n, i, 1] += basis[i] * green
-            right[n, i, 2] += basis[i] * blue
+            for c in range(3):
+                right[n, i, c] += basis[i] * sums[m, 1 + c]
             for j in range(i + 1):
                 normal[n, at] += total * basis[i] * basis[j]
                 at += 1

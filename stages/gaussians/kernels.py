@@ -121,7 +121,7 @@ def _fill_axes(turn, log_scales, pose, axes):  # pragma: no cover - compiled
 
 
 @njit(**_OPTIONS)
-def _slopes(x, y, z, focal, reach):  # pragma: no cover - compiled
+def _slopes(x, y, z, reach):  # pragma: no cover - compiled
     """The direction (x / z, y / z) that the projection is taken at, and whether each is the point's own."""
     u, v = x / z, y / z
     left, right, top, bottom = reach[0], reach[1], reach[2], reach[3]
@@ -162,7 +162,7 @@ def project(
         turn, axes, flat = np.empty((3, 3), np.float32), np.empty((3, 3), np.float32), np.empty((2, 3), np.float32)
         _fill_rotation(rotations[n], turn)
         _fill_axes(turn, log_scales[n], pose, axes)
-        u, v, _, _ = _slopes(x, y, z, focal, reach)
+        u, v, _, _ = _slopes(x, y, z, reach)
         _fill_flat(axes, u, v, z, focal, flat)
         xx, xy, yy = LOW_PASS, _0, LOW_PASS
         for k in range(3):
@@ -247,16 +247,23 @@ def _exp(x):  # pragma: no cover - compiled
     return value * value
 
 
-@njit(**_OPTIONS)
-def _fill_alphas(dx, dy, count, a, b, c, opacity, open_, alphas):  # pragma: no cover - compiled
+@njit(inline="always")
+def _fill_alphas(dx, dy, count, a, b, c, opacity, open_, base, alphas):  # pragma: no cover - compiled
     """Fill alphas of `count` pixels of a row, the first at (dx, dy) from the mean; 0 where they are cut or the pixel is
-    done. open_: transmittance of the pixels, negative where they are done."""
+    done. open_: transmittance of the tile's pixels, negative where they are done, from `base` on those of the row."""
     across = -_HALF * c * dy * dy
     for i in range(count):
         x = dx + np.float32(i)
         power = max(across - x * (_HALF * a * x + b * dy), _LEAST_POWER)
         alpha = min(opacity * _exp(min(power, _0)), MOST_ALPHA)
-        alphas[i] = alpha if (alpha >= LEAST_ALPHA and open_[i] > _0) else _0
+        alphas[i] = alpha if (alpha >= LEAST_ALPHA and open_[base + i] > _0) else _0
+
+
+@njit(inline="always")
+def _part(box, x0, y0, x1, y1):  # pragma: no cover - compiled
+    """The part of a box in a tile: first and one past the last column and row, and columns."""
+    left, right = max(box[0], x0), min(box[1], x1)
+    return left, max(box[2], y0), min(box[3], y1), np.uintp(right - left)
 
 
 @njit(parallel=True, **_OPTIONS)
@@ -268,37 +275,37 @@ def blend(
     for tile in prange(starts.shape[0] - 1):
         x0, y0 = tile % columns * TILE, tile // columns * TILE
         x1, y1 = min(x0 + TILE, width), min(y0 + TILE, height)
-        open_ = np.ones((TILE, TILE), np.float32)
-        sums = np.zeros((3, TILE, TILE), np.float32)
-        alphas = np.empty(TILE, np.float32)
+        open_ = np.ones(TILE * TILE, np.float32)
+        reds, greens = np.zeros(TILE * TILE, np.float32), np.zeros(TILE * TILE, np.float32)
+        blues, alphas = np.zeros(TILE * TILE, np.float32), np.empty(TILE, np.float32)
         for p in range(starts[tile], starts[tile + 1]):
             if (p - starts[tile]) % _LOOK == _LOOK - 1 and open_.max() <= _0:
                 break
             n = members[p]
-            left, right = max(boxes[n, 0], x0), min(boxes[n, 1], x1)
-            top, bottom = max(boxes[n, 2], y0), min(boxes[n, 3], y1)
+            left, top, bottom, count = _part(boxes[n], x0, y0, x1, y1)
             a, b, c, opacity = conics[n, 0], conics[n, 1], conics[n, 2], opacities[n]
             red, green, blue = colors[n, 0], colors[n, 1], colors[n, 2]
             dx = np.float32(left) + _HALF - means[n, 0]
             for y in range(top, bottom):
-                count, i, j = right - left, left - x0, y - y0
-                row = open_[j, i : i + count]
-                reds, greens, blues = sums[0, j, i : i + count], sums[1, j, i : i + count], sums[2, j, i : i + count]
-                _fill_alphas(dx, np.float32(y) + _HALF - means[n, 1], count, a, b, c, opacity, row, alphas)
+                base = np.uintp((y - y0) * TILE + left - x0)
+                _fill_alphas(dx, np.float32(y) + _HALF - means[n, 1], count, a, b, c, opacity, open_, base, alphas)
                 for k in range(count):
-                    left_open = row[k] * (_1 - alphas[k])
+                    was_open = open_[base + k]
+                    left_open = was_open * (_1 - alphas[k])
                     done = (alphas[k] > _0) & (left_open < LEAST_OPEN)
-                    weight = _0 if done else row[k] * alphas[k]
-                    reds[k] += weight * red
-                    greens[k] += weight * green
-                    blues[k] += weight * blue
-                    row[k] = -row[k] if done else left_open
+                    weight = _0 if done else was_open * alphas[k]
+                    reds[base + k] += weight * red
+                    greens[base + k] += weight * green
+                    blues[base + k] += weight * blue
+                    open_[base + k] = -was_open if done else left_open
         for y in range(y0, y1):
             for x in range(x0, x1):
-                rest = abs(open_[y - y0, x - x0])
+                at = (y - y0) * TILE + x - x0
+                rest = abs(open_[at])
                 transmittance[y, x] = rest
-                for c in range(3):
-                    image[y, x, c] = sums[c, y - y0, x - x0] + rest * background[c]
+                image[y, x, 0] = reds[at] + rest * background[0]
+                image[y, x, 1] = greens[at] + rest * background[1]
+                image[y, x, 2] = blues[at] + rest * background[2]
 
 
 @njit(parallel=True, **_OPTIONS)
@@ -316,15 +323,18 @@ def blend_backward(
     for tile in prange(starts.shape[0] - 1):
         x0, y0 = tile % columns * TILE, tile // columns * TILE
         x1, y1 = min(x0 + TILE, width), min(y0 + TILE, height)
-        open_ = np.ones((TILE, TILE), np.float32)
+        open_ = np.ones(TILE * TILE, np.float32)
         # What lies behind, times the gradient: all of the pixel's colour at first.
-        behind = np.zeros((TILE, TILE), np.float32)
+        behind = np.zeros(TILE * TILE, np.float32)
+        slopes = np.zeros((TILE * TILE, 3), np.float32)
         for y in range(y0, y1):
             for x in range(x0, x1):
+                at = (y - y0) * TILE + x - x0
                 total = transmittance[y, x] * d_open[y, x]
                 for c in range(3):
+                    slopes[at, c] = d_image[y, x, c]
                     total += image[y, x, c] * d_image[y, x, c]
-                behind[y - y0, x - x0] = total
+                behind[at] = total
         alphas = np.empty(TILE, np.float32)
         finished = False
         for p in range(starts[tile], starts[tile + 1]):
@@ -336,102 +346,103 @@ def blend_backward(
                 finished = True
                 continue
             n = members[p]
-            left, right = max(boxes[n, 0], x0), min(boxes[n, 1], x1)
-            top, bottom = max(boxes[n, 2], y0), min(boxes[n, 3], y1)
+            left, top, bottom, count = _part(boxes[n], x0, y0, x1, y1)
             a, b, c, opacity = conics[n, 0], conics[n, 1], conics[n, 2], opacities[n]
             red, green, blue = colors[n, 0], colors[n, 1], colors[n, 2]
             first_dx = np.float32(left) + _HALF - means[n, 0]
             d_x, d_y, d_a, d_b, d_c, d_opacity, d_red, d_green, d_blue = _0, _0, _0, _0, _0, _0, _0, _0, _0
             for y in range(top, bottom):
-                count, i, j = right - left, left - x0, y - y0
-                row = open_[j, i : i + count]
+                base = np.uintp((y - y0) * TILE + left - x0)
                 dy = np.float32(y) + _HALF - means[n, 1]
-                _fill_alphas(first_dx, dy, count, a, b, c, opacity, row, alphas)
+                _fill_alphas(first_dx, dy, count, a, b, c, opacity, open_, base, alphas)
                 for k in range(count):
                     alpha = alphas[k]
                     if alpha <= _0:
                         continue
-                    was_open = row[k]
+                    at = base + k
+                    was_open = open_[at]
                     left_open = was_open * (_1 - alpha)
                     if left_open < LEAST_OPEN:
-                        row[k] = -was_open
+                        open_[at] = -was_open
                         continue
-                    row[k] = left_open
-                    x = left + k
+                    open_[at] = left_open
                     weight = was_open * alpha
-                    g_red, g_green, g_blue = d_image[y, x, 0], d_image[y, x, 1], d_image[y, x, 2]
+                    g_red, g_green, g_blue = slopes[at, 0], slopes[at, 1], slopes[at, 2]
                     d_red += weight * g_red
                     d_green += weight * g_green
                     d_blue += weight * g_blue
                     own = red * g_red + green * g_green + blue * g_blue
-                    behind[j, i + k] -= weight * own
+                    rest = behind[at] - weight * own
+                    behind[at] = rest
                     if alpha >= MOST_ALPHA:
                         continue
-                    d_alpha = was_open * own - behind[j, i + k] / (_1 - alpha)
-                    d_power = alpha * d_alpha
+                    d_power = alpha * (was_open * own - rest / (_1 - alpha))
                     dx = first_dx + np.float32(k)
                     d_opacity += d_power
-                    d_x += d_power * (a * dx + b * dy)
-                    d_y += d_power * (b * dx + c * dy)
-                    d_a -= _HALF * d_power * dx * dx
-                    d_b -= d_power * dx * dy
-                    d_c -= _HALF * d_power * dy * dy
-            parts[p, 0], parts[p, 1] = d_x, d_y
-            parts[p, 2], parts[p, 3], parts[p, 4] = d_a, d_b, d_c
+                    x_power, y_power = d_power * dx, d_power * dy
+                    d_x += x_power
+                    d_y += y_power
+                    d_a += x_power * dx
+                    d_b += x_power * dy
+                    d_c += y_power * dy
+            parts[p, 0], parts[p, 1] = a * d_x + b * d_y, b * d_x + c * d_y
+            parts[p, 2], parts[p, 3], parts[p, 4] = -_HALF * d_a, -d_b, -_HALF * d_c
             parts[p, 5] = d_opacity / opacity
             parts[p, 6], parts[p, 7], parts[p, 8] = d_red, d_green, d_blue
 
 
 @njit(parallel=True, **_OPTIONS)
 def add_parts(first, places, parts, sums):  # pragma: no cover - compiled
-    """Fill sums [M, PARTS]: the parts of each ellipse, added up in one order."""
+    """Fill sums [M, D]: the parts [P, D] of each ellipse, added up in one order."""
+    width = sums.shape[1]
     for m in prange(first.shape[0] - 1):
-        for k in range(PARTS):
+        for k in range(width):
             sums[m, k] = _0
         for pair in range(first[m], first[m + 1]):
-            row = parts[places[pair]]
-            for k in range(PARTS):
-                sums[m, k] += row[k]
+            place = places[pair]
+            for k in range(width):
+                sums[m, k] += parts[place, k]
 
 
 @njit(parallel=True, **_OPTIONS)
 def weigh(
-    starts, members, columns, means, conics, opacities, boxes, shape, residual, trust, parts
+    starts, members, columns, means, conics, opacities, boxes, residual, trust, parts
 ):  # pragma: no cover - compiled
     """Fill parts [P, 4]: each pair's sum of weights (alpha times transmittance), and of weights times residual.
 
     Pixels count as much as `trust` [H, W] says. residual: [H, W, 3].
     """
-    height, width = shape
+    height, width = trust.shape
     for tile in prange(starts.shape[0] - 1):
         x0, y0 = tile % columns * TILE, tile // columns * TILE
         x1, y1 = min(x0 + TILE, width), min(y0 + TILE, height)
-        open_ = np.ones((TILE, TILE), np.float32)
+        open_ = np.ones(TILE * TILE, np.float32)
         alphas = np.empty(TILE, np.float32)
         for p in range(starts[tile], starts[tile + 1]):
             n = members[p]
-            left, right = max(boxes[n, 0], x0), min(boxes[n, 1], x1)
-            top, bottom = max(boxes[n, 2], y0), min(boxes[n, 3], y1)
+            left, top, bottom, count = _part(boxes[n], x0, y0, x1, y1)
             dx = np.float32(left) + _HALF - means[n, 0]
+            a, b, c, opacity = conics[n, 0], conics[n, 1], conics[n, 2], opacities[n]
             total, red, green, blue = _0, _0, _0, _0
             for y in range(top, bottom):
-                count, i, j = right - left, left - x0, y - y0
-                row = open_[j, i : i + count]
+                base = np.uintp((y - y0) * TILE + left - x0)
                 dy = np.float32(y) + _HALF - means[n, 1]
-                _fill_alphas(dx, dy, count, conics[n, 0], conics[n, 1], conics[n, 2], opacities[n], row, alphas)
+                _fill_alphas(dx, dy, count, a, b, c, opacity, open_, base, alphas)
                 for k in range(count):
                     if alphas[k] <= _0:
                         continue
-                    left_open = row[k] * (_1 - alphas[k])
+                    was_open = open_[base + k]
+                    left_open = was_open * (_1 - alphas[k])
                     if left_open < LEAST_OPEN:
-                        row[k] = -row[k]
+                        open_[base + k] = -was_open
                         continue
-                    weight = row[k] * alphas[k] * trust[y, left + k]
-                    row[k] = left_open
+                    open_[base + k] = left_open
+                    column = left + np.int64(k)
+                    weight = was_open * alphas[k] * trust[y, column]
                     total += weight
-                    red += weight * residual[y, left + k, 0]
-                    green += weight * residual[y, left + k, 1]
-                    blue += weight * residual[y, left + k, 2]
+                    red += weight * residual[y, column, 0]
+                    green += weight * residual[y, column, 1]
+                    blue += weight * residual[y, column, 2]
             parts[p, 0], parts[p, 1], parts[p, 2], parts[p, 3] = total, red, green, blue
 
 
@@ -476,7 +487,7 @@ def project_backward(
         d_axes, d_turn = np.empty((3, 3), np.float32), np.empty((3, 3), np.float32)
         per_norm = _fill_rotation(rotations[n], turn)
         _fill_axes(turn, log_scales[n], pose, axes)
-        u, v, own_u, own_v = _slopes(x, y, z, focal, reach)
+        u, v, own_u, own_v = _slopes(x, y, z, reach)
         _fill_flat(axes, u, v, z, focal, flat)
         d_u, d_v, d_z = _0, _0, _0
         for k in range(3):

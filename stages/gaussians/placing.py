@@ -17,7 +17,7 @@ from stages.surface.triangle_mesh import face_areas
 
 # Standard deviation in the surface, in mean distances of neighbours, and along the normal, in those in the surface.
 WIDTH, THICKNESS = 0.77, 0.1
-OPACITY = 0.95
+OPACITY = 0.98
 # Gaussians on a unit of surface where the texture has most detail, in those where it has none.
 MOST_DENSITY = 4.0
 # Side in texels of the squares that detail is looked at in, and its standard deviation (colour levels) that makes

@@ -9,11 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
+from typing import Any, Protocol
 
 import numpy as np
 
+from stages.gaussians import drawing as cpu
 from stages.gaussians import kernels
-from stages.gaussians.drawing import Gradients, gradients, render
+from stages.gaussians.drawing import Camera, Gradients
 from stages.gaussians.gaussians import Gaussians
 from stages.gaussians.photo_error import photo_error
 from stages.gaussians.targets import Target
@@ -35,6 +37,16 @@ HALF_OFFSET, HALF_SIZE = 0.5, 1.6
 LEAST_OPACITY = 0.02
 
 Listener = Callable[[float, float, str], None]
+
+
+class Renderer(Protocol):
+    """What draws, and leads errors back: `stages.gaussians.drawing` or `drawing_cuda`."""
+
+    def render(self, gaussians: Gaussians, camera: Camera, background: tuple[float, float, float]) -> Any: ...
+
+    def gradients(
+        self, gaussians: Gaussians, drawing: Any, d_image: np.ndarray, d_transmittance: np.ndarray
+    ) -> Gradients: ...
 
 
 @dataclass
@@ -90,6 +102,7 @@ def refine(
     steps: int,
     most: int,
     listener: Listener | None = None,
+    renderer: Renderer = cpu,
 ) -> tuple[Gaussians, list[float]]:
     """Refine by `steps` photos, up to `most` Gaussians. Returns them, and each step's error.
 
@@ -108,9 +121,9 @@ def refine(
         order = order or rng.permutation(len(targets)).tolist()
         target = targets[order.pop()]
         background = rng.random(3).astype(np.float32)
-        drawing = render(gaussians, target.camera, tuple(background))
+        drawing = renderer.render(gaussians, target.camera, tuple(background))
         error, slope = photo_error(drawing.image, target.over(background, drawing.image))
-        found = gradients(gaussians, drawing, slope.astype(np.float32), np.zeros_like(drawing.transmittance))
+        found = renderer.gradients(gaussians, drawing, slope.astype(np.float32), np.zeros_like(drawing.transmittance))
         pull[found.ids] += np.linalg.norm(found.means, axis=1)
         seen[found.ids] += 1
         _step(gaussians, found, moments, step, steps, anchors.extent)
@@ -151,7 +164,7 @@ def _step(gaussians: Gaussians, found: Gradients, moments: Moments, step: int, s
 def _split_and_prune(
     gaussians: Gaussians, anchors: Anchors, moments: Moments, pull: np.ndarray, room: int
 ) -> tuple[Gaussians, Anchors, Moments]:
-    """Without transparent ones, and with two in the place of the `room` whose mean gradients, `pull` [N], are largest."""
+    """Without transparent ones, and two in the place of each of the `room` with the largest mean gradients [N]."""
     kept = np.flatnonzero(_opacities(gaussians) >= LEAST_OPACITY)
     wanted = kept[np.argsort(-pull[kept], kind="stable")[:room]]
     wanted = wanted[pull[wanted] > 0]
