@@ -27,7 +27,7 @@ from stages.shading.observations import Observations
 PHOTOS_FOR_DEGREE = (1, 6, 12, 24)
 # Pull of harmonics, in photos that see the Gaussian fully, to 0 at first and to the neighbours' mean then; that of
 # degree 0 only settles what no photo tells.
-RIDGE = (1e-3, 0.5, 1.0, 1.5)
+RIDGE = (1e-3, 0.15, 0.3, 0.45)
 # Neighbours with a Gaussian itself, and how many of their mean distances a turn of the normal by one radian counts as.
 NEIGHBORS, TURN = 24, 8.0
 # Errors beyond this (sRGB, 1 for full scale) count in proportion to their size, not its square (Huber).
