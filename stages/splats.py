@@ -35,14 +35,13 @@ def run(context: StageContext[SplatsParams]) -> dict[str, Any]:
     params = context.params
     if not params.enabled:
         return {}
-    import cv2
     import numba
 
     from stages.drawing.rasterizing import rasterize_atlas
     from stages.gaussians import drawing, drawing_cuda
     from stages.gaussians.colours import degree_for, sweep
     from stages.gaussians.keeping import write_gaussians
-    from stages.gaussians.placing import count_for, place
+    from stages.gaussians.placing import WIDTH, count_for, place
     from stages.gaussians.refining import Anchors, refine
     from stages.gaussians.targets import target
     from stages.reporting.pictures import read_rgb
@@ -50,7 +49,6 @@ def run(context: StageContext[SplatsParams]) -> dict[str, Any]:
     from stages.texture.prepared_views import PreparedViews
 
     numba.set_num_threads(min(context.workers, numba.config.NUMBA_NUM_THREADS))
-    cv2.setNumThreads(context.workers)
     photos, held_out = context.read(PINHOLE_PHOTOS), context.read(HELD_OUT)
     cameras = context.read(SCENE).cameras
     cameras = cameras.select([i for i, name in enumerate(cameras.names) if name not in held_out])
@@ -67,19 +65,20 @@ def run(context: StageContext[SplatsParams]) -> dict[str, Any]:
         tell(_SEEN, 1, "colours of each Gaussian")
         gaussians, prior = _colored(gaussians, normals, gains, in_order)
     views.kept.clear()
+    apart = float(np.exp(gaussians.log_scales[:, 0]).mean()) / WIDTH
     targets = [
         found
         for index, name in enumerate(cameras.names)
-        if (found := target(atlas, cameras, index, *photos.masked(name), gains[index])) is not None
+        if (found := target(atlas, cameras, index, *photos.masked(name), gains[index], apart)) is not None
     ]
     if not targets:
         raise ReconstructionError(
             "There is nothing for splats to look like: no photo shows the mesh.",
             "Try it without: `hineus run PHOTOS --set splats.enabled=false`.",
         )
-    told = [(each.camera, each.photo, each.inside.astype(np.float32)) for each in targets]
     for number in range(SWEEPS):
         tell(_SEEN + (_COLORED - _SEEN) * (number + 1) / (SWEEPS + 1), 1, "colours of all Gaussians together")
+        told = ((each.camera, each.photo, each.inside.astype(np.float32)) for each in targets)
         gaussians, _ = sweep(gaussians, told, prior)
     errors: list[float] = []
     if params.steps:
