@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from configs.params import SplatsParams
-from stages.artifacts import ATLAS_MESH, BASE_COLOR, HELD_OUT, PINHOLE_PHOTOS, SCENE, SPLATS
+from stages.artifacts import ATLAS_MESH, BASE_COLOR, HELD_OUT, PINHOLE_PHOTOS, SCENE, SPLATS, read_texture
 from stages.engine.stage import Stage, StageContext
 from stages.errors import ReconstructionError
 
@@ -44,7 +44,6 @@ def run(context: StageContext[SplatsParams]) -> dict[str, Any]:
     from stages.gaussians.placing import WIDTH, count_for, place
     from stages.gaussians.refining import Anchors, refine
     from stages.gaussians.targets import target
-    from stages.reporting.pictures import read_rgb
     from stages.texture.baking import compare_photos
     from stages.texture.prepared_views import PreparedViews
 
@@ -52,7 +51,7 @@ def run(context: StageContext[SplatsParams]) -> dict[str, Any]:
     photos, held_out = context.read(PINHOLE_PHOTOS), context.read(HELD_OUT)
     cameras = context.read(SCENE).cameras
     cameras = cameras.select([i for i, name in enumerate(cameras.names) if name not in held_out])
-    atlas, texture = context.read(ATLAS_MESH), read_rgb(context.read(BASE_COLOR))
+    atlas, texture = context.read(ATLAS_MESH), read_texture(context.read(BASE_COLOR))
     tell = context.progress
     texels = rasterize_atlas(atlas.uvs, atlas.faces, atlas.texture_size)
     views = PreparedViews(atlas, len(texels), cameras, lambda index: photos.masked(cameras.names[index]))
