@@ -518,7 +518,7 @@ def test_help_lists_every_stage_and_loads_nothing_heavy() -> None:
     names, _, listed = done.stdout.partition("\n")
     assert names.split() == [
         "ingest", "sfm", "place", "undistort", "densify", "train", "extract", "cleanup", "atlas", "bake",
-        "materials", "export", "report",
+        "materials", "splats", "export", "report",
     ]  # fmt: skip
     for name in [*names.split(), "run", "status", "doctor", "demo", "config", "presets"]:
         assert f" {name} " in listed
