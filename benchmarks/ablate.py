@@ -180,7 +180,8 @@ FOLDERS = OUT / "ablation"
 POSED, SHARED = ("undistort", "densify"), "densify"  # what trainings start from, and up to where all runs share it
 # Of `stages`, what the stages measured are made of.
 SOURCES = ("train.py", "extract.py", "cleanup.py", "compiling.py", "neural", "surface", "geometry")
-LATER = ("atlas", "bake", "materials", "export", "report")  # sections of settings that no stage measured depends on
+# Sections of settings that no stage measured depends on.
+LATER = ("atlas", "bake", "materials", "splats", "export", "report")
 HOLDOUT = 8  # every so many photos one is left out, on sets whose score is the PSNR
 # Two runs with a thread each do more on two cores than one run with two.
 ONE_THREAD = {

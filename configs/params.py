@@ -334,6 +334,25 @@ class MaterialsParams(Section):
         return texts
 
 
+class SplatsParams(Section):
+    """Photos and textured mesh to Gaussians on the surface."""
+
+    enabled: bool = Field(False, description="make Gaussian splats, whose colours change with the direction")
+    count: int | None = Field(
+        None,
+        ge=1000,
+        le=1_000_000,
+        description="Gaussians that are placed; refining adds some; null: as many as a typical photo has pixels of the "
+        "surface, from 20,000 to 150,000",
+    )
+    steps: int = Field(
+        1500,
+        ge=0,
+        le=1_000_000,
+        description="photos that they are refined by, one after the other; 0: colours by least squares alone",
+    )
+
+
 class ExportParams(Section):
     """Textured mesh, and dense points, to files."""
 
@@ -382,5 +401,6 @@ class Config(Section):
     atlas: AtlasParams = AtlasParams()
     bake: BakeParams = BakeParams()
     materials: MaterialsParams = MaterialsParams()
+    splats: SplatsParams = SplatsParams()
     export: ExportParams = ExportParams()
     report: ReportParams = ReportParams()

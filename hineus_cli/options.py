@@ -188,6 +188,13 @@ Relightable = Annotated[
         "materials.enabled.",
     ),
 ]
+Splats = Annotated[
+    bool,
+    typer.Option(
+        "--splats",
+        help="Gaussian splats on the surface, whose colours change with the direction: sets splats.enabled.",
+    ),
+]
 Deterministic = Annotated[
     bool,
     typer.Option(
@@ -222,6 +229,7 @@ def settings(
     light: Path | None = None,
     balls: list[str] | None = None,
     no_light: bool = False,
+    splats: bool = False,
 ) -> tuple[str, ...]:
     """Those of --set, then what other options stand for; an option that was not given says nothing.
 
@@ -239,6 +247,7 @@ def settings(
         "materials.enabled": relightable or light is not None or bool(balls) or None,
         # what is given last counts, be it balls or a file
         "materials.balls": balls or ([] if light is not None or no_light else None),
+        "splats.enabled": splats or None,
         "sfm.deterministic": deterministic or None,
         "sfm.masks": "always" if moving_object else None,
         "undistort.masks": "alone" if moving_object else None,
@@ -275,6 +284,7 @@ def of_a_run(
     no_ground: NoGround = False,
     watertight: Watertight = False,
     relightable: Relightable = False,
+    splats: Splats = False,
     deterministic: Deterministic = False,
     moving_object: MovingObject = False,
 ) -> Request:
@@ -308,6 +318,7 @@ def of_a_run(
             light,
             ball,
             no_light,
+            splats,
         ),
         device=device,
         workers=workers,

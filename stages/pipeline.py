@@ -16,6 +16,7 @@ from stages.materials import MATERIALS
 from stages.place import PLACE
 from stages.report import REPORT
 from stages.sfm import SFM
+from stages.splats import SPLATTING
 from stages.train import TRAIN
 from stages.undistort import UNDISTORT
 
@@ -31,6 +32,7 @@ PIPELINE: tuple[Stage[Any], ...] = (
     ATLAS,  # clean mesh -> UV charts
     BAKE,  # charts + photos -> texture
     MATERIALS,  # photos + texture -> materials and light
+    SPLATTING,  # photos + textured mesh -> Gaussians on the surface
     EXPORT,  # textured mesh -> GLB, USDZ, OBJ, PLY, STL; points -> PLY, LAZ
     REPORT,  # everything -> one HTML page
 )

@@ -18,6 +18,7 @@ from typer.testing import CliRunner, Result
 from configs.load import describe_settings
 from hineus_cli import options
 from hineus_cli.app import build_app
+from hineus_cli.commands.run import turned_on
 from hineus_cli.console import key_numbers, outcome_table, status_table
 from stages import machine_check as doctor
 from stages import reconstruct
@@ -26,6 +27,7 @@ from stages.engine.status import StageStatus
 from stages.engine.workspace import Workspace
 from stages.errors import ConfigError, InputError, ReconstructionError
 from stages.machine_check import Finding
+from stages.pipeline import PIPELINE
 
 REPOSITORY = Path(__file__).parents[1]
 
@@ -200,6 +202,23 @@ def test_relightable_asks_for_materials_and_the_workspace_remembers_it(folder: P
     hineus("run", "photos", "--relightable")
     hineus("run", "photos")
     assert "materials:\n  enabled: true" in config.read_text()
+
+
+def test_splats_asks_for_them_and_the_workspace_remembers_it(folder: Path) -> None:
+    config = folder / "photos_hineus" / "config.yaml"
+    hineus("run", "photos")
+    assert "splats:\n  enabled: false" in config.read_text()
+    hineus("run", "photos", "--splats")
+    hineus("run", "photos")
+    assert "splats:\n  enabled: true" in config.read_text()
+
+
+def test_a_stage_that_is_off_is_turned_on_by_its_own_command() -> None:
+    asked = {stage.name: turned_on(stage) for stage in PIPELINE}
+    assert {name: sets for name, sets in asked.items() if sets} == {
+        "materials": ("materials.enabled=true",),
+        "splats": ("splats.enabled=true",),
+    }
 
 
 def test_watertight_sets_the_closed_mesh(folder: Path) -> None:
@@ -499,7 +518,7 @@ def test_help_lists_every_stage_and_loads_nothing_heavy() -> None:
     names, _, listed = done.stdout.partition("\n")
     assert names.split() == [
         "ingest", "sfm", "place", "undistort", "densify", "train", "extract", "cleanup", "atlas", "bake",
-        "materials", "export", "report",
+        "materials", "splats", "export", "report",
     ]  # fmt: skip
     for name in [*names.split(), "run", "status", "doctor", "demo", "config", "presets"]:
         assert f" {name} " in listed

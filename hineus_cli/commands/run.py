@@ -54,10 +54,20 @@ def stage_command(stage: Stage) -> Callable[..., None]:
         as_json: Json = False,
         verbose: Verbose = False,
     ) -> None:
-        _run(context.obj, replace(request, until=stage.name, force=(stage.name,) if force else ()), verbose)
+        sets = (*turned_on(stage), *request.sets)
+        _run(context.obj, replace(request, sets=sets, until=stage.name, force=(stage.name,) if force else ()), verbose)
 
     command.__doc__ = f"Stage: {stage.summary or stage.name}."
     return command
+
+
+def turned_on(stage: Stage) -> tuple[str, ...]:
+    """What is set where a stage that is off by default is asked for by its name."""
+    from configs.params import Config
+
+    section = Config.model_fields.get(stage.name)
+    fields = getattr(section.annotation, "model_fields", {}) if section is not None else {}
+    return (f"{stage.name}.enabled=true",) if "enabled" in fields else ()
 
 
 def _run(session: Session, request: Request, verbose: bool) -> None:

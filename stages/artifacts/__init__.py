@@ -43,5 +43,6 @@ from stages.artifacts.sfm import (
     Registration,
     Unregistered,
 )
+from stages.artifacts.splats import SPLATS
 from stages.artifacts.train import CAMERAS, FIELD, HELD_OUT, METRICS, PREVIEWS, SCENE, checkpoint_path, preview_path
 from stages.artifacts.undistort import FIRST_SCENE, OUTLINES, PINHOLE_PHOTOS, SILHOUETTES, given_mask_of

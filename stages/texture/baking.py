@@ -124,7 +124,7 @@ def bake_texture(
 
     with ThreadPoolExecutor(max_workers=max(1, workers)) as pool:
         views_of = PreparedViews(atlas, num_texels, cameras, load_photo)
-        gains, sharpness = _compare(atlas, texels, views_of.in_order(pool, workers), num_views, tell)
+        gains, sharpness = compare_photos(atlas, texels, views_of.in_order(pool, workers), num_views, tell)
         if not gain:
             gains = np.ones((num_views, 3))
         room = SMALL_BAND_BYTES if len(views_of.kept) == num_views else BAND_BYTES
@@ -174,8 +174,12 @@ def bake_texture(
     )
 
 
-def _compare(
-    atlas: AtlasMesh, texels: Texels, prepared: Iterator[View], num_views: int, tell: Callable[[str], None]
+def compare_photos(
+    atlas: AtlasMesh,
+    texels: Texels,
+    prepared: Iterator[View],
+    num_views: int,
+    tell: Callable[[str], None] = lambda note: None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Gains [N, 3] and sharpness [N] of the photos, from a sample of the texels."""
     rng = np.random.default_rng(0)

@@ -1,0 +1,124 @@
+"""Photos and mesh to Gaussians on the surface, whose colours change with the direction."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from configs.params import SplatsParams
+from stages.artifacts import ATLAS_MESH, BASE_COLOR, HELD_OUT, PINHOLE_PHOTOS, SCENE, SPLATS, read_texture
+from stages.engine.stage import Stage, StageContext
+from stages.errors import ReconstructionError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from stages.gaussians.gaussians import Gaussians
+    from stages.texture.photo_views import View
+
+# Gaussians whose colours in all photos are in memory at a time.
+_CHUNK = 50_000
+# Parts of the stage's progress that its steps end at.
+_SEEN, _COLORED = 0.1, 0.3
+# Sweeps of least squares over all photos, before anything but colours changes.
+SWEEPS = 2
+# Gaussians after refining, at most, in those that are placed.
+GROWTH = 1.3
+
+
+def run(context: StageContext[SplatsParams]) -> dict[str, Any]:
+    """Make Gaussians, where asked. Returns them in numbers."""
+    params = context.params
+    if not params.enabled:
+        return {}
+    import numba
+
+    from stages.drawing.rasterizing import rasterize_atlas
+    from stages.gaussians import drawing, drawing_cuda
+    from stages.gaussians.colours import degree_for, sweep
+    from stages.gaussians.keeping import write_gaussians
+    from stages.gaussians.placing import WIDTH, count_for, place
+    from stages.gaussians.refining import Anchors, refine
+    from stages.gaussians.targets import target
+    from stages.texture.baking import compare_photos
+    from stages.texture.prepared_views import PreparedViews
+
+    numba.set_num_threads(min(context.workers, numba.config.NUMBA_NUM_THREADS))
+    photos, held_out = context.read(PINHOLE_PHOTOS), context.read(HELD_OUT)
+    cameras = context.read(SCENE).cameras
+    cameras = cameras.select([i for i, name in enumerate(cameras.names) if name not in held_out])
+    atlas, texture = context.read(ATLAS_MESH), read_texture(context.read(BASE_COLOR))
+    tell = context.progress
+    texels = rasterize_atlas(atlas.uvs, atlas.faces, atlas.texture_size)
+    views = PreparedViews(atlas, len(texels), cameras, lambda index: photos.masked(cameras.names[index]))
+    with ThreadPoolExecutor(max_workers=max(1, context.workers)) as pool:
+        tell(0, 1, "comparing photos")
+        in_order = partial(views.in_order, pool, context.workers)
+        gains, _ = compare_photos(atlas, texels, in_order(), len(cameras))
+        count = count_for(atlas, cameras) if params.count is None else params.count
+        gaussians, normals = place(atlas, texture, count, degree_for(len(cameras)))
+        tell(_SEEN, 1, "colours of each Gaussian")
+        gaussians, prior = _colored(gaussians, normals, gains, in_order)
+    views.kept.clear()
+    apart = float(np.exp(gaussians.log_scales[:, 0]).mean()) / WIDTH
+    targets = [
+        found
+        for index, name in enumerate(cameras.names)
+        if (found := target(atlas, cameras, index, *photos.masked(name), gains[index], apart)) is not None
+    ]
+    if not targets:
+        raise ReconstructionError(
+            "There is nothing for splats to look like: no photo shows the mesh.",
+            "Try it without: `hineus run PHOTOS --set splats.enabled=false`.",
+        )
+    for number in range(SWEEPS):
+        tell(_SEEN + (_COLORED - _SEEN) * (number + 1) / (SWEEPS + 1), 1, "colours of all Gaussians together")
+        told = ((each.camera, each.photo, each.inside.astype(np.float32)) for each in targets)
+        gaussians, _ = sweep(gaussians, told, prior)
+    errors: list[float] = []
+    if params.steps:
+        anchors = Anchors(gaussians.centers, normals, float(np.ptp(atlas.vertices, axis=0).max()))
+        gaussians, errors = refine(
+            gaussians, anchors, targets, params.steps, round(GROWTH * count),
+            lambda done, total, note: tell(_COLORED + (1 - _COLORED) * done / total, 1, note),
+            drawing_cuda if context.device == "cuda" and drawing_cuda.is_there() else drawing,
+        )  # fmt: skip
+    write_gaussians(context.to_write(SPLATS), gaussians)
+    tell(1, 1, "done")
+    return {
+        "gaussians": len(gaussians),
+        "degree": gaussians.degree,
+        **({"error": round(float(np.mean(errors[-len(targets) :])), 5)} if errors else {}),
+    }
+
+
+def _colored(
+    gaussians: Gaussians, normals: np.ndarray, gains: np.ndarray, views: Callable[[], Iterator[View]]
+) -> tuple[Gaussians, np.ndarray]:
+    """The Gaussians with the colours of the photos that see each, and what neighbours have in common [N, K, 3]."""
+    from stages.gaussians.colours import fit_each, shared
+    from stages.shading.observations import observe
+
+    parts = [slice(start, start + _CHUNK) for start in range(0, len(gaussians), _CHUNK)]
+
+    def fitted(prior: np.ndarray) -> np.ndarray:
+        found = [fit_each(observe(gaussians.centers[p], normals[p], views()), gains, prior[p]) for p in parts]
+        return np.concatenate(found)
+
+    prior = shared(fitted(gaussians.harmonics), gaussians.centers, normals)
+    return replace(gaussians, harmonics=fitted(prior)), prior
+
+
+SPLATTING: Stage[SplatsParams] = Stage(
+    name="splats",
+    version=1,
+    settings=lambda config: config.splats,
+    run=run,
+    reads=(PINHOLE_PHOTOS, HELD_OUT, SCENE, ATLAS_MESH, BASE_COLOR),
+    writes=(SPLATS,),
+    summary="photos + textured mesh -> Gaussians on the surface",
+)

@@ -1,0 +1,126 @@
+"""The splats stage on files, and its pure parts on a square that is known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rigs import capture, look_at, scene_without_points
+
+from configs.params import SplatsParams
+from stages import artifacts
+from stages.artifacts import AtlasMesh, write_png
+from stages.drawing.view_scores import psnr
+from stages.engine.stage import StageContext
+from stages.gaussians.drawing import draw
+from stages.gaussians.keeping import read_gaussians
+from stages.splats import SPLATTING
+
+SIZE, FOCAL = (64, 48), 70.0
+
+
+def checks(side: int = 64) -> np.ndarray:
+    """[S, S, 3] uint8 squares of two colours, eight each way."""
+    rows, columns = np.indices((side, side)) * 8 // side
+    return np.where(((rows + columns) % 2 == 0)[..., None], (220, 60, 40), (40, 90, 200)).astype(np.uint8)
+
+
+def square() -> AtlasMesh:
+    """It faces -y; the texture covers it."""
+    corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * 0.5
+    return AtlasMesh(
+        np.stack([corners[:, 0], np.zeros(4), corners[:, 1]], 1).astype(np.float32),
+        np.tile([0.0, -1, 0], (4, 1)).astype(np.float32),
+        (corners + 0.5).astype(np.float32),
+        np.array([[0, 1, 2], [0, 2, 3]], np.int32),
+        64,
+    )
+
+
+def photograph(cameras, index: int, fade: float = 0.0) -> np.ndarray:
+    """The square in a camera [H, W, 3] uint8, grey around it; `fade` dims it as the camera goes to the right."""
+    import cv2
+
+    width, height = cameras.sizes[index]
+    fine = 8
+    at = (np.indices((height * fine, width * fine))[::-1].reshape(2, -1).T + 0.5) / fine
+    origins, directions = cameras.rays(index, at)
+    places = origins + directions * (-origins[:, 1] / directions[:, 1])[:, None]
+    x, z = places[:, 0] + 0.5, places[:, 2] + 0.5
+    on = (x >= 0) & (x < 1) & (z >= 0) & (z < 1)
+    texture = checks()
+    colors = np.full((len(at), 3), 128.0)
+    colors[on] = texture[((1 - z[on]) * 64).astype(int).clip(0, 63), (x[on] * 64).astype(int)]
+    colors[on] *= 1 - fade * cameras.centers[index][0]
+    image = colors.reshape(height * fine, width * fine, 3)
+    return cv2.resize(image, (int(width), int(height)), interpolation=cv2.INTER_AREA).round().astype(np.uint8)
+
+
+def workspace(root: Path, fade: float = 0.0) -> StageContext:
+    """The square from eighteen places before it, of which one is held out."""
+    folders = {name: root / name for name in (*SPLATTING.needs, "out", "scratch")}
+    for folder in folders.values():
+        folder.mkdir()
+    artifacts.ATLAS_MESH.save(folders["atlas"], square())
+    places = [np.array([x, -1.3, z]) for x in np.linspace(-0.8, 0.8, 6) for z in (-0.5, 0.0, 0.5)]
+    cameras = capture([look_at(place, np.zeros(3)) for place in places], size=SIZE, focal=FOCAL)
+    artifacts.SCENE.save(folders["train"], scene_without_points(cameras))
+    artifacts.HELD_OUT.save(folders["train"], (cameras.names[7],))
+    write_png(artifacts.BASE_COLOR.load(folders["bake"]), checks())
+    pictures = artifacts.Pictures(folders["undistort"])
+    for index, name in enumerate(cameras.names):
+        pictures.path(name).parent.mkdir(parents=True, exist_ok=True)
+        write_png(pictures.path(name), photograph(cameras, index, fade))
+    return StageContext(
+        inputs={name: folders[name] for name in SPLATTING.needs},
+        sources={},
+        out=folders["out"],
+        scratch=folders["scratch"],
+        params=SplatsParams(enabled=True, count=3000, steps=0),
+        reads=SPLATTING.reads,
+    )
+
+
+def held_out_psnr(context: StageContext) -> float:
+    cameras = context.read(artifacts.SCENE).cameras
+    photo = context.read(artifacts.PINHOLE_PHOTOS).image(cameras.names[7])
+    image, _ = draw(read_gaussians(artifacts.SPLATS.load(context.out)), cameras, 7)
+    on = (np.abs(photo.astype(int) - 128) > 3).any(2)
+    return psnr(np.round(image * 255).astype(np.uint8), photo, on)
+
+
+def test_nothing_is_written_unless_asked(tmp_path: Path) -> None:
+    context = workspace(tmp_path)
+    assert SPLATTING.run(replace(context, params=SplatsParams())) == {}
+    assert not list(context.out.iterdir())
+
+
+@pytest.mark.slow
+def test_a_photo_that_was_held_out_is_met_and_better_after_refining(tmp_path: Path) -> None:
+    context = workspace(tmp_path)
+    numbers = SPLATTING.run(context)
+    assert 2700 < numbers["gaussians"] < 3300
+    assert numbers["degree"] == 2
+    fitted = held_out_psnr(context)
+    assert fitted > 16
+    more = SPLATTING.run(replace(context, params=SplatsParams(enabled=True, count=3000, steps=200)))
+    assert held_out_psnr(context) > fitted + 3
+    assert more["gaussians"] > numbers["gaussians"]
+    again = read_gaussians(artifacts.SPLATS.load(context.out))
+    # Nothing has left the square by 2 % of its side.
+    assert np.abs(again.centers[:, 1]).max() < 0.02
+    assert np.abs(again.centers[:, [0, 2]]).max() < 0.52
+
+
+@pytest.mark.slow
+def test_the_same_again_is_the_same(tmp_path: Path) -> None:
+    context = workspace(tmp_path)
+    context = replace(context, params=SplatsParams(enabled=True, count=1000, steps=40))
+    SPLATTING.run(context)
+    first = read_gaussians(artifacts.SPLATS.load(context.out))
+    SPLATTING.run(replace(context, workers=2))
+    second = read_gaussians(artifacts.SPLATS.load(context.out))
+    np.testing.assert_array_equal(first.centers, second.centers)
+    np.testing.assert_array_equal(first.harmonics, second.harmonics)
