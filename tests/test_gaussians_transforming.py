@@ -46,7 +46,7 @@ def test_the_basis_ends_at_degree_3():
 @settings(max_examples=25, deadline=None)
 @given(st.integers(0, 3), st.tuples(*[st.floats(-1, 1)] * 3), st.floats(0, np.pi))
 def test_turned_harmonics_say_at_a_turned_direction_what_they_said(degree, axis, angle):
-    rotation = rotation_about(np.array(axis) + (0, 0, 2), angle)
+    rotation = rotation_about(np.add(axis, [0, 0, 2]), angle)
     before = some_gaussians(20, degree).harmonics
     turned = turned_harmonics(before, rotation)
     expected = np.einsum("pk,nkc->npc", basis(AROUND, degree), before)

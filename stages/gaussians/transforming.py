@@ -45,7 +45,7 @@ def _turned(rotations: np.ndarray, turn: np.ndarray) -> np.ndarray:
 def turned_harmonics(
     harmonics: Float[np.ndarray, "n k 3"], rotation: Float[np.ndarray, "3 3"]
 ) -> Float[np.ndarray, "n k 3"]:
-    """Coefficients that say at `rotation @ direction` what `harmonics` say at the direction: exact, degree by degree."""
+    """Coefficients that say at `rotation @ direction` what `harmonics` say at the direction; exact."""
     degree = int(np.sqrt(harmonics.shape[1])) - 1
     turned = harmonics.astype(np.float64)
     for l in range(1, degree + 1):
