@@ -67,8 +67,9 @@ class Page:
         message = {"id": self._count, "method": method, "params": params, **session}
         os.write(self._requests, json.dumps(message).encode() + b"\0")
         while (answer := self._next()).get("id") != self._count:
-            if answer.get("method") in ("Runtime.exceptionThrown", "Log.entryAdded"):
-                self.errors.append(json.dumps(answer["params"]))
+            told = json.dumps(answer.get("params"))
+            if answer.get("method") in ("Runtime.exceptionThrown", "Log.entryAdded") and "favicon.ico" not in told:
+                self.errors.append(told)
         assert "result" in answer, answer
         return answer["result"]
 
