@@ -10,9 +10,12 @@ from made_up_gaussians import some_gaussians
 from scipy.spatial.transform import Rotation
 from tetrahedron import rotation_about
 
+from stages.drawing.rendering import look_at
+from stages.gaussians.drawing import draw
 from stages.gaussians.gaussians import Gaussians
 from stages.gaussians.harmonics import basis
 from stages.gaussians.transforming import transformed, turned_harmonics
+from stages.geometry.normalisation import into_frame
 from stages.geometry.similarity import Similarity
 from stages.geometry.vectors import unit
 from stages.light import harmonics as of_light
@@ -65,6 +68,17 @@ def test_a_camera_that_moves_along_sees_the_same():
     np.testing.assert_allclose(np.linalg.norm(after.rotations, axis=1), 1, atol=1e-6)
     assert (after.opacity_logits == before.opacity_logits).all()
     assert (after.anchored == before.anchored).all()
+
+
+@pytest.mark.slow
+def test_the_picture_stays_as_it_was_where_the_camera_moves_along():
+    before = some_gaussians(60)
+    camera = look_at(np.array([1.0, -2, 1.5]), np.zeros(3), np.array([0.0, 0, 1]), 48, 40)
+    image, alpha = draw(before, camera, 0)
+    moved, moved_alpha = draw(transformed(before, PLACE), into_frame(camera, PLACE.inverse()), 0)
+    assert np.ptp(image, axis=(0, 1)).min() > 0.3
+    np.testing.assert_allclose(moved, image, atol=2e-3)
+    np.testing.assert_allclose(moved_alpha, alpha, atol=2e-3)
 
 
 def test_there_and_back_is_where_it_was():

@@ -87,7 +87,7 @@ def test_splats_lie_where_the_mesh_lies_in_its_colours_from_a_file_and_under_the
         mesh = tab.screenshot()
     for splats in shown:
         assert np.abs(splats - mesh).sum() > 1e5
-        assert (is_shown(splats) & is_shown(mesh)).sum() > 0.95 * (is_shown(splats) | is_shown(mesh)).sum()
+        assert (is_shown(splats) & is_shown(mesh)).sum() > 0.9 * (is_shown(splats) | is_shown(mesh)).sum()
         for shade in (is_red, is_blue):  # which the texture blends where they meet
             assert shade(mesh).sum() > 2000
             assert (shade(splats) & shade(mesh)).sum() > 0.97 * shade(mesh).sum()
@@ -96,10 +96,10 @@ def test_splats_lie_where_the_mesh_lies_in_its_colours_from_a_file_and_under_the
 def test_a_page_without_splats_carries_no_program_for_them(tmp_path):
     text = page(bare_inputs(tmp_path))
     assert "SPARK" not in text
-    assert '"splats"' not in text
+    assert '"spz"' not in text
 
 
 def test_damaged_splats_are_left_out(tmp_path):
     context = bare_inputs(tmp_path)
     artifacts.SPLATS.load(context.inputs["splats"]).write_bytes(b"PK no archive")
-    assert '"splats"' not in page(context)
+    assert '"spz"' not in page(context)
