@@ -252,6 +252,7 @@ REPORT: Stage[ReportParams] = Stage(
         "atlas",
         "bake",
         "materials",
+        "splats",
         "export",
     ),
     reads_run=True,

@@ -93,12 +93,14 @@ def test_splats_lie_where_the_mesh_lies_in_its_colours_from_a_file_and_under_the
             assert (shade(splats) & shade(mesh)).sum() > 0.97 * shade(mesh).sum()
 
 
+@pytest.mark.slow
 def test_a_page_without_splats_carries_no_program_for_them(tmp_path):
     text = page(bare_inputs(tmp_path))
     assert "SPARK" not in text
     assert '"spz"' not in text
 
 
+@pytest.mark.slow
 def test_damaged_splats_are_left_out(tmp_path):
     context = bare_inputs(tmp_path)
     artifacts.SPLATS.load(context.inputs["splats"]).write_bytes(b"PK no archive")
