@@ -3,8 +3,8 @@
 function addSplats({ packed, scene, renderer, redraw }) {
   let [splats, unpacked] = [null, null];
   const unpack = () => {
-    // as they were fitted: widened by 0.3 pixels² without fading, sorted by depth, cut at three deviations
-    const how = { preBlurAmount: 0.3, blurAmount: 0, sortRadial: false, maxStdDev: 3 };
+    // as they were fitted: widened by 0.3 pixels² without fading, sorted by depth, as far as alpha reaches 1/255
+    const how = { preBlurAmount: 0.3, blurAmount: 0, sortRadial: false, maxStdDev: Math.sqrt(2 * Math.log(255)) };
     scene.add(new SPARK.SparkRenderer({ renderer, onDirty: redraw, ...how }));
     const fileBytes = Uint8Array.from(atob(packed), (c) => c.charCodeAt(0));
     splats = new SPARK.SplatMesh({ fileBytes, fileName: "model.spz" });
