@@ -23,7 +23,7 @@ import numpy as np
 BROWSER = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 WEBGL = ("--enable-unsafe-swiftshader", "--use-gl=angle", "--use-angle=swiftshader")
 HEADLESS = ("--headless=new", "--no-sandbox", "--disable-dev-shm-usage", "--hide-scrollbars")
-TIMEOUT_S = 30.0
+TIMEOUT_S = 120.0
 
 
 class Page:

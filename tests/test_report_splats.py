@@ -15,8 +15,8 @@ from stages.engine.workspace import Workspace
 from stages.gaussians.gaussians import Gaussians
 from stages.gaussians.keeping import write_gaussians
 
-COUNT = 20_000
-SIZE = 0.008
+COUNT = 8_000
+SIZE = 0.012
 
 
 def painted_pyramid() -> Gaussians:
@@ -79,7 +79,7 @@ def test_splats_lie_where_the_mesh_lies_in_its_colours_from_a_file_and_under_the
     shown = []
     with serving(watch(workspace.root, ())) as served, opened(tmp_path) as tab:
         for url in (report.as_uri(), served):
-            tab.go(f"{url}#show=splats")
+            tab.go(f"{url}#show=splats", 600, 700)
             tab.wait_for('document.documentElement.dataset.viewer === "ready"')
             tab.value(WHILE)
             shown.append(tab.screenshot())
@@ -87,9 +87,9 @@ def test_splats_lie_where_the_mesh_lies_in_its_colours_from_a_file_and_under_the
         mesh = tab.screenshot()
     for splats in shown:
         assert np.abs(splats - mesh).sum() > 1e5
-        assert (is_shown(splats) & is_shown(mesh)).sum() > 0.9 * (is_shown(splats) | is_shown(mesh)).sum()
+        assert (is_shown(splats) & is_shown(mesh)).sum() > 0.85 * (is_shown(splats) | is_shown(mesh)).sum()
         for shade in (is_red, is_blue):  # which the texture blends where they meet
-            assert shade(mesh).sum() > 2000
+            assert shade(mesh).sum() > 1000
             assert (shade(splats) & shade(mesh)).sum() > 0.97 * shade(mesh).sum()
 
 
