@@ -173,9 +173,8 @@ def read_path(file: Path, size: tuple[int, int]) -> PinholeCameras:
 # ---------------------------------------------------------------- pictures
 def _mesh_painter(opened: Workspace, mesh: artifacts.AtlasMesh) -> Callable[[PinholeCameras, int], np.ndarray]:
     from stages.drawing.rendering import render_textured
-    from stages.reporting.pictures import read_rgb
 
-    texture = read_rgb(artifacts.BASE_COLOR.load(opened.stage_folder(BAKE.name)))
+    texture = artifacts.read_texture(artifacts.BASE_COLOR.load(opened.stage_folder(BAKE.name)))
     return lambda cameras, index: render_textured(mesh, texture, cameras.select([index]), supersample=SUPERSAMPLE)
 
 
