@@ -6,7 +6,7 @@
 # make bench-smoke   a small scene through the whole pipeline, its figures against committed ones
 # make lint   formatting, lint, types, who-may-import-whom
 # make image  the container of the Dockerfile, built and tried out
-# make vendor the report's copy of three.js, from npm
+# make vendor the report's copies of three.js and Spark, from npm
 # Each makes .venv first where needed.
 
 PYTHON ?=
@@ -64,11 +64,14 @@ image:
 # Bundled in a temporary folder: nothing of npm stays in the tree.
 VENDOR := stages/templates/vendor
 vendor:
-	folder=$$(mktemp -d) && cp $(VENDOR)/three.entry.js $$folder/ && \
-	npm install --prefix $$folder --no-save three@0.187.0 esbuild@0.28.2 && \
-	$$folder/node_modules/.bin/esbuild $$folder/three.entry.js --bundle --minify --format=iife --global-name=THREE \
-	  --target=es2020 --outfile=$(VENDOR)/three.min.js && \
-	cp $$folder/node_modules/three/LICENSE $(VENDOR)/LICENSE && rm -r $$folder
+	folder=$$(mktemp -d) && cp $(VENDOR)/*.entry.js $(VENDOR)/three.global.js $$folder/ && cd $$folder && \
+	npm install --no-save three@0.187.0 @sparkjsdev/spark@2.2.0 esbuild@0.28.2 && \
+	bundle() { node_modules/.bin/esbuild $$1.entry.js --bundle --minify --format=iife --global-name=$$2 --target=es2020 \
+	  --outfile=$(CURDIR)/$(VENDOR)/$$1.min.js $$3 $$4; } && \
+	bundle three THREE && \
+	bundle spark SPARK --alias:three/addons=./node_modules/three/examples/jsm --alias:three=./three.global.js && \
+	cp node_modules/three/LICENSE $(CURDIR)/$(VENDOR)/LICENSE && \
+	cp node_modules/@sparkjsdev/spark/LICENSE $(CURDIR)/$(VENDOR)/LICENSE.spark && rm -r $$folder
 
 clean:
 	rm -rf .venv demo build dist *.egg-info

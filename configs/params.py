@@ -370,6 +370,14 @@ class ExportParams(Section):
     lods: int = Field(
         0, ge=0, le=4, description="lighter GLBs with the same textures, each with half the faces of the one before"
     )
+    splats: tuple[Literal["ply", "spz", "glb"], ...] = Field(
+        ("ply", "spz", "glb"),
+        description="files of Gaussian splats, where `splats.enabled` made some: ply as 3DGS writes it, spz a quarter "
+        "as large or less, glb with KHR_gaussian_splatting",
+    )
+    splat_lods: int = Field(
+        0, ge=0, le=4, description="lighter files of splats, each with half the Gaussians of the one before"
+    )
     collision: Literal["off", "hulls"] = Field(
         "off", description="a GLB of convex pieces for physics engines; needs `pip install coacd`"
     )

@@ -24,6 +24,7 @@ from hineus_cli.commands.doctor import doctor
 from hineus_cli.commands.evaluate import compare, evaluate_app
 from hineus_cli.commands.export_poses import export_colmap, export_transforms
 from hineus_cli.commands.relight import relight
+from hineus_cli.commands.render import render
 from hineus_cli.commands.run import run, stage_command
 from hineus_cli.commands.settings import presets, show_config
 from hineus_cli.commands.status import status
@@ -155,7 +156,7 @@ def build_app(pipeline: Sequence[Stage] = PIPELINE) -> typer.Typer:
     ) -> None:
         """Photos in, textured 3D asset out. Start with `hineus doctor`, then `hineus run PHOTOS`."""
 
-    for command in (run, check, status, view, relight, compare, bench, doctor, presets, demo):
+    for command in (run, check, status, view, relight, render, compare, bench, doctor, presets, demo):
         app.command()(command)
     app.add_typer(evaluate_app, name="evaluate")
     app.command("config")(show_config)

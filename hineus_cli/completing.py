@@ -25,6 +25,12 @@ def lights(incomplete: str) -> list[str]:
     return _starting(incomplete, ["learned", *LIGHTS])
 
 
+def rendered_subjects(incomplete: str) -> list[str]:
+    from stages.render import SUBJECTS
+
+    return _starting(incomplete, list(SUBJECTS))
+
+
 def setting_keys(incomplete: str) -> list[str]:
     """Keys with the equals sign; behind it the values, of settings that have few."""
     from configs.load import describe_settings

@@ -339,3 +339,15 @@ def with_options_of_a_run(command: Callable[..., None]) -> Callable[..., None]:
     asked.__annotations__ = {each.name: each.annotation for each in parameters}
     asked.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]  # what typer reads
     return asked
+
+
+def picture_size(text: str) -> tuple[int, int]:
+    """ "640x480" as width and height.
+
+    Raises:
+        ConfigError: it is no size.
+    """
+    found = re.fullmatch(r"(\d{1,5})x(\d{1,5})", text.strip().lower())
+    if not found:
+        raise ConfigError(f"--size {text[:40]} is no size.", "Try `--size 1280x720`: width and height in pixels.")
+    return int(found[1]), int(found[2])

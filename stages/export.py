@@ -1,4 +1,5 @@
-"""The textured mesh to GLB, USDZ, OBJ + MTL + PNG, PLY and STL, dense points to PLY and LAZ, all in the world frame."""
+"""The textured mesh to GLB, USDZ, OBJ + MTL + PNG, PLY and STL, dense points to PLY and LAZ, Gaussian splats to PLY,
+SPZ and GLB, all in the world frame."""
 
 from __future__ import annotations
 
@@ -26,6 +27,7 @@ from stages.artifacts import (
     ORM,
     POINT_CLOUD,
     SCENE,
+    SPLATS,
     WORLD_PLACE,
     texture_bytes,
 )
@@ -127,6 +129,10 @@ def run(context: StageContext[ExportParams]) -> dict[str, Any]:
         raise ReconstructionError(
             f"The mesh cannot be exported: {error}.", "Rebuild it: `hineus run PHOTOS --from cleanup`."
         ) from error
+    if params.splats and (file := context.read(SPLATS)).exists():
+        about_splats, of_splats = _write_splats(asset, file, params)
+        numbers |= about_splats
+        sizes |= of_splats
     if "points" in params.formats:
         about_points, of_points = _write_points(context, asset, place)
         warnings += about_points.pop("warnings", [])
@@ -246,6 +252,34 @@ def _write_stl(asset: Asset) -> int:
 
     mesh = asset.in_world(asset.mesh)
     return artifacts.asset_path(asset.out, "stl").write_bytes(stl_bytes(mesh.vertices, mesh.faces, asset.note))
+
+
+def _write_splats(asset: Asset, file: Path, params: ExportParams) -> tuple[dict[str, Any], dict[str, int]]:
+    """Numbers of the Gaussian splats, and bytes of each file: the PLY in the frame of the OBJ, others in the GLB's."""
+    from stages.files.splat_files import splat_glb_bytes, splat_ply_bytes, spz_bytes
+    from stages.gaussians.keeping import read_gaussians
+    from stages.gaussians.levels_of_detail import levels_of_detail
+    from stages.gaussians.transforming import transformed
+
+    gltf_from_scene = Similarity(1.0, asset.gltf_from_world, np.zeros(3)).compose(asset.world_from_scene)
+    writers = {
+        "ply": lambda some: splat_ply_bytes(transformed(some, asset.world_from_scene), asset.note),
+        "spz": lambda some: spz_bytes(transformed(some, gltf_from_scene)),
+        "glb": lambda some: splat_glb_bytes(transformed(some, gltf_from_scene), generator(), asset.extras),
+    }
+    counts, sizes = [], {}
+    try:
+        gaussians = read_gaussians(file)
+        for level, some in enumerate((gaussians, *levels_of_detail(gaussians, params.splat_lods))):
+            counts.append(len(some))
+            for kind in params.splats:
+                name = f"splats_{kind}" if level == 0 else f"splats_lod{level}_{kind}"
+                sizes[name] = artifacts.splats_path(asset.out, kind, level).write_bytes(writers[kind](some))
+    except (ValueError, KeyError) as error:
+        raise ReconstructionError(
+            f"The splats cannot be exported: {error}.", "Make them again: `hineus run PHOTOS --from splats`."
+        ) from error
+    return {"splats": counts[0], **({"splat_lods": counts[1:]} if counts[1:] else {})}, sizes
 
 
 def _write_points(
@@ -390,7 +424,7 @@ def provenance(scene: PosedScene, place: Place, gltf_from_world: np.ndarray, run
 
 EXPORT: Stage[ExportParams] = Stage(
     name="export",
-    version=9,
+    version=10,
     settings=lambda config: config.export,
     run=run,
     reads=(
@@ -407,8 +441,9 @@ EXPORT: Stage[ExportParams] = Stage(
         LIGHT,
         LIGHT_HDR,
         LIGHT_HARMONICS,
+        SPLATS,
     ),
     writes=(ASSET,),
     reads_manifests=("bake", "materials"),
-    summary="textured mesh -> GLB, USDZ, OBJ, PLY, STL; dense points -> PLY, LAZ",
+    summary="textured mesh -> GLB, USDZ, OBJ, PLY, STL; dense points -> PLY, LAZ; splats -> PLY, SPZ, GLB",
 )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 import shlex
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -17,8 +16,9 @@ from stages.atlas import ATLAS
 from stages.bake import BAKE
 from stages.engine.damage import damage_named
 from stages.engine.status import replaced_inputs
-from stages.engine.workspace import DISK_FULL, Workspace
-from stages.errors import ConfigError, InputError, WorkspaceError, did_you_mean
+from stages.engine.workspace import Workspace
+from stages.errors import ConfigError, WorkspaceError, did_you_mean
+from stages.files.films import check_film, is_video, write_film
 from stages.geometry.up import gltf_from_scene
 from stages.light.built_in import LIGHTS, MEAN
 from stages.light.environment import mean_radiance
@@ -38,10 +38,6 @@ LEARNED = "learned"
 # Rows of the maps of built-in lights.
 BUILT_IN_ROWS = 256
 RENDERERS = ("hineus", "mitsuba")
-PICTURES, VIDEOS = (".png",), (".mp4",)
-FRAMES_PER_SECOND = 30
-SMALLEST, LARGEST = 16, 4096
-GAP = 8  # pixels between pictures in a row
 
 UP, FRONT = np.array([0.0, 1, 0]), np.array([0.0, 0, 1])
 
@@ -76,7 +72,12 @@ class Wish:
 
     @property
     def is_video(self) -> bool:
-        return self.out.suffix.lower() in VIDEOS
+        return is_video(self.out)
+
+    @property
+    def count(self) -> int:
+        """Of pictures."""
+        return self.frames if self.is_video else self.sides
 
     def check(self) -> None:
         """
@@ -86,10 +87,7 @@ class Wish:
         """
         from stages.drawing.relighting import BACKGROUNDS
 
-        if self.out.suffix.lower() not in PICTURES + VIDEOS:
-            raise ConfigError(
-                f"--out {self.out} is neither a picture nor a video.", "Name a file that ends with .png or .mp4."
-            )
+        check_film(self.out, self.size)
         for option, value, known in (
             ("renderer", self.renderer, RENDERERS),
             ("background", self.background, BACKGROUNDS),
@@ -97,15 +95,8 @@ class Wish:
             if value not in known:
                 hint = did_you_mean(value, known, f"--{option} {{}}")
                 raise ConfigError(f"--{option} {value[:40]} is not known.", f"{hint}There are {', '.join(known)}.")
-        width, height = self.size
-        if not (SMALLEST <= width <= LARGEST and SMALLEST <= height <= LARGEST) or (width | height) % 2:
-            raise ConfigError(
-                f"--size {width}x{height}: both must be even, {SMALLEST} to {LARGEST} pixels.", "Try `--size 1280x720`."
-            )
         if self.is_video and self.background == "transparent":
             raise ConfigError("A video has no transparent background.", "Try `--background white`, or a .png file.")
-        if not self.out.absolute().parent.is_dir():
-            raise InputError(f"There is no folder {self.out.absolute().parent}.", "Make it, or name another place.")
 
 
 @dataclass(frozen=True)
@@ -149,7 +140,7 @@ def relight(workspace: Path, wish: Wish, progress: Callable[[int, int], None]) -
         if subject.light_file is None:
             _tell_of_no_materials(opened)
         pictures = _pictures(subject, radiance, wish, wish.exposure_ev + metered)
-        about = _write(wish, pictures, progress)
+        about = write_film(wish.out, pictures, wish.count, wish.size, progress)
     return {
         "file": str(wish.out.absolute()),
         "light": wish.light,
@@ -250,7 +241,7 @@ def views(vertices: np.ndarray, wish: Wish) -> list[tuple[PinholeCameras, float]
     """
     from stages.drawing.rendering import turntable
 
-    count = wish.frames if wish.is_video else wish.sides
+    count = wish.count
     angles = 360 * np.arange(count) / count
     width, height = wish.size
     if wish.turn_light:
@@ -285,52 +276,3 @@ def _path_tracer(subject: Subject, radiance: np.ndarray) -> Renderer:
     from stages.drawing.path_tracing import PathTracer, choose_variant
 
     return PathTracer(subject.mesh, subject.material, radiance, choose_variant()[0]).relit
-
-
-# ---------------------------------------------------------------- the file
-def _write(wish: Wish, pictures: Iterator[np.ndarray], progress: Callable[[int, int], None]) -> dict[str, Any]:
-    """Written beside it and renamed, so that what is there is whole."""
-    from stages.files.video import write_mp4
-
-    count = wish.frames if wish.is_video else wish.sides
-    beside = wish.out.with_name(f".{wish.out.stem}.{os.getpid()}{wish.out.suffix}")
-    try:
-        if wish.is_video:
-            _, codec = write_mp4(beside, _told(pictures, count, progress), wish.size, FRAMES_PER_SECOND)
-            about: dict[str, Any] = {"frames": count, "codec": codec}
-        else:
-            beside.write_bytes(png_bytes(in_a_row(list(_told(pictures, count, progress)))))
-            about = {"sides": count}
-        beside.replace(wish.out)
-    except OSError as error:
-        if error.errno in DISK_FULL:
-            raise
-        raise InputError(
-            f"{wish.out} cannot be written: {error.strerror or error}.", "Name another place with `--out`."
-        ) from error
-    finally:
-        beside.unlink(missing_ok=True)
-    return about
-
-
-def _told(pictures: Iterator[np.ndarray], count: int, progress: Callable[[int, int], None]) -> Iterator[np.ndarray]:
-    progress(0, count)
-    for done, drawn in enumerate(pictures, 1):
-        yield drawn
-        progress(done, count)
-
-
-def in_a_row(pictures: list[np.ndarray]) -> np.ndarray:
-    """Pictures of one size side by side, with white (or nothing, where they are transparent) between them."""
-    gap = np.full((len(pictures[0]), GAP, pictures[0].shape[2]), 255, np.uint8)
-    gap[..., 3:] = 0
-    row = [part for drawn in pictures for part in (gap, drawn)][1:]
-    return np.concatenate(row, axis=1)
-
-
-def png_bytes(image: np.ndarray) -> bytes:
-    """[H, W, 3] or [H, W, 4] uint8 RGB or RGBA as a PNG."""
-    import cv2
-
-    code = cv2.COLOR_RGBA2BGRA if image.shape[2] == 4 else cv2.COLOR_RGB2BGR
-    return cv2.imencode(".png", cv2.cvtColor(image, code))[1].tobytes()

@@ -36,6 +36,7 @@ from stages.artifacts import (
     QUALITY,
     REGISTRATION,
     SCENE,
+    SPLATS,
     WORLD_PLACE,
     Artifact,
     AtlasMesh,
@@ -53,7 +54,7 @@ from stages.geometry.point_cloud import PointCloud
 T = TypeVar("T")
 
 TEMPLATES = Path(__file__).parent / "templates"
-THREE = TEMPLATES / "vendor" / "three.min.js"
+THREE, SPARK = TEMPLATES / "vendor" / "three.min.js", TEMPLATES / "vendor" / "spark.min.js"
 REPLAY_WORKSPACE = "again_hineus"
 
 
@@ -102,6 +103,7 @@ def run(context: StageContext[ReportParams]) -> dict[str, Any]:
         scene, place, region, atlas, texture, left(context, QUALITY), left(context, POINT_CLOUD), captions
     )
     page["viewer"] |= in_lights(context, scene, place)
+    page |= with_splats(context, page["viewer"], scene)
     context.progress(4, steps, "writing the page")
     placed = {name: manifests[name].numbers for name in ("undistort", "place", "train") if name in manifests}
     page |= {
@@ -183,6 +185,14 @@ def in_lights(context: StageContext[ReportParams], scene: PosedScene, place: Pla
     return describe_lights(context.read(LIGHT_HDR), context.read(MATERIAL_COLOR), context.read(ORM), scene, place)
 
 
+def with_splats(context: StageContext[ReportParams], viewer: dict[str, Any], scene: PosedScene) -> dict[str, Any]:
+    """The 3D view with Gaussian splats, and the program that draws them; the view as it is where there are none."""
+    from stages.reporting.splats import pack_splats
+
+    splats = pack_splats(context.read(SPLATS), scene.up)
+    return {"viewer": {**viewer, "splats": splats}, "spark": SPARK.read_text(encoding="utf-8")} if splats else {}
+
+
 def region_corners(scene: PosedScene, region: GivenRegion | None) -> np.ndarray | None:
     """Corners [8, 3] of the box that was given as region, scene frame; None where none was."""
     corners = region.box_corners() if region else None
@@ -202,7 +212,7 @@ def replay(context: StageContext[ReportParams]) -> str:
 
 REPORT: Stage[ReportParams] = Stage(
     name="report",
-    version=11,
+    version=12,
     settings=lambda config: config.report,
     run=run,
     reads=(
@@ -227,6 +237,7 @@ REPORT: Stage[ReportParams] = Stage(
         ORM,
         KNOWN,
         LIGHT_HDR,
+        SPLATS,
     ),
     writes=(PAGE,),
     reads_manifests=(
@@ -241,6 +252,7 @@ REPORT: Stage[ReportParams] = Stage(
         "atlas",
         "bake",
         "materials",
+        "splats",
         "export",
     ),
     reads_run=True,

@@ -17,6 +17,9 @@ from stages.engine.runner import run_pipeline
 from stages.engine.stage import Stage, StageContext
 from stages.engine.workspace import Workspace
 from stages.files.light_files import write_exr, write_hdr
+from stages.gaussians.gaussians import Gaussians
+from stages.gaussians.harmonics import C0
+from stages.gaussians.keeping import write_gaussians
 from stages.geometry.cameras import PinholeCameras
 from stages.geometry.place import Place
 from stages.geometry.similarity import Similarity
@@ -41,8 +44,8 @@ def lamp_above(height: int = 32) -> np.ndarray:
     return light
 
 
-def make_workspace(root: Path, materials: bool) -> Path:
-    """`root`, with the stages up to `materials` published."""
+def make_workspace(root: Path, materials: bool, until: str = "materials") -> Path:
+    """`root`, with the stages up to `until` published; splats, where it is theirs, are a red ball."""
     photos = root.parent / f"{root.name}_photos"
     photos.mkdir()
     run_pipeline(
@@ -50,14 +53,14 @@ def make_workspace(root: Path, materials: bool) -> Path:
         Workspace.open(root, create=True),
         Config(),
         {"photos": photos},
-        until="materials",
+        until=until,
     )
     return root
 
 
 def _left_by(stage: Stage, materials: bool) -> Any:
     def run(context: StageContext) -> dict[str, Any]:
-        leave = {"train": _scene, "place": _place, "atlas": _atlas, "bake": _texture}
+        leave = {"train": _scene, "place": _place, "atlas": _atlas, "bake": _texture, "splats": _splats}
         if materials:
             leave["materials"] = _materials
         if stage.name in leave:
@@ -98,3 +101,22 @@ def _materials(context: StageContext) -> None:
     write_png(context.to_write(artifacts.ORM), np.full((16, 16, 3), (255, 255, 0), np.uint8))
     write_exr(context.to_write(artifacts.LIGHT), lamp_above())
     write_hdr(context.to_write(artifacts.LIGHT_HDR), lamp_above())
+
+
+def _splats(context: StageContext) -> None:
+    write_gaussians(context.to_write(artifacts.SPLATS), red_ball())
+
+
+def red_ball() -> Gaussians:
+    """Opaque Gaussians at the vertices of the ball, as large as their distances."""
+    points = ball().vertices
+    one = np.ones(len(points), np.float32)
+    red = (np.array([1.0, 0, 0]) - 0.5) / C0
+    return Gaussians(
+        centers=points,
+        rotations=np.eye(4, dtype=np.float32)[:1].repeat(len(points), 0),
+        log_scales=np.log(0.06) * np.ones((len(points), 3), np.float32),
+        opacity_logits=4 * one,
+        harmonics=np.tile(red.astype(np.float32), (len(points), 1, 1)),
+        anchored=one > 0,
+    )

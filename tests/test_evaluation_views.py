@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from made_up_gaussians import some_gaussians
 from sphere_scene import RADIUS, render, ring_of_cameras, sphere_scene, write_undistorted
 from train_settings import small
 from typer.testing import CliRunner
@@ -25,6 +26,7 @@ from stages.engine.workspace import Workspace
 from stages.evaluation.photos import images
 from stages.evaluation.photos.images import find_lpips, score_image
 from stages.evaluation.photos.regions import judge, laid_on_white
+from stages.gaussians.keeping import write_gaussians
 from stages.neural.drawing import FieldDrawer, FieldDrawing
 from stages.neural.fields import Fields
 from stages.neural.trained_field import field_state
@@ -227,6 +229,40 @@ def test_the_command_scores_each_photo_and_writes_the_pictures(workspace, tmp_pa
     assert "2 of 8" in found["done"][0]
     table = CliRunner().invoke(app, ["evaluate", "views", str(workspace.root), "--device", "cpu"]).stdout
     assert all(word in table for word in ("view_02.png", "mean", "ssim"))
+
+
+@pytest.mark.slow
+def test_splats_are_scored_where_there_are_some_of_the_mesh(workspace, tmp_path):
+    _, without = evaluate(workspace.root)
+    assert "splats" not in without["mean"]
+    atlas = artifacts.ATLAS_MESH.load(workspace.stage_folder("atlas"))
+    rows = np.repeat(np.arange(len(atlas.vertices)), 2)
+    some = some_gaussians(len(rows), 0)
+    grey = replace(
+        some,
+        centers=atlas.vertices[rows],
+        log_scales=np.full_like(some.log_scales, np.log(np.ptp(atlas.vertices) / 25)),
+        opacity_logits=np.full_like(some.opacity_logits, 4),
+        harmonics=np.zeros_like(some.harmonics),
+    )
+    publish(workspace, "splats", lambda out: write_gaussians(artifacts.SPLATS.load(out), grey))
+    _, found = evaluate(workspace.root, "--renders", tmp_path / "renders")
+    assert f"splats: {len(rows):,} Gaussians" in " ".join(found["done"])
+    for photo in found["photos"]:
+        assert abs(photo["splats"]["object"]["psnr"] - photo["mesh"]["object"]["psnr"]) < 1.5  # the mesh is grey, too
+        assert (tmp_path / "renders" / "splats" / photo["name"]).is_file()
+    table = CliRunner().invoke(app, ["evaluate", "views", str(workspace.root), "--device", "cpu"]).stdout
+    assert "splats" in table
+    other = replace(atlas, texture_size=4)
+    publish(workspace, "atlas", lambda out: artifacts.ATLAS_MESH.save(out, other))
+    publish(
+        workspace,
+        "bake",
+        lambda out: artifacts.write_png(artifacts.BASE_COLOR.load(out), np.zeros((4, 4, 3), np.uint8)),
+    )
+    _, stale = evaluate(workspace.root)
+    assert "splats" not in stale["mean"]
+    assert "another mesh" in " ".join(stale["done"])
 
 
 def test_what_is_missing_or_stale_is_explained(workspace, tmp_path):

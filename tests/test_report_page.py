@@ -6,13 +6,13 @@ import html
 import json
 import re
 import shlex
-import shutil
 import subprocess
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from chromium import BROWSER, HEADLESS, WEBGL
 from relit_workspace import ball
 from report_inputs import BOX, bare_inputs, full_inputs, manifest, page
 
@@ -29,9 +29,7 @@ from stages.geometry.point_cloud import PointCloud
 from stages.geometry.similarity import Similarity
 from stages.light.environment import directions
 
-BROWSER = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(BROWSER is None, reason="needs Chromium")]
-WEBGL = ("--enable-unsafe-swiftshader", "--use-gl=angle", "--use-angle=swiftshader")
 
 
 @pytest.fixture
@@ -42,7 +40,7 @@ def full(tmp_path) -> StageContext:
 def browse(folder: Path, url: str, *options: str, webgl: bool = True) -> subprocess.CompletedProcess[str]:
     done = subprocess.run(
         [
-            str(BROWSER), "--headless=new", "--no-sandbox", "--disable-dev-shm-usage", "--hide-scrollbars",
+            str(BROWSER), *HEADLESS,
             f"--user-data-dir={folder / 'profile'}", "--enable-logging=stderr", "--virtual-time-budget=5000",
             *(WEBGL if webgl else ("--disable-gpu", "--disable-3d-apis")), *options, url,
         ],

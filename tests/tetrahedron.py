@@ -58,7 +58,8 @@ UP = np.array([0.0, 0, 1])
 
 def workspace(tmp_path: Path, params: ExportParams | None = None) -> StageContext:
     folders = {
-        name: tmp_path / name for name in ("densify", "train", "place", "atlas", "bake", "materials", "out", "scratch")
+        name: tmp_path / name
+        for name in ("densify", "train", "place", "atlas", "bake", "materials", "splats", "out", "scratch")
     }
     for folder in folders.values():
         folder.mkdir()

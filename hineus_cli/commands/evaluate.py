@@ -194,7 +194,7 @@ def evaluate_views(
     device: Device = "auto",
     as_json: Json = False,
 ) -> None:
-    """Held-out photos against drawings of the field and of the textured mesh."""
+    """Held-out photos against drawings of the field, of the textured mesh and of splats."""
     from stages.evaluation.photos.held_out import evaluate_views as score
 
     _run(context, lambda: score(workspace, renders, device), _show_views)
@@ -265,7 +265,8 @@ def _show_views(found: dict[str, Any]) -> None:
     rows = [*found["photos"], {"name": "mean", **found["mean"]}]
     columns = [
         (what, region, key)
-        for what in ("field", "mesh")
+        for what in ("field", "mesh", "splats")
+        if what in found["mean"]
         for region in ("object", "whole")
         for key in ("psnr", "ssim", "lpips")
         if any(row[what][region] is not None and row[what][region][key] is not None for row in rows)

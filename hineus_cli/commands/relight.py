@@ -2,28 +2,14 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from hineus_cli.completing import lights
-from hineus_cli.options import Json, OfWorkspace, Verbose
+from hineus_cli.options import Json, OfWorkspace, Verbose, picture_size
 from hineus_cli.session import Session, print_json
-from stages.errors import ConfigError
-
-
-def picture_size(text: str) -> tuple[int, int]:
-    """ "640x480" as width and height.
-
-    Raises:
-        ConfigError: it is no size.
-    """
-    found = re.fullmatch(r"(\d{1,5})x(\d{1,5})", text.strip().lower())
-    if not found:
-        raise ConfigError(f"--size {text[:40]} is no size.", "Try `--size 1280x720`: width and height in pixels.")
-    return int(found[1]), int(found[2])
 
 
 def relight(

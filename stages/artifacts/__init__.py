@@ -19,6 +19,7 @@ from stages.artifacts.export import (
     obj_map_path,
     points_path,
     simulation_path,
+    splats_path,
 )
 from stages.artifacts.ingest import IMAGE_SET, LEFT_OUT, PHOTOS, ImageRecord, ImageSet, SkippedImage
 from stages.artifacts.json_files import read_json, write_json

@@ -44,3 +44,8 @@ def simulation_path(folder: Path) -> Path:
 def light_path(folder: Path, kind: str) -> Path:
     """The light of the photos: exr, hdr or json (its spherical harmonics), in the frame of the GLB."""
     return folder / f"model_light.{kind}"
+
+
+def splats_path(folder: Path, kind: str, level: int = 0) -> Path:
+    """The Gaussian splats: ply, spz or glb; level 0 is all of them, 1 or more a level of detail."""
+    return folder / f"model{f'_lod{level}' if level else ''}.splats.{kind}"

@@ -1,1 +1,1 @@
-"""Meshes, points and lights to the bytes of other programs: GLB, USDZ, OBJ, PLY, STL, LAZ, EXR, HDR. No stage."""
+"""Meshes, points, splats, lights to the bytes of other programs: GLB, USDZ, OBJ, PLY, STL, SPZ, LAZ, HDR. No stage."""

@@ -43,7 +43,7 @@ def glb_bytes(
     vertices, flipped = mesh.vertices, mesh.uvs.copy()
     flipped[:, 1] = 1 - flipped[:, 1]
     bounds = {"min": vertices.min(0).tolist(), "max": vertices.max(0).tolist()}
-    buffer = _GlbBuffer()
+    buffer = GlbBuffer()
     attributes = {
         "POSITION": buffer.add_numbers(vertices, "VEC3", **bounds),
         "NORMAL": buffer.add_numbers(mesh.normals, "VEC3"),
@@ -65,7 +65,7 @@ def glb_bytes(
     )
 
 
-def _material(buffer: _GlbBuffer, textures: Textures) -> dict[str, Any]:
+def _material(buffer: GlbBuffer, textures: Textures) -> dict[str, Any]:
     """The material, its images added to the buffer. One image of three channels serves as two textures."""
     surface: dict[str, Any] = {
         "baseColorTexture": {"index": buffer.add_image(textures.base_color, "base_color")},
@@ -95,7 +95,7 @@ def shapes_glb_bytes(
         shapes: name -> vertices [V, 3] in a right-handed, Y-up frame, and faces [F, 3], counter-clockwise from outside.
         extras: JSON-able, kept in the asset's extras.
     """
-    buffer = _GlbBuffer()
+    buffer = GlbBuffer()
     meshes = []
     for name, (vertices, faces) in shapes.items():
         points = np.ascontiguousarray(vertices, dtype=np.float32)
@@ -106,7 +106,7 @@ def shapes_glb_bytes(
     return buffer.file(meshes, generator, extras)
 
 
-class _GlbBuffer:
+class GlbBuffer:
     """The binary chunk as it grows, and the JSON that says what lies where in it."""
 
     def __init__(self) -> None:

@@ -39,6 +39,12 @@ class Gaussians:
         """Of the harmonics, 0 to 3."""
         return int(np.sqrt(self.harmonics.shape[1])) - 1
 
+    @property
+    def opacities(self) -> np.ndarray:
+        """[N] float32, 0 to 1."""
+        half = 0.5 * self.opacity_logits  # the logistic function as a tangent, which does not overflow
+        return 0.5 + 0.5 * np.tanh(half)
+
     def select(self, rows: np.ndarray) -> Gaussians:
         """Those at `rows`, indices or a mask [N]."""
         return Gaussians(**{field.name: getattr(self, field.name)[rows] for field in fields(self)})

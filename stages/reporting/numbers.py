@@ -39,6 +39,8 @@ def headline(
         numbers.append(("final mesh in held-out photos", f"{held_out['psnr']:.1f} dB"))
     if "seen_share" in baked:
         numbers.append(("texture from photos", f"{100 * baked['seen_share']:.0f} %"))
+    if "splats" in exported:
+        numbers.append(("Gaussian splats", f"{exported['splats']:,}"))
     total = total_row(list(manifests.values()))
     if total:
         numbers += [("wall time", total["wall"]), ("peak memory", total["memory"])]

@@ -1,6 +1,6 @@
 // The page's 3D view, on three.js (global THREE): the mesh with its texture or a measure per vertex in colours, the
 // cameras as pyramids, sparse and dense points, ground, region, and the next photos to take; the mesh in a light from all
-// around, and what the material is. Drawn when something changes only.
+// around, and what the material is; Gaussian splats in place of the mesh. Drawn when something changes only.
 (function () {
   "use strict";
   const canvas = document.getElementById("viewer");
@@ -85,6 +85,7 @@
   Object.values(materials).forEach(region.dim);
   const mesh = new THREE.Mesh(geometry, materials.texture);
   scene.add(mesh);
+  const splats = data.splats && addSplats({ packed: data.splats.spz, scene, renderer, redraw });
 
   // ---------------------------------------------------------------- light from all around, and the material's images
   const surroundings = {};
@@ -147,7 +148,9 @@
   const show = (what) => {
     const overlay = data.overlays.find((each) => each.key === what);
     const light = data.lights.find((each) => each.key === what);
-    mesh.visible = what !== "none";
+    const asSplats = Boolean(splats) && what === "splats";
+    if (splats) splats.show(asSplats);
+    mesh.visible = what !== "none" && !asSplats;
     mesh.material = overlay ? materials.measure : light ? materials.lit : materials[what] || materials.texture;
     inLight(light);
     if (light || basic.includes(what)) showMaterial();
@@ -356,7 +359,7 @@
   element("light-turn").value = asked.get("turn") || "0";
   show(asked.get("show") || "texture");
   choose(asked.get("pick") || "");
-  Promise.all([load(texture, data.texture), told]).then(() => {
+  Promise.all([load(texture, data.texture), told, splats && splats.ready()]).then(() => {
     draw();
     document.documentElement.dataset.viewer = "ready";
   });

@@ -187,6 +187,11 @@ def _light(draw: DrawFn, tiny: Tiny, folder: Path) -> Commands:
     return [["relight", str(tiny.workspace), "--light", name, "--out", "a.png", "--size", "32x32"]]
 
 
+def _path(draw: DrawFn, tiny: Tiny, folder: Path) -> Commands:
+    wrong_file(draw, tiny.input("transforms.json"), folder / "path.json")
+    return [["render", str(tiny.workspace), "--path", "path.json", "--out", "a.png", "--size", "32x32"]]
+
+
 # ---------------------------------------------------------------- a workspace of someone else, or damaged
 def _record(draw: DrawFn, tiny: Tiny, folder: Path) -> Commands:
     shutil.copytree(tiny.workspace, folder / "w")
@@ -250,6 +255,7 @@ ENTRY_POINTS = (
     EntryPoint("mesh", 12, _mesh),
     EntryPoint("matrix", 3, _matrix),
     EntryPoint("light", 6, _light),
+    EntryPoint("path of a film", 6, _path),
     EntryPoint("record of a workspace", 8, _record),
     EntryPoint("artifact of a stage", 6, _artifact, WITHIN_S),
     EntryPoint("materials of a workspace", 2, _materials, first=make_up_materials),

@@ -1,4 +1,5 @@
-"""`hineus evaluate views`: photos that a workspace held out, against drawings of its field and of its final mesh."""
+"""`hineus evaluate views`: photos that a workspace held out, against drawings of its field, of its final mesh and
+of its splats."""
 
 from __future__ import annotations
 
@@ -16,7 +17,10 @@ from stages.engine.workspace import Workspace
 from stages.errors import InputError, WorkspaceError
 from stages.evaluation.photos.images import find_lpips
 from stages.evaluation.photos.scoring import score_photos
+from stages.gaussians.gaussians import Gaussians
+from stages.gaussians.keeping import read_gaussians
 from stages.reconstruct import choose_device
+from stages.splats import SPLATTING
 from stages.train import TRAIN
 from stages.undistort import UNDISTORT
 
@@ -25,10 +29,11 @@ DRAWN_FROM = (UNDISTORT, TRAIN, ATLAS, BAKE)
 
 
 def evaluate_views(workspace: Path, renders: Path | None = None, device: str = "auto") -> dict[str, Any]:
-    """The photos that a workspace held out, against drawings of its field and of its final mesh.
+    """The photos that a workspace held out, against drawings of its field, of its final mesh and, where
+    they are of that mesh, of its splats.
 
     Args:
-        renders: folder for the pictures, `photo/`, `field/` and `mesh/`; None: none are written.
+        renders: folder for the pictures, `photo/`, `field/`, `mesh/` and `splats/`; None: none are written.
         device: auto, cpu or cuda.
 
     Returns:
@@ -39,7 +44,8 @@ def evaluate_views(workspace: Path, renders: Path | None = None, device: str = "
         WorkspaceError: a stage is missing, damaged, or of another run than those after it.
     """
     opened = _whole(workspace)
-    with damage_named(opened, [stage.name for stage in DRAWN_FROM]):
+    made = [stage.name for stage in (*DRAWN_FROM, SPLATTING) if opened.published(stage.name)]
+    with damage_named(opened, made):
         return _scored(opened, workspace, renders, device)
 
 
@@ -66,7 +72,10 @@ def _scored(opened: Workspace, workspace: Path, renders: Path | None, device: st
 
     lpips, about_lpips = find_lpips()
     indices = [cameras.names.index(name) for name in held_out]
-    found = score_photos(opened, cameras, indices, load, choose_device(device), lpips=lpips, renders=renders)
+    splats, about_splats = _splats(opened)
+    found = score_photos(
+        opened, cameras, indices, load, choose_device(device), lpips=lpips, renders=renders, splats=splats
+    )
     return {
         "workspace": str(workspace),
         **found,
@@ -75,9 +84,21 @@ def _scored(opened: Workspace, workspace: Path, renders: Path | None, device: st
             f"photos: {len(held_out)} of {len(cameras)}, held out from training and texture by `--hold-out`",
             f"object: the photo's mask in {masked} photos, the mesh's silhouette in {len(held_out) - masked}",
             "whole: the photo as it is for a field with a background; else masked photo and drawing on white",
+            *([f"splats: {about_splats}"] if about_splats else []),
             f"lpips: {about_lpips}",
         ],
     }
+
+
+def _splats(opened: Workspace) -> tuple[Gaussians | None, str]:
+    """The splats of the workspace's mesh, and in words how many or why none; no words where none were made."""
+    file = artifacts.SPLATS.load(opened.stage_folder(SPLATTING.name))
+    if not file.exists():
+        return None, ""
+    if replaced_inputs(SPLATTING, opened):
+        return None, "left out: they are of another mesh than the one there"
+    splats = read_gaussians(file)
+    return splats, f"{len(splats):,} Gaussians, on white"
 
 
 def _whole(workspace: Path) -> Workspace:

@@ -1,10 +1,11 @@
-"""Photos that nothing was learned from, against drawings of the trained field and of the textured mesh.
+"""Photos that nothing was learned from, against drawings of the trained field, of the textured mesh and of splats.
 
 H x W pixels. Two regions are scored:
 
 - object: the photo's mask, or the mesh's silhouette where there is none, as far as the field says something;
-- whole: the whole photo. A field that has learned a background is held against the photo as it is. Any other field, and
-  the mesh, are laid on white, as is what the mask leaves out of the photo; without a mask they have no such score.
+- whole: the whole photo. A field that has learned a background is held against the photo as it is. Any other
+  field, the mesh and the splats are laid on white, as is what the mask leaves out of the photo; without a mask they
+  have no such score.
 """
 
 from __future__ import annotations
@@ -37,11 +38,13 @@ class Judged:
 
     Attributes:
         field, mesh: their scores.
-        pictures: "photo", "field" and "mesh", [H, W, 3] uint8, as they are compared as a whole.
+        splats: theirs; None where there are none.
+        pictures: "photo", "field", "mesh" and "splats", [H, W, 3] uint8, as they are compared as a whole.
     """
 
     field: RegionScores
     mesh: RegionScores
+    splats: RegionScores | None
     pictures: dict[str, np.ndarray]
 
 
@@ -52,6 +55,7 @@ def judge(
     mesh: np.ndarray,
     silhouette: np.ndarray,
     lpips: Lpips | None = None,
+    splats: np.ndarray | None = None,
 ) -> Judged:
     """Scores of a photo's drawings.
 
@@ -61,6 +65,7 @@ def judge(
         field: of the trained field.
         mesh: [H, W, 3] uint8 of the textured mesh, white around it.
         silhouette: [H, W] bool, where the mesh is.
+        splats: as `mesh`, of the Gaussians; None: there are none.
     """
     counted = (silhouette if mask is None else mask) & field.drawn
     on_white = photo if mask is None else np.where(mask[..., None], photo, np.uint8(WHITE))
@@ -71,10 +76,13 @@ def judge(
         inside = score_image(colors, photo, counted, lpips) if counted.any() else None
         return RegionScores(inside, None if whole is None else score_image(image, whole, None, lpips))
 
+    surface_truth = None if mask is None else on_white
+    pictures = {"photo": photo if field.background else on_white, "field": seen, "mesh": mesh}
     return Judged(
         scores(seen, field.colors, field_truth),
-        scores(mesh, mesh, None if mask is None else on_white),
-        {"photo": photo if field.background else on_white, "field": seen, "mesh": mesh},
+        scores(mesh, mesh, surface_truth),
+        None if splats is None else scores(splats, splats, surface_truth),
+        pictures if splats is None else {**pictures, "splats": splats},
     )
 
 

@@ -17,6 +17,8 @@ from stages.drawing.view_scores import draw_view, silhouette
 from stages.engine.workspace import Workspace
 from stages.evaluation.photos.images import Lpips
 from stages.evaluation.photos.regions import WHITE, judge
+from stages.gaussians.gaussians import Gaussians
+from stages.gaussians.pictures import draw_picture
 from stages.geometry.cameras import PinholeCameras
 from stages.neural.drawing import FieldDrawer
 from stages.neural.trained_field import load_field
@@ -36,24 +38,27 @@ def score_photos(
     textured: bool = True,
     lpips: Lpips | None = None,
     renders: Path | None = None,
+    splats: Gaussians | None = None,
 ) -> dict[str, Any]:
-    """Photos against drawings of a workspace's field and of its textured mesh; its stages are there.
+    """Photos against drawings of a workspace's field, of its textured mesh and of splats; its stages are there.
 
     Args:
         cameras: in the workspace's scene frame.
         indices: of the cameras that are scored.
         textured: whether there is a textured mesh; without one there are no scores of "mesh".
-        renders: folder for the pictures, `photo/`, `field/` and `mesh/`; None: none are written.
+        renders: folder for the pictures, `photo/`, `field/`, `mesh/` and `splats/`; None: none are written.
+        splats: in the scene frame; without them there are no scores of "splats".
 
     Returns:
         {"photos": [{"name", "field": {"object": {"psnr", "ssim", "lpips", "pixels"} or None, "whole": ..}, "mesh":
-        {..}}], "mean": the same without names, over the photos}; regions as in `stages.evaluation.photos.regions`.
+        {..}, "splats": {..}}], "mean": the same without names, over the photos}; regions as in
+        `stages.evaluation.photos.regions`.
     """
     drawer = field_drawer(workspace, device)
     if textured:
         atlas = artifacts.ATLAS_MESH.load(workspace.stage_folder("atlas"))
         texture = artifacts.read_texture(artifacts.BASE_COLOR.load(workspace.stage_folder("bake")))
-    kinds = ("field", "mesh") if textured else ("field",)
+    kinds = ("field", *(("mesh",) if textured else ()), *(("splats",) if splats is not None else ()))
     photos: list[dict[str, Any]] = []
     for index in indices:
         name = cameras.names[index]
@@ -63,7 +68,8 @@ def score_photos(
             covered = silhouette(atlas.vertices, atlas.faces, cameras, index)
         else:
             drawing, covered = np.full_like(photo, WHITE), np.zeros(photo.shape[:2], bool)
-        judged = judge(photo, mask, drawer.draw(cameras, index), drawing, covered, lpips)
+        of_splats = None if splats is None else draw_picture(splats, cameras, index)
+        judged = judge(photo, mask, drawer.draw(cameras, index), drawing, covered, lpips, of_splats)
         if renders is not None:
             for what, picture in judged.pictures.items():
                 artifacts.write_png((renders / what / name).with_suffix(".png"), picture)

@@ -1,4 +1,4 @@
-// What the 3D view uses of three.js; `make vendor` bundles it into three.min.js.
+// What the 3D view uses of three.js, and Spark in it; `make vendor` bundles it into three.min.js.
 export {
   AmbientLight,
   BufferAttribute,
@@ -33,3 +33,42 @@ export {
   WebGLRenderer,
 } from "three";
 export { OrbitControls } from "three/addons/controls/OrbitControls.js";
+// What Spark uses more.
+export {
+  Box3,
+  Camera,
+  ColorManagement,
+  CubeCamera,
+  DataArrayTexture,
+  Euler,
+  FileLoader,
+  Float32BufferAttribute,
+  FloatType,
+  GLSL3,
+  InstancedBufferGeometry,
+  LinearMipMapLinearFilter,
+  LinearSRGBColorSpace,
+  Loader,
+  Matrix2,
+  Matrix3,
+  NearestFilter,
+  Object3D,
+  OrthographicCamera,
+  Quaternion,
+  REVISION,
+  RGBAIntegerFormat,
+  RGIntegerFormat,
+  RawShaderMaterial,
+  Raycaster,
+  ShaderChunk,
+  ShaderMaterial,
+  Timer,
+  UnsignedByteType,
+  UnsignedIntType,
+  UnsignedShortType,
+  Vector2,
+  Vector4,
+  WebGLArrayRenderTarget,
+  WebGLCubeRenderTarget,
+  WebGLRenderTarget,
+} from "three";
