@@ -138,7 +138,7 @@ def refine(
             pull, seen = np.zeros(len(gaussians), np.float32), np.zeros(len(gaussians), np.float32)
         if listener is not None and (step % 10 == 0 or step == steps - 1):
             listener(step + 1, steps, "refining")
-    kept = _opacities(gaussians) >= LEAST_OPACITY
+    kept = gaussians.opacities >= LEAST_OPACITY
     return gaussians.select(kept), errors
 
 
@@ -165,7 +165,7 @@ def _split_and_prune(
     gaussians: Gaussians, anchors: Anchors, moments: Moments, pull: np.ndarray, room: int
 ) -> tuple[Gaussians, Anchors, Moments]:
     """Without transparent ones, and two in the place of each of the `room` with the largest mean gradients [N]."""
-    kept = np.flatnonzero(_opacities(gaussians) >= LEAST_OPACITY)
+    kept = np.flatnonzero(gaussians.opacities >= LEAST_OPACITY)
     wanted = kept[np.argsort(-pull[kept], kind="stable")[:room]]
     wanted = wanted[pull[wanted] > 0]
     stays = np.setdiff1d(kept, wanted)
@@ -183,29 +183,14 @@ def _split_and_prune(
 
 def _halves(gaussians: Gaussians) -> list[Gaussians]:
     """Two for each, side by side along its longest axis."""
-    count = len(gaussians)
+    from scipy.spatial.transform import Rotation
+
     longest = gaussians.log_scales.argmax(1)
-    rows = np.arange(count)
-    axes = _axes(gaussians.rotations)[rows, :, longest]
+    rows = np.arange(len(gaussians))
+    turns = Rotation.from_quat(gaussians.rotations[:, [1, 2, 3, 0]])  # SciPy has w last
+    axes = turns.as_matrix()[rows, :, longest]
     offset = HALF_OFFSET * np.exp(gaussians.log_scales[rows, longest])[:, None] * axes
     log_scales = gaussians.log_scales.copy()
     log_scales[rows, longest] -= np.log(HALF_SIZE)
     smaller = replace(gaussians, log_scales=log_scales)
     return [replace(smaller, centers=(gaussians.centers + sign * offset).astype(np.float32)) for sign in (1, -1)]
-
-
-def _axes(quaternions: np.ndarray) -> np.ndarray:
-    """Matrices [N, 3, 3] of quaternions [N, 4] (w, x, y, z)."""
-    w, x, y, z = (quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)).T
-    entries = [
-        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-    ]  # fmt: skip
-    matrices: np.ndarray = np.stack(entries, axis=1).reshape(-1, 3, 3)
-    return matrices
-
-
-def _opacities(gaussians: Gaussians) -> np.ndarray:
-    opacities: np.ndarray = 1 / (1 + np.exp(-gaussians.opacity_logits))
-    return opacities
