@@ -29,7 +29,7 @@ PHOTOS_FOR_DEGREE = (1, 6, 12, 24)
 # degree 0 only settles what no photo tells.
 RIDGE = (1e-3, 0.15, 0.3, 0.45)
 # Neighbours with a Gaussian itself, and how many of their mean distances a turn of the normal by one radian counts as.
-NEIGHBORS, TURN = 24, 8.0
+NEIGHBORS, TURN = 24, 12.0
 # Errors beyond this (sRGB, 1 for full scale) count in proportion to their size, not its square (Huber).
 HUBER = 0.06
 _ROUNDS = 3
