@@ -170,7 +170,7 @@ def _split_and_prune(
     wanted = wanted[pull[wanted] > 0]
     stays = np.setdiff1d(kept, wanted)
     rows = np.concatenate([stays, wanted, wanted])
-    halves = _halves(gaussians.select(wanted))
+    halves = _halves(gaussians.select(wanted)) if len(wanted) else []  # SciPy 1.13 takes no empty arrays of turns
     stayed = gaussians.select(stays)
     together = Gaussians(
         **{
