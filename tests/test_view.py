@@ -319,7 +319,7 @@ def test_many_connections_and_half_requests_end_in_time(url, monkeypatch, capfd)
     for connection in open_ones[: viewing.MOST_CONNECTIONS]:
         connection.sendall(b"GET / HTTP/1.1\r\nHost")
     answers = [rest(connection) for connection in reversed(open_ones)]
-    assert time.monotonic() - started < 5
+    assert time.monotonic() - started < 9  # a busy machine needs some of it; without the patch it is over 10
     assert sum(b" 503 " in answer for answer in answers) >= viewing.MOST_CONNECTIONS
     assert not any(b" 200 " in answer for answer in answers)
     for connection in open_ones:
@@ -334,12 +334,12 @@ def test_a_request_that_comes_drop_by_drop_is_not_waited_for(url, monkeypatch):
     with connect(url) as connection, contextlib.suppress(ConnectionError):
         started = time.monotonic()
         connection.settimeout(0.1)
-        while time.monotonic() - started < 5:
+        while time.monotonic() - started < 30:
             connection.sendall(b"G")
             with contextlib.suppress(TimeoutError):
                 if not connection.recv(1):
                     break
-    assert time.monotonic() - started < 3
+    assert time.monotonic() - started < 9
 
 
 def test_a_client_that_goes_away_leaves_no_trace(url, capfd):
