@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 
 
 class HineusError(Exception):
@@ -51,3 +51,16 @@ def did_you_mean(name: str, known: Iterable[str], form: str = "{}") -> str:
     """The start of a hint: "Did you mean `--preset cpu`? " by the nearest known name; empty where none is near."""
     near = difflib.get_close_matches(name, known, 1)
     return f"Did you mean `{form.format(near[0])}`? " if near else ""
+
+
+def check_choice(option: str, value: str, known: Collection[str]) -> None:
+    """
+    Args:
+        option: as it is written on the command line.
+
+    Raises:
+        ConfigError: the value is none of those known.
+    """
+    if value not in known:
+        hint = did_you_mean(value, known, f"{option} {{}}")
+        raise ConfigError(f"{option} {value[:40]} is not known.", f"{hint}There are {', '.join(known)}.")

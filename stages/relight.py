@@ -15,9 +15,9 @@ from stages import artifacts
 from stages.atlas import ATLAS
 from stages.bake import BAKE
 from stages.engine.damage import damage_named
-from stages.engine.status import replaced_inputs
+from stages.engine.status import check_current, replaced_inputs
 from stages.engine.workspace import Workspace
-from stages.errors import ConfigError, WorkspaceError, did_you_mean
+from stages.errors import ConfigError, WorkspaceError, check_choice, did_you_mean
 from stages.files.films import check_film, is_video, write_film
 from stages.geometry.up import gltf_from_scene
 from stages.light.built_in import LIGHTS, MEAN
@@ -88,13 +88,8 @@ class Wish:
         from stages.drawing.relighting import BACKGROUNDS
 
         check_film(self.out, self.size)
-        for option, value, known in (
-            ("renderer", self.renderer, RENDERERS),
-            ("background", self.background, BACKGROUNDS),
-        ):
-            if value not in known:
-                hint = did_you_mean(value, known, f"--{option} {{}}")
-                raise ConfigError(f"--{option} {value[:40]} is not known.", f"{hint}There are {', '.join(known)}.")
+        check_choice("--renderer", self.renderer, RENDERERS)
+        check_choice("--background", self.background, BACKGROUNDS)
         if self.is_video and self.background == "transparent":
             raise ConfigError("A video has no transparent background.", "Try `--background white`, or a .png file.")
 
@@ -155,12 +150,7 @@ def relight(workspace: Path, wish: Wish, progress: Callable[[int, int], None]) -
 # ---------------------------------------------------------------- what is there
 def _needed(opened: Workspace) -> list[str]:
     """Stages that are read; those that materials come from only where there are some."""
-    for stage in (ATLAS, BAKE):
-        if replaced_inputs(stage, opened):
-            raise WorkspaceError(
-                f"The workspace {opened.root} has no texture of its present mesh.",
-                f"Make it: `hineus run --workspace {shlex.quote(str(opened.root))} --until bake`.",
-            )
+    check_current(opened, (ATLAS, BAKE), "texture of its present mesh", "--until bake")
     with_materials = not replaced_inputs(MATERIALS, opened)
     read = [artifacts.SCENE.stage, artifacts.WORLD_PLACE.stage, ATLAS.name, BAKE.name]
     return [*read, *([MATERIALS.name] if with_materials else [])]

@@ -14,10 +14,9 @@ from stages import artifacts
 from stages.atlas import ATLAS
 from stages.bake import BAKE
 from stages.engine.damage import damage_named
-from stages.engine.stage import Stage
-from stages.engine.status import replaced_inputs
+from stages.engine.status import check_current
 from stages.engine.workspace import Workspace
-from stages.errors import ConfigError, InputError, WorkspaceError, did_you_mean
+from stages.errors import InputError, WorkspaceError, check_choice
 from stages.files.films import check_film, is_video, write_film
 from stages.geometry.cameras import PinholeCameras, PosedScene
 from stages.geometry.normalisation import into_frame
@@ -59,9 +58,7 @@ class Film:
             InputError: there is no folder for the file.
         """
         check_film(self.out, self.size)
-        if self.what not in SUBJECTS:
-            hint = did_you_mean(self.what, SUBJECTS, "--what {}")
-            raise ConfigError(f"--what {self.what[:40]} is not known.", f"{hint}There are {', '.join(SUBJECTS)}.")
+        check_choice("--what", self.what, SUBJECTS)
 
 
 def render(workspace: Path, film: Film, progress: Callable[[int, int], None]) -> dict[str, Any]:
@@ -94,19 +91,16 @@ def render(workspace: Path, film: Film, progress: Callable[[int, int], None]) ->
 def _needed(opened: Workspace, what: str) -> list[str]:
     """Stages that are read."""
     read = [artifacts.SCENE.stage, artifacts.WORLD_PLACE.stage, ATLAS.name]
-    command = f"hineus run --workspace {shlex.quote(str(opened.root))}"
     if what == "mesh":
-        _check_current(opened, (ATLAS, BAKE), "texture of its present mesh", f"{command} --until bake")
+        check_current(opened, (ATLAS, BAKE), "texture of its present mesh", "--until bake")
         return [*read, BAKE.name]
-    _check_current(opened, (ATLAS, SPLATTING), "splats of its present mesh", f"{command} --splats")
+    check_current(opened, (ATLAS, SPLATTING), "splats of its present mesh", "--splats")
     if not artifacts.SPLATS.load(opened.stage_folder(SPLATTING.name)).exists():
-        raise WorkspaceError(f"The workspace {opened.root} has no splats.", f"Make them: `{command} --splats`.")
+        raise WorkspaceError(
+            f"The workspace {opened.root} has no splats.",
+            f"Make them: `hineus run --workspace {shlex.quote(str(opened.root))} --splats`.",
+        )
     return [*read, SPLATTING.name]
-
-
-def _check_current(opened: Workspace, stages: tuple[Stage[Any], ...], what: str, command: str) -> None:
-    if any(replaced_inputs(stage, opened) for stage in stages):
-        raise WorkspaceError(f"The workspace {opened.root} has no {what}.", f"Make it: `{command}`.")
 
 
 # ---------------------------------------------------------------- the path

@@ -195,22 +195,14 @@ def test_no_ground_sets_the_cut_and_is_remembered(folder: Path) -> None:
     assert "remove_ground: false" in config.read_text()
 
 
-def test_relightable_asks_for_materials_and_the_workspace_remembers_it(folder: Path) -> None:
+@pytest.mark.parametrize(("option", "section"), [("--relightable", "materials"), ("--splats", "splats")])
+def test_an_option_turns_a_stage_on_and_the_workspace_remembers_it(folder: Path, option: str, section: str) -> None:
     config = folder / "photos_hineus" / "config.yaml"
     hineus("run", "photos")
-    assert "materials:\n  enabled: false" in config.read_text()
-    hineus("run", "photos", "--relightable")
+    assert f"{section}:\n  enabled: false" in config.read_text()
+    hineus("run", "photos", option)
     hineus("run", "photos")
-    assert "materials:\n  enabled: true" in config.read_text()
-
-
-def test_splats_asks_for_them_and_the_workspace_remembers_it(folder: Path) -> None:
-    config = folder / "photos_hineus" / "config.yaml"
-    hineus("run", "photos")
-    assert "splats:\n  enabled: false" in config.read_text()
-    hineus("run", "photos", "--splats")
-    hineus("run", "photos")
-    assert "splats:\n  enabled: true" in config.read_text()
+    assert f"{section}:\n  enabled: true" in config.read_text()
 
 
 def test_a_stage_that_is_off_is_turned_on_by_its_own_command() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
@@ -14,6 +15,7 @@ from stages.engine.fingerprint import RUN_KEY, FileDigests, Identity, SourceDige
 from stages.engine.manifest import CHEAP_BYTES, Manifest, ManifestDamaged, jsonable, output_problem
 from stages.engine.stage import Stage
 from stages.engine.workspace import Workspace
+from stages.errors import WorkspaceError
 
 MAX_REASONS = 3
 
@@ -133,6 +135,20 @@ def replaced_inputs(stage: Stage[Any], workspace: Workspace) -> list[str]:
         if now is None or made_from.get(artifact.name) != now.artifact_digest(artifact):
             replaced.append(artifact.name)
     return replaced
+
+
+def check_current(workspace: Workspace, stages: Sequence[Stage[Any]], what: str, options: str) -> None:
+    """
+    Args:
+        what: the stages make, in words.
+        options: of `hineus run` that make it.
+
+    Raises:
+        WorkspaceError: a stage is missing, damaged, or was made from others than the workspace now holds.
+    """
+    if any(replaced_inputs(stage, workspace) for stage in stages):
+        command = f"hineus run --workspace {shlex.quote(str(workspace.root))} {options}"
+        raise WorkspaceError(f"The workspace {workspace.root} has no {what}.", f"Make it: `{command}`.")
 
 
 def _publication(stage: Stage[Any], workspace: Workspace, hashes: bool) -> tuple[Manifest | None, str | None]:

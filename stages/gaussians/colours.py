@@ -18,7 +18,7 @@ import numpy as np
 
 from stages.compiling import njit, prange
 from stages.gaussians import kernels
-from stages.gaussians.drawing import Camera, project
+from stages.gaussians.drawing import BLACK, Camera, render
 from stages.gaussians.gaussians import Gaussians
 from stages.gaussians.kernels import fill_basis
 from stages.shading.observations import Observations
@@ -91,15 +91,10 @@ def sweep(
     right = np.zeros((count, terms, 3), np.float32)
     total = pixels = 0.0
     for camera, photo, trust in photos:
-        found = project(gaussians, camera)
-        image = np.empty_like(photo)
-        open_ = np.empty(photo.shape[:2], np.float32)
-        kernels.blend(
-            found.starts, found.members, found.columns, found.means, found.conics, found.opacities, found.colors,
-            found.boxes, np.zeros(3, np.float32), image, open_,
-        )  # fmt: skip
+        drawing = render(gaussians, camera, BLACK)
+        found = drawing.ellipses
         # Where Gaussians leave a part of the pixel open, they owe only theirs.
-        residual = photo * (1 - open_[..., None]) - image
+        residual = photo * (1 - drawing.transmittance[..., None]) - drawing.image
         off = np.abs(residual).max(2)
         total += float(((residual**2).mean(2) * trust).sum())
         pixels += float(trust.sum())

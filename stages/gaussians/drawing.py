@@ -22,7 +22,7 @@ from stages.geometry.cameras import PinholeCameras
 if TYPE_CHECKING:
     from jaxtyping import Float32
 
-WHITE = (1.0, 1.0, 1.0)
+BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
 
 
 @dataclass(frozen=True)

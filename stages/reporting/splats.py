@@ -15,7 +15,7 @@ from stages.gaussians.transforming import transformed
 from stages.geometry.similarity import Similarity
 from stages.geometry.up import y_up_rotation
 
-# Of more Gaussians, whose files would make the page too heavy (60 bytes each), about so many are shown.
+# Of more Gaussians, whose files would make the page too heavy (50 bytes each), about so many are shown.
 MAX_SPLATS = 150_000
 
 
