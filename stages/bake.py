@@ -12,6 +12,7 @@ from stages.artifacts import (
     CAMERAS,
     CLEAN_FULL_MESH,
     FIELD,
+    GAINS,
     HELD_OUT,
     NORMAL_MAP,
     OCCLUSION,
@@ -63,6 +64,7 @@ def run(context: StageContext[BakeParams]) -> dict[str, Any]:
         ) from error
     write_png(context.to_write(BASE_COLOR), baked.base_color)
     write_png(context.to_write(PROVENANCE), baked.provenance)
+    context.write(GAINS, dict(zip(cameras.names, baked.gains, strict=True)))
     context.write(QUALITY, witness.quality(texels, baked.provenance))
     numbers = dict(baked.numbers)
     full = context.read(CLEAN_FULL_MESH)
@@ -80,10 +82,10 @@ def run(context: StageContext[BakeParams]) -> dict[str, Any]:
 
 BAKE: Stage[BakeParams] = Stage(
     name="bake",
-    version=7,
+    version=8,
     settings=lambda config: config.bake,
     run=run,
     reads=(PINHOLE_PHOTOS, CAMERAS, FIELD, HELD_OUT, CLEAN_FULL_MESH, ATLAS_MESH),
-    writes=(BASE_COLOR, PROVENANCE, NORMAL_MAP, OCCLUSION, QUALITY),
+    writes=(BASE_COLOR, PROVENANCE, NORMAL_MAP, OCCLUSION, GAINS, QUALITY),
     summary="charts + photos -> textures",
 )

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from configs.params import SplatsParams
-from stages.artifacts import ATLAS_MESH, BASE_COLOR, HELD_OUT, PINHOLE_PHOTOS, SCENE, SPLATS, read_texture
+from stages.artifacts import ATLAS_MESH, BASE_COLOR, GAINS, HELD_OUT, PINHOLE_PHOTOS, SCENE, SPLATS, read_texture
 from stages.engine.stage import Stage, StageContext
 from stages.errors import ReconstructionError
 
@@ -22,10 +22,10 @@ if TYPE_CHECKING:
 
 # Gaussians whose colours in all photos are in memory at a time.
 _CHUNK = 50_000
+# Of so many Gaussians at least, one tells what neighbours have in common.
+_SOME = 4
 # Parts of the stage's progress that its steps end at.
-_SEEN, _COLORED = 0.1, 0.3
-# Sweeps of least squares over all photos, before anything but colours changes.
-SWEEPS = 2
+_PLACED, _COLORED = 0.02, 0.2
 # Gaussians after refining, at most, in those that are placed.
 GROWTH = 1.3
 
@@ -37,14 +37,12 @@ def run(context: StageContext[SplatsParams]) -> dict[str, Any]:
         return {}
     import numba
 
-    from stages.drawing.rasterizing import rasterize_atlas
     from stages.gaussians import drawing, drawing_cuda
     from stages.gaussians.colours import degree_for, sweep
     from stages.gaussians.keeping import write_gaussians
     from stages.gaussians.placing import WIDTH, count_for, place
     from stages.gaussians.refining import Anchors, refine
     from stages.gaussians.targets import target
-    from stages.texture.baking import compare_photos
     from stages.texture.prepared_views import PreparedViews
 
     numba.set_num_threads(min(context.workers, numba.config.NUMBA_NUM_THREADS))
@@ -53,15 +51,15 @@ def run(context: StageContext[SplatsParams]) -> dict[str, Any]:
     cameras = cameras.select([i for i, name in enumerate(cameras.names) if name not in held_out])
     atlas, texture = context.read(ATLAS_MESH), read_texture(context.read(BASE_COLOR))
     tell = context.progress
-    texels = rasterize_atlas(atlas.uvs, atlas.faces, atlas.texture_size)
-    views = PreparedViews(atlas, len(texels), cameras, lambda index: photos.masked(cameras.names[index]))
+    of_photo = context.read(GAINS)
+    gains = np.array([of_photo[name] for name in cameras.names])
+    count = count_for(atlas, cameras) if params.count is None else params.count
+    tell(0, 1, "Gaussians on the surface")
+    gaussians, normals = place(atlas, texture, count, degree_for(len(cameras)))
+    views = PreparedViews(atlas, len(gaussians), cameras, lambda index: photos.masked(cameras.names[index]))
     with ThreadPoolExecutor(max_workers=max(1, context.workers)) as pool:
-        tell(0, 1, "comparing photos")
+        tell(_PLACED, 1, "colours of each Gaussian")
         in_order = partial(views.in_order, pool, context.workers)
-        gains, _ = compare_photos(atlas, texels, in_order(), len(cameras))
-        count = count_for(atlas, cameras) if params.count is None else params.count
-        gaussians, normals = place(atlas, texture, count, degree_for(len(cameras)))
-        tell(_SEEN, 1, "colours of each Gaussian")
         gaussians, prior = _colored(gaussians, normals, gains, in_order)
     views.kept.clear()
     apart = float(np.exp(gaussians.log_scales[:, 0]).mean()) / WIDTH
@@ -75,10 +73,9 @@ def run(context: StageContext[SplatsParams]) -> dict[str, Any]:
             "There is nothing for splats to look like: no photo shows the mesh.",
             "Try it without: `hineus run PHOTOS --set splats.enabled=false`.",
         )
-    for number in range(SWEEPS):
-        tell(_SEEN + (_COLORED - _SEEN) * (number + 1) / (SWEEPS + 1), 1, "colours of all Gaussians together")
-        told = ((each.camera, each.photo, each.inside.astype(np.float32)) for each in targets)
-        gaussians, _ = sweep(gaussians, told, prior)
+    tell((_PLACED + _COLORED) / 2, 1, "colours of all Gaussians together")
+    told = ((each.camera, each.photo, each.inside.astype(np.float32)) for each in targets)
+    gaussians = sweep(gaussians, normals, told, prior)
     errors: list[float] = []
     if params.steps:
         anchors = Anchors(gaussians.centers, normals, float(np.ptp(atlas.vertices, axis=0).max()))
@@ -103,14 +100,15 @@ def _colored(
     from stages.gaussians.colours import fit_each, shared
     from stages.shading.observations import observe
 
+    def fitted(rows: slice, prior: np.ndarray) -> np.ndarray:
+        return fit_each(observe(gaussians.centers[rows], normals[rows], views()), gains, prior)
+
+    centers = gaussians.centers
+    some = slice(None, None, max(_SOME, -(-len(gaussians) // _CHUNK)))
+    prior = shared(fitted(some, gaussians.harmonics[some]), centers[some], normals[some], centers, normals)
     parts = [slice(start, start + _CHUNK) for start in range(0, len(gaussians), _CHUNK)]
-
-    def fitted(prior: np.ndarray) -> np.ndarray:
-        found = [fit_each(observe(gaussians.centers[p], normals[p], views()), gains, prior[p]) for p in parts]
-        return np.concatenate(found)
-
-    prior = shared(fitted(gaussians.harmonics), gaussians.centers, normals)
-    return replace(gaussians, harmonics=fitted(prior)), prior
+    harmonics = np.concatenate([fitted(part, prior[part]) for part in parts])
+    return replace(gaussians, harmonics=harmonics), prior
 
 
 SPLATTING: Stage[SplatsParams] = Stage(
@@ -118,7 +116,7 @@ SPLATTING: Stage[SplatsParams] = Stage(
     version=1,
     settings=lambda config: config.splats,
     run=run,
-    reads=(PINHOLE_PHOTOS, HELD_OUT, SCENE, ATLAS_MESH, BASE_COLOR),
+    reads=(PINHOLE_PHOTOS, HELD_OUT, SCENE, ATLAS_MESH, BASE_COLOR, GAINS),
     writes=(SPLATS,),
     summary="photos + textured mesh -> Gaussians on the surface",
 )

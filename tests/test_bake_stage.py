@@ -113,6 +113,15 @@ def test_the_quality_of_each_vertex_is_kept(context):
     np.testing.assert_allclose(quality.texel_density, np.sqrt(64**2 * 0.4 * 0.8), rtol=1e-5)
 
 
+def test_the_exposure_of_each_photo_is_kept(context):
+    baked = BAKE.run(context)
+    gains = artifacts.GAINS.load(context.out)
+    assert list(gains) == ["one.png", "sub/two.png"]
+    assert baked["gain_max"] == pytest.approx(max(max(of) for of in gains.values()), abs=1e-4)
+    BAKE.run(replace(context, params=BakeParams(gain=False, normal_map=False, occlusion_rays=0)))
+    assert set(artifacts.GAINS.load(context.out).values()) == {(1.0, 1.0, 1.0)}
+
+
 def test_each_photo_is_read_and_its_depths_drawn_once(context, monkeypatch):
     from stages.texture import photo_views
 

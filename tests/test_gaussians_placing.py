@@ -124,7 +124,9 @@ def test_neighbours_share_on_their_own_side_alone() -> None:
     places = rng.random((2000, 3)).astype(np.float32) * [1, 1, 0]
     normals = np.repeat([[0.0, 0, 1], [0, 0, -1]], 1000, axis=0)
     harmonics = np.repeat([1.0, 5.0], 1000)[:, None, None] * np.ones((1, 4, 3), np.float32)
-    np.testing.assert_allclose(shared(harmonics.astype(np.float32), places, normals), harmonics, atol=1e-5)
+    some = slice(None, None, 4)
+    told = shared(harmonics[some].astype(np.float32), places[some], normals[some], places, normals)
+    np.testing.assert_allclose(told, harmonics, atol=1e-5)
 
 
 def test_more_photos_more_degrees() -> None:

@@ -14,8 +14,11 @@ from stages import artifacts
 from stages.artifacts import AtlasMesh, write_png
 from stages.drawing.view_scores import psnr
 from stages.engine.stage import StageContext
+from stages.gaussians.colours import sweep
 from stages.gaussians.drawing import draw
+from stages.gaussians.gaussians import Gaussians
 from stages.gaussians.keeping import read_gaussians
+from stages.gaussians.placing import place
 from stages.splats import SPLATTING
 
 SIZE, FOCAL = (64, 48), 70.0
@@ -69,6 +72,7 @@ def workspace(root: Path, fade: float = 0.0) -> StageContext:
     artifacts.SCENE.save(folders["train"], scene_without_points(cameras))
     artifacts.HELD_OUT.save(folders["train"], (cameras.names[7],))
     write_png(artifacts.BASE_COLOR.load(folders["bake"]), checks())
+    artifacts.GAINS.save(folders["bake"], {name: (1.0, 1.0, 1.0) for name in cameras.names if name != cameras.names[7]})
     pictures = artifacts.Pictures(folders["undistort"])
     for index, name in enumerate(cameras.names):
         pictures.path(name).parent.mkdir(parents=True, exist_ok=True)
@@ -89,6 +93,29 @@ def held_out_psnr(context: StageContext) -> float:
     image, _ = draw(read_gaussians(artifacts.SPLATS.load(context.out)), cameras, 7)
     on = (np.abs(photo.astype(int) - 128) > 3).any(2)
     return psnr(np.round(image * 255).astype(np.uint8), photo, on)
+
+
+@pytest.mark.slow
+def test_a_sweep_brings_photos_nearer_and_leaves_what_faces_away(tmp_path: Path) -> None:
+    from stages.gaussians.drawing import BLACK, camera_of, render
+
+    context = workspace(tmp_path)
+    cameras = context.read(artifacts.SCENE).cameras
+    photos = [context.read(artifacts.PINHOLE_PHOTOS).image(name).astype(np.float32) / 255 for name in cameras.names]
+    on = [(np.abs(photo - 128 / 255) > 0.01).any(2).astype(np.float32) for photo in photos]
+    front, normals = place(square(), checks(), 2000, 1)
+    both = front.select(np.tile(np.arange(len(front)), 2))
+    normals = np.concatenate([normals, -normals])
+    told = [(camera_of(cameras, index), photos[index], on[index]) for index in range(len(photos))]
+    found = sweep(both, normals, told, np.zeros_like(both.harmonics))
+
+    def error(gaussians: Gaussians) -> float:
+        off = [(render(gaussians, camera, BLACK).image - photo)[trust > 0] for camera, photo, trust in told]
+        return float((np.concatenate(off) ** 2).mean())
+
+    ahead = slice(0, len(front))
+    assert error(found.select(ahead)) < 0.3 * error(front)
+    assert not found.harmonics[len(front) :].any()
 
 
 def test_nothing_is_written_unless_asked(tmp_path: Path) -> None:

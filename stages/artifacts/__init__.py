@@ -6,7 +6,7 @@ finished workspace loads them from the folder of the stage that owns them: `arti
 
 from stages.artifacts.artifact import Artifact
 from stages.artifacts.atlas import ATLAS_MESH, AtlasMesh
-from stages.artifacts.bake import BASE_COLOR, NORMAL_MAP, OCCLUSION, PROVENANCE, QUALITY, VertexQuality
+from stages.artifacts.bake import BASE_COLOR, GAINS, NORMAL_MAP, OCCLUSION, PROVENANCE, QUALITY, VertexQuality
 from stages.artifacts.densify import DEPTH_MAPS, POINT_CLOUD, DepthMaps
 from stages.artifacts.export import (
     ASSET,

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
-from stages.artifacts.artifact import arrays_artifact, place_artifact
+from stages.artifacts.artifact import Artifact, arrays_artifact, place_artifact
+from stages.artifacts.json_files import read_record, write_json
 
 
 @dataclass(frozen=True)
@@ -31,6 +34,17 @@ class VertexQuality:
     invented: np.ndarray
 
 
+_GAINS = "gains.json"
+
+
+def _save_gains(folder: Path, gains: Mapping[str, Sequence[float]]) -> None:
+    write_json(folder / _GAINS, {name: [float(factor) for factor in factors] for name, factors in gains.items()})
+
+
+def _load_gains(folder: Path) -> Mapping[str, Sequence[float]]:
+    return read_record(folder / _GAINS, dict[str, tuple[float, float, float]])
+
+
 # 8-bit sRGB texture; row 0 is v = 1.
 BASE_COLOR = place_artifact("bake", "base_color.png")
 # 8-bit grey, one value a texel, see `stages.texture.baking.Provenance`.
@@ -40,3 +54,6 @@ NORMAL_MAP = place_artifact("bake", "normal_map.png", optional=True)
 # 8-bit grey, 255 where all is open, see `stages.texture.relief.bake_occlusion`.
 OCCLUSION = place_artifact("bake", "occlusion.png", optional=True)
 QUALITY = arrays_artifact("bake", "vertex_quality.npz", VertexQuality)
+# Factors on each photo's channels, by its name, that bring its exposure to that of the others; all 1 where `bake.gain`
+# is off. Photos held out have none.
+GAINS: Artifact[Mapping[str, Sequence[float]]] = Artifact("bake", (_GAINS,), _load_gains, _save_gains)

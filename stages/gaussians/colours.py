@@ -33,6 +33,8 @@ NEIGHBORS, TURN = 24, 12.0
 # Errors beyond this (sRGB, 1 for full scale) count in proportion to their size, not its square (Huber).
 HUBER = 0.06
 _ROUNDS = 3
+# Of what is missing where a Gaussian shows, so much is taken in: one sweep with this does what two with 1 do.
+OVER_RELAXATION = np.float32(1.5)
 
 
 def degree_for(num_photos: int) -> int:
@@ -59,15 +61,23 @@ def fit_each(seen: Observations, gains: np.ndarray, prior: np.ndarray) -> np.nda
     return harmonics
 
 
-def shared(harmonics: np.ndarray, centers: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """Means [N, K, 3] float32 of harmonics [N, K, 3] over each one's neighbours at points and normals [N, 3]."""
+def shared(
+    harmonics: np.ndarray, centers: np.ndarray, normals: np.ndarray, at: np.ndarray, facing: np.ndarray
+) -> np.ndarray:
+    """What neighbours have in common [N, K, 3] float32 at N points: means over the nearest ones.
+
+    Args:
+        harmonics: [M, K, 3] of neighbours at `centers` and unit `normals` [M, 3].
+        at, facing: [N, 3] points, and their unit normals.
+    """
     from scipy.spatial import cKDTree
 
     tree = cKDTree(centers)
     spacing = float(np.median(tree.query(centers[:: max(1, len(centers) // 1000)], k=2)[0][:, 1]))
-    places = np.concatenate([centers, TURN * spacing * normals], axis=1)
-    nearest = cKDTree(places).query(places, k=min(NEIGHBORS, len(places)))[1].reshape(len(places), -1)
-    means = np.zeros_like(harmonics)
+    tree = cKDTree(np.concatenate([centers, TURN * spacing * normals], axis=1))
+    places = np.concatenate([at, TURN * spacing * facing], axis=1)
+    nearest = tree.query(places, k=min(NEIGHBORS, len(centers)))[1].reshape(len(places), -1)
+    means = np.zeros((len(at), *harmonics.shape[1:]), np.float32)
     for column in nearest.T:
         means += harmonics[column]
     return means / nearest.shape[1]
@@ -75,29 +85,27 @@ def shared(harmonics: np.ndarray, centers: np.ndarray, normals: np.ndarray) -> n
 
 def sweep(
     gaussians: Gaussians,
+    normals: np.ndarray,
     photos: Iterable[tuple[Camera, np.ndarray, np.ndarray]],
     prior: np.ndarray,
-    step: float = 1.0,
-) -> tuple[Gaussians, float]:
-    """The Gaussians with harmonics nearer to the least-squares ones, and the mean squared error before.
+) -> Gaussians:
+    """The Gaussians with harmonics nearer to the least-squares ones.
 
     Args:
+        normals: [N, 3]; Gaussians that face away from a photo are not drawn, for what faces it hides them.
         photos: camera, what it should see [H, W, 3] float32, and how much each pixel counts [H, W] float32.
         prior: [N, K, 3] float32 harmonics that they are pulled to.
-        step: 1 takes in what is missing, up to 2 more.
     """
     count, terms = len(gaussians), gaussians.harmonics.shape[1]
     normal = np.zeros((count, terms * (terms + 1) // 2), np.float32)
     right = np.zeros((count, terms, 3), np.float32)
-    total = pixels = 0.0
     for camera, photo, trust in photos:
-        drawing = render(gaussians, camera, BLACK)
+        facing = np.flatnonzero(((camera.position - gaussians.centers) * normals).sum(1) > 0)
+        drawing = render(gaussians.select(facing), camera, BLACK)
         found = drawing.ellipses
         # Where Gaussians leave a part of the pixel open, they owe only theirs.
         residual = photo * (1 - drawing.transmittance[..., None]) - drawing.image
         off = np.abs(residual).max(2)
-        total += float(((residual**2).mean(2) * trust).sum())
-        pixels += float(trust.sum())
         trust = (trust * np.minimum(1, HUBER / np.maximum(off, 1e-6))).astype(np.float32)
         parts = np.empty((len(found.members), 4), np.float32)
         kernels.weigh(
@@ -106,10 +114,10 @@ def sweep(
         )  # fmt: skip
         sums = np.empty((len(found.ids), 4), np.float32)
         kernels.add_parts(found.first, found.places, parts, sums)
-        _take_in(found.ids, sums, gaussians.centers, camera.position, normal, right)
+        _take_in(facing[found.ids], sums, gaussians.centers, camera.position, normal, right)
     harmonics = gaussians.harmonics.copy()
-    _solve_all(normal, right, ridges(gaussians.degree), prior, np.float32(step), harmonics)
-    return replace(gaussians, harmonics=harmonics), total / max(pixels, 1e-12)
+    _solve_all(normal, right, ridges(gaussians.degree), prior, OVER_RELAXATION, harmonics)
+    return replace(gaussians, harmonics=harmonics)
 
 
 @njit(cache=True, nogil=True)
@@ -196,13 +204,14 @@ def _take_in(ids, sums, centers, position, normal, right):  # pragma: no cover -
         length = np.sqrt(x * x + y * y + z * z)
         basis = np.empty(terms, np.float32)
         fill_basis(x / length, y / length, z / length, basis)
-        at = 0
+        at = np.uintp(0)
         for i in range(terms):
+            weighted = total * basis[i]
             for c in range(3):
                 right[n, i, c] += basis[i] * sums[m, 1 + c]
-            for j in range(i + 1):
-                normal[n, at] += total * basis[i] * basis[j]
-                at += 1
+            for j in range(np.uintp(i + 1)):
+                normal[n, at + j] += weighted * basis[j]
+            at += np.uintp(i + 1)
 
 
 @njit(parallel=True, cache=True, nogil=True)
