@@ -52,6 +52,8 @@ COVERED = 0.6  # share of the surface that dense points cover: 0.16 of polished 
 TRAIN_CPU_S_PER_RAY_SAMPLE = 4.9e-6  # 317 to 329 CPU seconds for 8000 steps of 512 rays of 16 samples
 OTHER_CPU_S = 65.0  # everything after training: 37 to 47, and 15 more since UVAtlas makes the charts
 MATERIALS_CPU_S = 85.0  # 78 to 94 of four objects with 40 photos each: docs/benchmarks/materials.md
+# docs/benchmarks/splats.md; refining draws photos as they are, or smaller where they are finer than Gaussians.
+SPLATS_CPU_S, SPLATS_CPU_S_PER_STEP = 30.0, 0.65
 # Part of the work that cores share: two made training 1.53 to 1.80 times as fast, poses 1.7 times. What more cores
 # bring was not measured; by Amdahl's law it is at most five times one core.
 PARALLEL_SHARE = 0.8
@@ -245,6 +247,7 @@ def _minutes(looked_at: list[float], compared: float, config: Config, workers: i
     sfm_s = SFM_CPU_S_PER_MP * sum(looked_at) / 1e6 + SFM_CPU_S_PER_PAIR * pairs
     stereo_s = STEREO_CPU_S_PER_MP_AND_NEIGHBOR * config.densify.neighbors * compared / 1e6
     later_s = OTHER_CPU_S + MATERIALS_CPU_S * config.materials.enabled
+    later_s += (SPLATS_CPU_S + SPLATS_CPU_S_PER_STEP * config.splats.steps) * config.splats.enabled
     return (training_s + (sfm_s + stereo_s + later_s) * wall_per_cpu) / 60
 
 

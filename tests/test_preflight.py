@@ -200,6 +200,8 @@ def test_needs_grow_with_photos_as_measured():
     assert small.minutes == pytest.approx(2.8, abs=0.3)
     assert of(47, 554, **{"densify.neighbors": 8}).minutes > small.minutes
     assert of(47, 554, **{"materials.enabled": True}).minutes == pytest.approx(small.minutes + 0.85, abs=0.2)
+    splats = {"splats.enabled": True, "splats.steps": 100}  # 95 CPU seconds, of which two cores share four fifths
+    assert of(47, 554, **splats).minutes == pytest.approx(small.minutes + 0.95, abs=0.2)
     assert small.disk_gb > without.disk_gb
     # one core takes 1.5 to 1.8 times as long, and no number of cores does it in no time
     assert 1.5 < of(47, 554, workers=1).minutes / small.minutes < 1.8
