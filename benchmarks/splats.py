@@ -32,7 +32,7 @@ def measure(workspace: Path) -> dict[str, Any]:
     scores: dict[str, Any] = {}
     costs = {}
     for way, steps in WAYS.items():
-        options = ("--hold-out", "8", "--splats", "--set", f"splats.steps={steps}")
+        options = ("--hold-out", "8", "--splats", "--set", f"splats.steps={steps}", "--force", "splats")
         command = [sys.executable, "-m", "hineus_cli", "run", "--workspace", str(workspace), *options]
         subprocess.run(command, check=True, stdout=sys.stderr)
         costs[way] = cost(workspace)
