@@ -351,6 +351,11 @@ class SplatsParams(Section):
         le=1_000_000,
         description="photos that they are refined by, one after the other; 0: colours by least squares alone",
     )
+    background: bool = Field(
+        False,
+        description="also free ones, up to as many again, where dense points lie off the mesh: thin things, and what "
+        "is around the subject",
+    )
 
 
 class ExportParams(Section):

@@ -10,9 +10,20 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from configs.params import SplatsParams
-from stages.artifacts import ATLAS_MESH, BASE_COLOR, GAINS, HELD_OUT, PINHOLE_PHOTOS, SCENE, SPLATS, read_texture
+from stages.artifacts import (
+    ATLAS_MESH,
+    BASE_COLOR,
+    GAINS,
+    HELD_OUT,
+    PINHOLE_PHOTOS,
+    POINT_CLOUD,
+    SCENE,
+    SPLATS,
+    read_texture,
+)
 from stages.engine.stage import Stage, StageContext
 from stages.errors import ReconstructionError
+from stages.geometry.point_cloud import TRUSTED
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -39,10 +50,11 @@ def run(context: StageContext[SplatsParams]) -> dict[str, Any]:
 
     from stages.gaussians import drawing, drawing_cuda
     from stages.gaussians.colours import degree_for, sweep
+    from stages.gaussians.gaussians import Gaussians
     from stages.gaussians.keeping import write_gaussians
-    from stages.gaussians.placing import WIDTH, count_for, place
+    from stages.gaussians.placing import WIDTH, count_for, free_gaussians, place
     from stages.gaussians.refining import Anchors, refine
-    from stages.gaussians.targets import target
+    from stages.gaussians.targets import target, where_drawn
     from stages.texture.prepared_views import PreparedViews
 
     numba.set_num_threads(min(context.workers, numba.config.NUMBA_NUM_THREADS))
@@ -66,13 +78,21 @@ def run(context: StageContext[SplatsParams]) -> dict[str, Any]:
     targets = [
         found
         for index, name in enumerate(cameras.names)
-        if (found := target(atlas, cameras, index, *photos.masked(name), gains[index], apart)) is not None
+        if (found := target(atlas, cameras, index, *photos.masked(name), gains[index], apart, params.background))
     ]
     if not targets:
         raise ReconstructionError(
             "There is nothing for splats to look like: no photo shows the mesh.",
             "Try it without: `hineus run PHOTOS --set splats.enabled=false`.",
         )
+    if params.background:
+        cloud = context.read(POINT_CLOUD).within(context.read(SCENE).poses_from_scene)
+        cloud = cloud.chosen(cloud.trust >= TRUSTED)
+        free = free_gaussians(cloud.points, cloud.colors, gaussians.centers, count, gaussians.degree)
+        gaussians = Gaussians.joined([gaussians, free])
+        normals = np.concatenate([normals, np.zeros_like(free.centers)])
+        prior = np.concatenate([prior, free.harmonics])
+        targets = [where_drawn(each, gaussians) for each in targets]
     tell((_PLACED + _COLORED) / 2, 1, "colours of all Gaussians together")
     told = ((each.camera, each.photo, each.inside.astype(np.float32)) for each in targets)
     gaussians = sweep(gaussians, normals, told, prior)
@@ -80,7 +100,7 @@ def run(context: StageContext[SplatsParams]) -> dict[str, Any]:
     if params.steps:
         anchors = Anchors(gaussians.centers, normals, float(np.ptp(atlas.vertices, axis=0).max()))
         gaussians, errors = refine(
-            gaussians, anchors, targets, params.steps, round(GROWTH * count),
+            gaussians, anchors, targets, params.steps, round(GROWTH * len(gaussians)),
             lambda done, total, note: tell(_COLORED + (1 - _COLORED) * done / total, 1, note),
             drawing_cuda if context.device == "cuda" and drawing_cuda.is_there() else drawing,
         )  # fmt: skip
@@ -88,6 +108,7 @@ def run(context: StageContext[SplatsParams]) -> dict[str, Any]:
     tell(1, 1, "done")
     return {
         "gaussians": len(gaussians),
+        **({"free": int((~gaussians.anchored).sum())} if params.background else {}),
         "degree": gaussians.degree,
         **({"error": round(float(np.mean(errors[-len(targets) :])), 5)} if errors else {}),
     }
@@ -116,7 +137,7 @@ SPLATTING: Stage[SplatsParams] = Stage(
     version=1,
     settings=lambda config: config.splats,
     run=run,
-    reads=(PINHOLE_PHOTOS, HELD_OUT, SCENE, ATLAS_MESH, BASE_COLOR, GAINS),
+    reads=(PINHOLE_PHOTOS, POINT_CLOUD, HELD_OUT, SCENE, ATLAS_MESH, BASE_COLOR, GAINS),
     writes=(SPLATS,),
     summary="photos + textured mesh -> Gaussians on the surface",
 )

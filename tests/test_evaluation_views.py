@@ -74,6 +74,9 @@ def test_without_a_mask_the_silhouette_is_the_object_and_a_background_makes_the_
     assert (found.field.whole.psnr, found.field.whole.pixels) == (pytest.approx(100), photo[..., 0].size)
     assert (found.mesh.object.psnr, found.mesh.object.pixels) == (pytest.approx(100), silhouette.sum())
     assert found.mesh.whole is None
+    everywhere = judge(photo, None, drawing(photo, background=True), mesh, silhouette, None, photo, True)
+    assert everywhere.splats.whole.pixels == photo[..., 0].size
+    assert judge(photo, None, drawing(photo, background=True), mesh, silhouette, None, photo).splats.whole is None
     alone = judge(photo, None, drawing(photo, background=False, left=8), mesh, silhouette)
     assert alone.field.whole is None
     assert alone.field.object.pixels == alone.mesh.object.pixels == silhouette[:, 8:].sum()  # the same for both

@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 
 from stages.artifacts import AtlasMesh
 from stages.gaussians.colours import degree_for, fit_each, shared
-from stages.gaussians.placing import count_for, place, turns_to
+from stages.gaussians.placing import count_for, free_gaussians, place, turns_to
 from stages.gaussians.refining import ACROSS, ALONG, Anchors
 from stages.geometry.cameras import PinholeCameras
 from stages.geometry.vectors import unit
@@ -127,6 +127,23 @@ def test_neighbours_share_on_their_own_side_alone() -> None:
     some = slice(None, None, 4)
     told = shared(harmonics[some].astype(np.float32), places[some], normals[some], places, normals)
     np.testing.assert_allclose(told, harmonics, atol=1e-5)
+
+
+def test_free_ones_stand_where_points_lie_off_the_surface() -> None:
+    rng = np.random.default_rng(0)
+    surface = np.stack(np.meshgrid(np.linspace(0, 1, 40), np.linspace(0, 1, 40), [0.0]), -1).reshape(-1, 3)
+    thin = np.stack([np.full(300, 0.5), np.full(300, 0.5), np.linspace(0.2, 1, 300)], 1)
+    points = np.concatenate([surface + np.array([0.004, 0.004, 0.01]), thin, [[9.0, 9, 9]]])
+    colors = np.tile(np.uint8([255, 0, 128]), (len(points), 1))
+    free = free_gaussians(points, colors, surface, 1000, 2)
+    assert len(free) == 301
+    assert not free.anchored.any()
+    assert (free.centers[:, 2] > 0.19).all()
+    np.testing.assert_allclose(0.5 + C0 * free.harmonics[:, 0], colors[:301] / 255, atol=1e-6)
+    np.testing.assert_allclose(np.exp(free.log_scales[150]), 0.8 / 299 * 4 / 3, rtol=1e-3)
+    assert np.exp(free.log_scales).max() < 5 * 0.8 / 299 * 4 / 3  # the lone one is no fog
+    assert len(free_gaussians(points, colors, surface, 100, 2)) == 100
+    assert len(free_gaussians(surface + rng.normal(0, 1e-3, surface.shape), colors[:1600], surface, 100, 0)) == 0
 
 
 def test_more_photos_more_degrees() -> None:

@@ -8,7 +8,17 @@ import numpy as np
 import pytest
 from made_up_gaussians import some_gaussians
 
-from stages.gaussians.refining import ACROSS, ALONG, HALF_OFFSET, HALF_SIZE, Anchors, Moments, _halves, _split_and_prune
+from stages.gaussians.refining import (
+    ACROSS,
+    ALONG,
+    AROUND,
+    HALF_OFFSET,
+    HALF_SIZE,
+    Anchors,
+    Moments,
+    _halves,
+    _split_and_prune,
+)
 
 
 def anchors_at(points: np.ndarray) -> Anchors:
@@ -24,6 +34,13 @@ def test_what_strays_is_brought_back_to_its_bounds_and_the_rest_stays():
     np.testing.assert_allclose(centers[1], [0, 0, -ALONG], rtol=1e-6)
     np.testing.assert_allclose(centers[2], [0.6 * ACROSS, 0.8 * ACROSS, 0], rtol=1e-6)
     np.testing.assert_array_equal(centers[3], [3, 4, 1])  # not asked for
+
+
+def test_what_has_no_surface_stays_in_a_ball_around_its_point():
+    anchors = Anchors(np.zeros((2, 3)), np.zeros((2, 3)), extent=2.0)
+    centers = np.array([[0, 0, 5.0], [0.01, 0.01, 0]], np.float32)
+    anchors.hold(centers, np.array([0, 1]))
+    np.testing.assert_allclose(centers, [[0, 0, 2 * AROUND], [0.01, 0.01, 0]], rtol=1e-6)
 
 
 def test_halves_lie_on_both_sides_along_the_longest_axis():

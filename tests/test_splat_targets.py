@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from stages.artifacts import AtlasMesh
-from stages.gaussians.targets import MARGIN, target
+from stages.gaussians.placing import free_gaussians
+from stages.gaussians.targets import MARGIN, target, where_drawn
 from stages.geometry.cameras import PinholeCameras
 
 WIDTH, HEIGHT = 90, 70
@@ -49,6 +52,26 @@ def test_a_mask_says_where_the_object_ends() -> None:
     assert not found.inside[20, 30]
     assert not found.outside[20, 30]  # the mesh is there: which of both is wrong is not known
     assert target(square(), camera(), 0, some_photo(), np.zeros((HEIGHT, WIDTH), bool), np.ones(3)) is None
+
+
+def test_with_the_background_all_of_the_photo_counts() -> None:
+    mask = np.zeros((HEIGHT, WIDTH), bool)
+    mask[:, :41] = True
+    found = target(square(), camera(), 0, some_photo(), mask, np.ones(3), background=True)
+    np.testing.assert_array_equal(found.shown, some_photo())
+    assert found.inside.all()
+    assert not found.outside.any()
+    spots = free_gaussians(
+        np.array([[x, 0.0, 0.0] for x in (-0.5, 0, 0.5, 1)]), np.zeros((4, 3)), np.ones((9, 3)), 4, 0
+    )
+    spots = replace(
+        spots, log_scales=np.full((4, 3), np.log(0.05), np.float32), opacity_logits=np.full(4, 9, np.float32)
+    )
+    told = where_drawn(found, spots).inside
+    assert told[33, 41]
+    assert told[33, 21]
+    assert not told[33, 31]
+    assert 20 < told.sum() < 150
 
 
 @pytest.mark.parametrize("factor", [1, 2, 3])

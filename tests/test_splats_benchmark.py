@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from benchmarks import splats
+from stages.evaluation.suites.registry import SUITES
+from stages.evaluation.suites.tables import views_table
 
 SCORES = {
     "field": {"psnr": 27.281, "ssim": 0.8561},
@@ -20,3 +22,13 @@ def test_each_way_has_its_scores_and_its_cost():
     lines = splats.cost_table([result]).splitlines()[2:]
     assert lines[0] == "| helmet | least squares | 149,040 | 20 | 0.78 | 37.0 | 0.0 | 5.5 |"
     assert lines[1].startswith("| helmet | refined |")
+
+
+def test_a_suite_has_columns_of_splats_where_a_run_has_some():
+    mean = {"field": {"whole": {"psnr": 20.0, "ssim": 0.5}}, "mesh": {}}
+    run = {"scene": "ship", "method": "peer", "seed": 0, "scores": {"views": {"counted": 2, "mean": mean}}}
+    assert "splats, object" not in views_table(SUITES["nerf-synthetic"], [run]).header
+    mean["splats"] = {"object": {"psnr": 31.5, "ssim": 0.9}}
+    table = views_table(SUITES["nerf-synthetic"], [run])
+    assert table.rows[0][table.header.index("splats, object")] == "31.50 / 0.900"
+    assert table.rows[0][table.header.index("field, whole")] == "20.00 / 0.500"

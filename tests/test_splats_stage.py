@@ -19,6 +19,8 @@ from stages.gaussians.drawing import draw
 from stages.gaussians.gaussians import Gaussians
 from stages.gaussians.keeping import read_gaussians
 from stages.gaussians.placing import place
+from stages.gaussians.refining import AROUND
+from stages.geometry.point_cloud import PointCloud
 from stages.splats import SPLATTING
 
 SIZE, FOCAL = (64, 48), 70.0
@@ -73,6 +75,7 @@ def workspace(root: Path, fade: float = 0.0) -> StageContext:
     artifacts.HELD_OUT.save(folders["train"], (cameras.names[7],))
     write_png(artifacts.BASE_COLOR.load(folders["bake"]), checks())
     artifacts.GAINS.save(folders["bake"], {name: (1.0, 1.0, 1.0) for name in cameras.names if name != cameras.names[7]})
+    artifacts.POINT_CLOUD.save(folders["densify"], PointCloud.empty())
     pictures = artifacts.Pictures(folders["undistort"])
     for index, name in enumerate(cameras.names):
         pictures.path(name).parent.mkdir(parents=True, exist_ok=True)
@@ -139,6 +142,29 @@ def test_a_photo_that_was_held_out_is_met_and_better_after_refining(tmp_path: Pa
     # Nothing has left the square by 2 % of its side.
     assert np.abs(again.centers[:, 1]).max() < 0.02
     assert np.abs(again.centers[:, [0, 2]]).max() < 0.52
+
+
+@pytest.mark.slow
+def test_what_lies_behind_is_shown_where_dense_points_tell_of_it(tmp_path: Path) -> None:
+    context = workspace(tmp_path)
+    wall = np.stack(np.meshgrid(np.linspace(-1, 1, 40), [0.3], np.linspace(-1, 1, 40)), -1).reshape(-1, 3)
+    count = len(wall)
+    cloud = PointCloud(
+        wall.astype(np.float32), np.tile(np.float32([0, -1, 0]), (count, 1)), np.full((count, 3), 90, np.uint8),
+        np.where(np.arange(count) % 2, 1, 0.2).astype(np.float32), np.arange(count + 1), np.zeros(count, np.int32),
+    )  # fmt: skip
+    artifacts.POINT_CLOUD.save(context.inputs["densify"], cloud)
+    numbers = SPLATTING.run(replace(context, params=SplatsParams(enabled=True, count=2000, steps=60, background=True)))
+    assert 0 < numbers["free"] <= 1.5 * count / 2  # half are not trusted; some are split
+    found = read_gaussians(artifacts.SPLATS.load(context.out))
+    free = found.select(~found.anchored)
+    assert np.linalg.norm(free.centers[:, None] - wall[None], axis=2).min(1).max() < AROUND * 1.01
+    cameras = context.read(artifacts.SCENE).cameras
+    image, alpha = draw(found, cameras, 8)
+    photo = photograph(cameras, 8) / 255
+    beside = (np.abs(photo - 128 / 255) < 0.01).all(2) & (alpha > 0.9)
+    assert beside.sum() > 300
+    assert np.abs(image - photo)[beside].mean() < 0.05  # the points were darker
 
 
 @pytest.mark.slow

@@ -92,7 +92,8 @@ def sweep(
     """The Gaussians with harmonics nearer to the least-squares ones.
 
     Args:
-        normals: [N, 3]; Gaussians that face away from a photo are not drawn, for what faces it hides them.
+        normals: [N, 3]; of the Gaussians on the surface those that face away from a photo are not drawn, for what
+            faces it hides them.
         photos: camera, what it should see [H, W, 3] float32, and how much each pixel counts [H, W] float32.
         prior: [N, K, 3] float32 harmonics that they are pulled to.
     """
@@ -100,7 +101,8 @@ def sweep(
     normal = np.zeros((count, terms * (terms + 1) // 2), np.float32)
     right = np.zeros((count, terms, 3), np.float32)
     for camera, photo, trust in photos:
-        facing = np.flatnonzero(((camera.position - gaussians.centers) * normals).sum(1) > 0)
+        away = ((camera.position - gaussians.centers) * normals).sum(1) <= 0
+        facing = np.flatnonzero(~(away & gaussians.anchored))
         drawing = render(gaussians.select(facing), camera, BLACK)
         found = drawing.ellipses
         # Where Gaussians leave a part of the pixel open, they owe only theirs.

@@ -5,6 +5,7 @@ Everything is kept as 3DGS files keep it: logarithms of scales, logits of opacit
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -48,3 +49,9 @@ class Gaussians:
     def select(self, rows: np.ndarray) -> Gaussians:
         """Those at `rows`, indices or a mask [N]."""
         return Gaussians(**{field.name: getattr(self, field.name)[rows] for field in fields(self)})
+
+    @staticmethod
+    def joined(parts: Sequence[Gaussians]) -> Gaussians:
+        """Those of all parts, in order; the parts are of one degree."""
+        names = [field.name for field in fields(Gaussians)]
+        return Gaussians(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})

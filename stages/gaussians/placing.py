@@ -11,6 +11,7 @@ import numpy as np
 from stages.artifacts import AtlasMesh
 from stages.compiling import njit
 from stages.gaussians.gaussians import Gaussians
+from stages.gaussians.kernels import C0
 from stages.geometry.cameras import PinholeCameras
 from stages.geometry.vectors import unit
 from stages.surface.triangle_mesh import face_areas
@@ -18,6 +19,10 @@ from stages.surface.triangle_mesh import face_areas
 # Standard deviation in the surface, in mean distances of neighbours, and along the normal, in those in the surface.
 WIDTH, THICKNESS = 0.77, 0.1
 OPACITY = 0.98
+# Of those without a surface: opacity at first, and the nearest others that say how wide one is (3DGS).
+FREE_OPACITY, FREE_NEIGHBORS = 0.5, 3
+# None is wider than so many times the middle one: wrong points lie alone.
+WIDEST_FREE = 4.0
 # Gaussians on a unit of surface where the texture has most detail, in those where it has none.
 MOST_DENSITY = 4.0
 # Side in texels of the squares that detail is looked at in, and its standard deviation (colour levels) that makes
@@ -97,6 +102,38 @@ def flat_gaussians(points: np.ndarray, normals: np.ndarray, spacing: np.ndarray,
         opacity_logits=np.full(count, np.log(OPACITY / (1 - OPACITY)), np.float32),
         harmonics=np.zeros((count, (degree + 1) ** 2, 3), np.float32),
         anchored=np.ones(count, bool),
+    )
+
+
+def free_gaussians(points: np.ndarray, colors: np.ndarray, around: np.ndarray, count: int, degree: int) -> Gaussians:
+    """At most `count` round ones for what has no surface: at points that lie apart from those on it, each as wide as
+    the nearest others are away.
+
+    Args:
+        points: [P, 3] trusted ones, on the surface or not.
+        colors: [P, 3] uint8 sRGB.
+        around: [N, 3] centers of the Gaussians on the surface.
+    """
+    from scipy.spatial import cKDTree
+
+    on_surface = cKDTree(around)
+    apart = 2 * float(np.median(on_surface.query(around, k=2)[0][:, 1]))
+    rows = np.flatnonzero(on_surface.query(points, distance_upper_bound=apart)[0] > apart)
+    rows = np.sort(np.random.default_rng(0).permutation(rows)[:count])
+    if len(rows) <= FREE_NEIGHBORS:
+        rows, scales = rows[:0], np.zeros(0)
+    else:
+        scales = cKDTree(points[rows]).query(points[rows], k=FREE_NEIGHBORS + 1)[0][:, 1:].mean(1)
+        scales = np.minimum(scales, WIDEST_FREE * np.median(scales))
+    harmonics = np.zeros((len(rows), (degree + 1) ** 2, 3), np.float32)
+    harmonics[:, 0] = (colors[rows] / 255 - 0.5) / float(C0)
+    return Gaussians(
+        centers=np.ascontiguousarray(points[rows], np.float32),
+        rotations=np.tile(np.array([1, 0, 0, 0], np.float32), (len(rows), 1)),
+        log_scales=np.log(np.maximum(scales, 1e-9))[:, None].repeat(3, 1).astype(np.float32),
+        opacity_logits=np.full(len(rows), np.log(FREE_OPACITY / (1 - FREE_OPACITY)), np.float32),
+        harmonics=harmonics,
+        anchored=np.zeros(len(rows), bool),
     )
 
 

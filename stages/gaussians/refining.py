@@ -29,6 +29,8 @@ HIGHER_HARMONICS = 0.1
 BETA_1, BETA_2 = 0.9, 0.999
 # How far anchored Gaussians may get from their anchors, along the normal and across it, in parts of the extent.
 ALONG, ACROSS = 0.004, 0.008
+# Those that are not anchored keep as near to the point that they stand for.
+AROUND = 0.02
 # Splits happen at these parts of all steps, and each time this part of the Gaussians is added, as far as there is room.
 SPLITS, SPLIT_SHARE = (0.15, 0.25, 0.35, 0.45, 0.55), 0.06
 # A split one's halves: so many of its deviations apart from its centre, and smaller by this factor.
@@ -74,7 +76,8 @@ class Moments:
 
 @dataclass(frozen=True)
 class Anchors:
-    """Where on the surface Gaussians belong: [N, 3] points and unit normals; `extent` is the object's size."""
+    """Where Gaussians belong: [N, 3] points and, on the surface, its unit normals, 0 elsewhere; `extent` is the
+    object's size."""
 
     points: np.ndarray
     normals: np.ndarray
@@ -90,7 +93,8 @@ class Anchors:
         height = (off * normals).sum(1, keepdims=True)
         across = off - height * normals
         length = np.linalg.norm(across, axis=1, keepdims=True)
-        across *= np.minimum(1, ACROSS * self.extent / np.maximum(length, 1e-12))
+        reach = np.where(normals.any(1, keepdims=True), ACROSS, AROUND) * self.extent
+        across *= np.minimum(1, reach / np.maximum(length, 1e-12))
         height = np.clip(height, -ALONG * self.extent, ALONG * self.extent)
         centers[ids] = points + height * normals + across
 
@@ -107,7 +111,7 @@ def refine(
     """Refine by `steps` photos, up to `most` Gaussians. Returns them, and each step's error.
 
     Args:
-        anchors: of all; those of Gaussians that are not anchored hold nothing.
+        anchors: of all.
         targets: at least one.
     """
     rng = np.random.default_rng(0)
@@ -127,8 +131,7 @@ def refine(
         pull[found.ids] += np.linalg.norm(found.means, axis=1)
         seen[found.ids] += 1
         _step(gaussians, found, moments, step, steps, anchors.extent)
-        held = found.ids[gaussians.anchored[found.ids]]
-        anchors.hold(gaussians.centers, held)
+        anchors.hold(gaussians.centers, found.ids)
         errors.append(error)
         if step in splits:
             room = max(0, min(most - len(gaussians), round(SPLIT_SHARE * most)))
@@ -171,13 +174,7 @@ def _split_and_prune(
     stays = np.setdiff1d(kept, wanted)
     rows = np.concatenate([stays, wanted, wanted])
     halves = _halves(gaussians.select(wanted)) if len(wanted) else []  # SciPy 1.13 takes no empty arrays of turns
-    stayed = gaussians.select(stays)
-    together = Gaussians(
-        **{
-            field.name: np.concatenate([getattr(stayed, field.name), *(getattr(half, field.name) for half in halves)])
-            for field in fields(gaussians)
-        }
-    )
+    together = Gaussians.joined([gaussians.select(stays), *halves])
     return together, anchors.select(rows), moments.select(stays, 2 * len(wanted))
 
 

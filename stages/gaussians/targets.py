@@ -12,7 +12,8 @@ import numpy as np
 
 from stages.artifacts import AtlasMesh
 from stages.drawing.view_scores import silhouette
-from stages.gaussians.drawing import Camera, camera_of
+from stages.gaussians.drawing import Camera, camera_of, render
+from stages.gaussians.gaussians import Gaussians
 from stages.geometry.cameras import PinholeCameras
 
 # Pixels by which the object may reach beyond the mesh's outline.
@@ -59,12 +60,14 @@ def target(
     mask: np.ndarray | None,
     gains: np.ndarray,
     spacing: float = 0.0,
+    background: bool = False,
 ) -> Target | None:
     """Of photo `index`, [H, W, 3] uint8 with its mask [H, W] bool, or None; None where it does not show the mesh.
 
     Args:
         gains: [3] factors that bring the photo to the others' exposure.
         spacing: of neighbouring Gaussians, scene units.
+        background: all of the photo should be seen, whatever the mask says.
     """
     import cv2
 
@@ -75,6 +78,8 @@ def target(
     outside = ~around if mask is None else ~(covered | mask)
     if not inside.any():
         return None
+    if background:
+        inside, outside, around = np.ones_like(covered), np.zeros_like(covered), np.ones_like(covered)
     camera = camera_of(cameras, index)
     depth = float(np.median(camera.pose[2, :3] @ atlas.vertices.T + camera.pose[2, 3]))
     between = spacing * float(camera.focal[0]) / max(depth, 1e-6)
@@ -91,6 +96,12 @@ def target(
         inside=_means(inside[window], factor) == 1,
         outside=_means(outside[window], factor) == 1,
     )
+
+
+def where_drawn(found: Target, gaussians: Gaussians) -> Target:
+    """The same, told only where Gaussians cover the image: elsewhere nothing is there to show what the photo does."""
+    covered = render(gaussians, found.camera).transmittance < 0.5
+    return replace(found, inside=found.inside & covered)
 
 
 def cut(camera: Camera, window: tuple[slice, slice]) -> Camera:

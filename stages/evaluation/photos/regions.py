@@ -5,7 +5,7 @@ H x W pixels. Two regions are scored:
 - object: the photo's mask, or the mesh's silhouette where there is none, as far as the field says something;
 - whole: the whole photo. A field that has learned a background is held against the photo as it is. Any other
   field, the mesh and the splats are laid on white, as is what the mask leaves out of the photo; without a mask they
-  have no such score.
+  have no such score, but for splats that were made with their background.
 """
 
 from __future__ import annotations
@@ -56,6 +56,7 @@ def judge(
     silhouette: np.ndarray,
     lpips: Lpips | None = None,
     splats: np.ndarray | None = None,
+    splats_everywhere: bool = False,
 ) -> Judged:
     """Scores of a photo's drawings.
 
@@ -66,6 +67,7 @@ def judge(
         mesh: [H, W, 3] uint8 of the textured mesh, white around it.
         silhouette: [H, W] bool, where the mesh is.
         splats: as `mesh`, of the Gaussians; None: there are none.
+        splats_everywhere: they show what is around the object, too.
     """
     counted = (silhouette if mask is None else mask) & field.drawn
     on_white = photo if mask is None else np.where(mask[..., None], photo, np.uint8(WHITE))
@@ -81,7 +83,7 @@ def judge(
     return Judged(
         scores(seen, field.colors, field_truth),
         scores(mesh, mesh, surface_truth),
-        None if splats is None else scores(splats, splats, surface_truth),
+        None if splats is None else scores(splats, splats, photo if splats_everywhere else surface_truth),
         pictures if splats is None else {**pictures, "splats": splats},
     )
 

@@ -59,6 +59,7 @@ def score_photos(
         atlas = artifacts.ATLAS_MESH.load(workspace.stage_folder("atlas"))
         texture = artifacts.read_texture(artifacts.BASE_COLOR.load(workspace.stage_folder("bake")))
     kinds = ("field", *(("mesh",) if textured else ()), *(("splats",) if splats is not None else ()))
+    everywhere = splats is not None and not splats.anchored.all()
     photos: list[dict[str, Any]] = []
     for index in indices:
         name = cameras.names[index]
@@ -69,7 +70,7 @@ def score_photos(
         else:
             drawing, covered = np.full_like(photo, WHITE), np.zeros(photo.shape[:2], bool)
         of_splats = None if splats is None else draw_picture(splats, cameras, index)
-        judged = judge(photo, mask, drawer.draw(cameras, index), drawing, covered, lpips, of_splats)
+        judged = judge(photo, mask, drawer.draw(cameras, index), drawing, covered, lpips, of_splats, everywhere)
         if renders is not None:
             for what, picture in judged.pictures.items():
                 artifacts.write_png((renders / what / name).with_suffix(".png"), picture)

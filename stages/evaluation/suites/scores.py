@@ -18,6 +18,7 @@ from stages.evaluation.protocols.glossy import evaluate_glossy
 from stages.evaluation.protocols.known_object import score_mesh
 from stages.evaluation.reading import read_mesh
 from stages.evaluation.suites.scene import SuiteScene, Truth
+from stages.gaussians.keeping import read_gaussians
 from stages.geometry.similarity import Similarity
 
 
@@ -41,9 +42,11 @@ def score_result(
         trained = artifacts.SCENE.load(workspace.stage_folder("train"))
         photos = NovelPhotos(scene.views, trained, scene.masks)
         indices = range(len(photos.cameras))
+        file = artifacts.SPLATS.load(workspace.stage_folder("splats"))
         found = score_photos(
-            workspace, photos.cameras, indices, photos.load, device, textured="bake" in fresh, lpips=find_lpips()[0]
-        )
+            workspace, photos.cameras, indices, photos.load, device, textured="bake" in fresh, lpips=find_lpips()[0],
+            splats=read_gaussians(file) if "splats" in fresh and file.exists() else None,
+        )  # fmt: skip
         scores["views"] = {"counted": len(indices), **found}
     return scores
 

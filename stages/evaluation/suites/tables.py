@@ -77,22 +77,26 @@ VIEW_SCORES = (
     ("field, object", "field.object"),
     ("mesh, whole", "mesh.whole"),
     ("mesh, object", "mesh.object"),
+    ("splats, whole", "splats.whole"),
+    ("splats, object", "splats.object"),
 )
 
 
 def views_table(suite: Suite, results: Sequence[Result]) -> TextTable:
-    """One row a run: PSNR and SSIM of test photos that no stage has seen, of the field and of the textured mesh."""
+    """One row a run: PSNR and SSIM of test photos that no stage has seen, of the field, of the textured mesh and, where
+    a run has any, of Gaussian splats."""
     rows = []
-    for result in results:
-        if not _at(result, "scores.views"):
-            continue
+    judged = [result for result in results if _at(result, "scores.views")]
+    with_splats = any(_at(result, "scores.views.mean.splats") for result in judged)
+    shown = [(name, key) for name, key in VIEW_SCORES if with_splats or not key.startswith("splats")]
+    for result in judged:
         cells = [result["scene"], label_of(result), _number(result.get("seed"), 0)]
         cells.append(_number(_at(result, "scores.views.counted"), 0))
-        for _, key in VIEW_SCORES:
+        for _, key in shown:
             psnr, ssim = (_at(result, f"scores.views.mean.{key}.{name}") for name in ("psnr", "ssim"))
             cells.append(NONE if psnr is None else f"{psnr:.2f} / {ssim:.3f}")
         rows.append(tuple(cells))
-    header = ("scene", "method", "seed", "test photos", *(name for name, _ in VIEW_SCORES))
+    header = ("scene", "method", "seed", "test photos", *(name for name, _ in shown))
     return TextTable(f"{suite.title}: test photos, PSNR dB / SSIM", header, tuple(rows))
 
 
