@@ -1,6 +1,6 @@
 """Make the synthetic suite: photos of made-up objects, with masks, exact cameras and the known surface.
 
-python -m benchmarks.synthetic OUT                          all scenes
+python -m benchmarks.synthetic OUT                          all scenes but towns
 python -m benchmarks.synthetic OUT --scenes thin,city       these
 python -m benchmarks.synthetic OUT --check                  only compare what is there with its cameras
 
@@ -19,17 +19,17 @@ from pathlib import Path
 from benchmarks.synthetic.capture import Order, make
 from benchmarks.synthetic.check import check
 from benchmarks.synthetic.mitsuba_camera import EVERYWHERE, choose_variant
-from benchmarks.synthetic.scenes import RECIPES
+from benchmarks.synthetic.scenes import RECIPES, TOWNS
 from stages.errors import HineusError
 
 
 def main() -> int:
-    scenes = "\n".join(f"  {name:9} {recipe.shows}" for name, recipe in RECIPES.items())
+    scenes = "\n".join(f"  {name:9} {recipe.shows}" for name, recipe in (RECIPES | TOWNS).items())
     parser = argparse.ArgumentParser(
         description=f"{__doc__}\nscenes:\n{scenes}", formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("out", type=Path, help="gets a folder for each scene")
-    parser.add_argument("--scenes", default=",".join(RECIPES), help="names, with commas between; default: all")
+    parser.add_argument("--scenes", default=",".join(RECIPES), help="names, with commas between; default: no towns")
     parser.add_argument("--photos", type=int, default=40, help="of each scene")
     parser.add_argument("--size", default="640x480", help="WIDTHxHEIGHT in pixels")
     parser.add_argument("--spp", type=int, default=16, help="paths a pixel; 4 times as many halve the noise")
@@ -38,9 +38,9 @@ def main() -> int:
     parser.add_argument("--check", action="store_true", help="render nothing")
     arguments = parser.parse_args()
     names = arguments.scenes.split(",")
-    unknown = [name for name in names if name not in RECIPES]
+    unknown = [name for name in names if name not in RECIPES | TOWNS]
     if unknown:
-        parser.error(f"no scene is called {', '.join(unknown)}; there are {', '.join(RECIPES)}")
+        parser.error(f"no scene is called {', '.join(unknown)}; there are {', '.join(RECIPES | TOWNS)}")
     width, _, height = arguments.size.partition("x")
     orders = [Order(name, arguments.photos, (int(width), int(height)), arguments.spp, arguments.seed) for name in names]
     try:
@@ -62,7 +62,7 @@ def _made_and_exact(order: Order, arguments: argparse.Namespace, variant: str) -
     def progress(done: int) -> None:
         print(f"\r{order.scene}: {done} of {order.num_photos}", end="", file=sys.stderr, flush=True)
 
-    if not arguments.check and make(order, folder, variant, progress):
+    if not arguments.check and make(order, folder, variant, progress, RECIPES | TOWNS):
         _say(f", {time.monotonic() - started:.0f} s")
     found = check(folder)
     _say(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -17,6 +17,7 @@ SKY_HEIGHT = 512
 FIELDS_SIDE = 8.0
 ROOM_BRIGHTEST = 2.0  # radiance of the windows: brighter ones ask for more paths a pixel
 FLIGHT_HEIGHT = 0.95  # over the city, of the block's side
+FLIGHT_INSIDE = 0.14  # photos' middles keep so far from its border
 OBLIQUE_DEG = 42.0  # of the oblique photos, from straight down
 
 
@@ -51,25 +52,45 @@ def normalised(parts: list[Part]) -> tuple[Part, ...]:
     points = np.concatenate([part.vertices for part in parts])
     low, high = points.min(0), points.max(0)
     origin, extent = np.array([*(low + high)[:2] / 2, low[2]]), float((high - low).max())
+    return tuple(moved(part, -origin, 1 / extent) for part in parts)
 
-    def moved(part: Part) -> Part:
-        return Part(
-            (part.vertices - origin) / extent,
-            part.faces,
-            part.finish,
-            lambda points, normals: part.paint(points * extent + origin, normals),
-            part.normals,
-            None if part.grain is None else part.grain / extent,
-        )
 
-    return tuple(moved(part) for part in parts)
+def moved(part: Part, by: np.ndarray, scale: float) -> Part:
+    """Moved by [3], then scaled around the origin; painted as before."""
+    return Part(
+        (part.vertices + by) * scale,
+        part.faces,
+        part.finish,
+        lambda points, normals: part.paint(points / scale - by, normals),
+        part.normals,
+        None if part.grain is None else part.grain * scale,
+    )
 
 
 def _city(rng: np.random.Generator, num_photos: int) -> Scene:
     """The block among fields under a sunny sky, photographed from the air."""
     parts = tuple(city.city_block(rng))
-    ground = Ground(city.fields(rng, 2048, FIELDS_SIDE), FIELDS_SIDE, -10 * GROUND_GAP)
-    return Scene(parts, ground, sunny_sky(), flight(num_photos, rng))
+    return Scene(parts, _fields(rng), sunny_sky(), flight(num_photos, rng))
+
+
+def _town(side: int) -> Callable[[np.random.Generator, int], Scene]:
+    """`side` times as many city blocks each way, all different, painted half as finely; a block's side is 1."""
+
+    def make(rng: np.random.Generator, num_photos: int) -> Scene:
+        places = np.arange(side) - (side - 1) / 2
+        parts = [
+            moved(replace(part, grain=part.grain and 2 * part.grain), np.array([x, y, 0.0]), 1.0)
+            for y in places
+            for x in places
+            for part in city.city_block(rng)
+        ]
+        return Scene(tuple(parts), _fields(rng), sunny_sky(), flight(num_photos, rng, side))
+
+    return make
+
+
+def _fields(rng: np.random.Generator) -> Ground:
+    return Ground(city.fields(rng, 2048, FIELDS_SIDE), FIELDS_SIDE, -10 * GROUND_GAP)
 
 
 def sunny_sky(height: int = SKY_HEIGHT) -> np.ndarray:
@@ -83,15 +104,17 @@ def sunny_sky(height: int = SKY_HEIGHT) -> np.ndarray:
     return (sky + glow[..., None] * [1.0, 0.93, 0.82]).astype(np.float32)
 
 
-def flight(num_photos: int, rng: np.random.Generator) -> np.ndarray:
-    """[N, 4, 4] world-to-camera matrices: a grid that looks down, then four that look ahead, one to each side."""
+def flight(num_photos: int, rng: np.random.Generator, side: float = 1.0) -> np.ndarray:
+    """[N, 4, 4] world-to-camera matrices: a grid that looks down, then four that look ahead, one to each side, over a
+    square of side `side`."""
     down = num_photos * 2 // 5
     groups = [(down, None), *(((num_photos - down + k) // 4, 90 * k) for k in range(4))]
+    reach = side / 2 - FLIGHT_INSIDE
     poses = []
     for count, heading in groups:
         for x, y in _grid(count):
             jitter = rng.uniform(-0.03, 0.03, 6)
-            target = np.array([0.36 * x, 0.36 * y, 0.05]) + [*jitter[:2], 0]
+            target = np.array([reach * x, reach * y, 0.05]) + [*jitter[:2], 0]
             if heading is None:
                 ahead = np.array([0.0, 1e-3])  # never exactly straight down: "up" is then any direction
             else:
@@ -121,4 +144,9 @@ RECIPES = {
     "thin": Recipe("a bicycle: spokes, wire basket, leaves", _on_table(objects.bicycle)),
     "mirror": Recipe("a dog of balloons, a perfect mirror", _on_table(objects.balloon_dog)),
     "city": Recipe("a city block from the air, straight down and oblique", _city),
+}
+# Larger, and made only when they are named.
+TOWNS = {
+    "town4": Recipe("four city blocks, for `--blocks`: four times as many photos", _town(2)),
+    "town16": Recipe("sixteen city blocks, for `--blocks`: sixteen times as many photos", _town(4)),
 }
