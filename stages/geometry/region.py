@@ -198,14 +198,11 @@ def _around_points(
     cameras: PinholeCameras, points: Float[np.ndarray, "p 3"], about: Bool[np.ndarray, " p"] | None
 ) -> RegionOfInterest:
     """The region of a forward capture: what its photos are about, or all that surrounds the cameras."""
-    from scipy.spatial import cKDTree
-
     if len(points) == 0:
         raise ValueError("got 0 sparse points and optical axes that do not meet, expected either")
     chosen, source = points[[] if about is None else about], FROM_ATTENTION
     if not len(chosen) or _one_sidedness(cameras, chosen) < MAX_ONE_SIDED:
-        distances, _ = cKDTree(cameras.centers).query(points)
-        chosen, source = points[distances <= FORWARD_DEPTHS * np.median(distances)], FROM_POINTS
+        chosen, source = points[surround_cameras(points, cameras.centers)], FROM_POINTS
     chosen = without_strays(chosen)
     center, radius = enclosing_sphere(chosen)
     if radius <= 0:
@@ -243,13 +240,28 @@ def grown_over(region: RegionOfInterest, points: Float[np.ndarray, "p 3"], groun
 
 def without_strays(points: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "k 3"]:
     """The points that have others near."""
+    return points[have_neighbours(points)]
+
+
+def have_neighbours(points: Float[np.ndarray, "p 3"]) -> Bool[np.ndarray, " p"]:
+    """Which points have others near."""
     from scipy.spatial import cKDTree
 
     if len(points) <= MIN_NEIGHBOURS:
-        return points
+        return np.ones(len(points), dtype=bool)
     typical = np.median(np.linalg.norm(points - np.median(points, axis=0), axis=1))
     isolation = cKDTree(points).query(points, k=MIN_NEIGHBOURS + 1)[0][:, -1]
-    return points[isolation <= MAX_ISOLATION * typical]
+    near: np.ndarray = isolation <= MAX_ISOLATION * typical
+    return near
+
+
+def surround_cameras(points: Float[np.ndarray, "p 3"], centers: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " p"]:
+    """Which points, some at least, are what lies around the cameras and not far behind it."""
+    from scipy.spatial import cKDTree
+
+    distances, _ = cKDTree(centers).query(points)
+    near: np.ndarray = distances <= FORWARD_DEPTHS * np.median(distances)
+    return near
 
 
 def _connected(points: Float[np.ndarray, "p 3"], region: RegionOfInterest) -> Float[np.ndarray, "k 3"]:

@@ -9,9 +9,10 @@ orientable 2-manifold:
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import Protocol
 
 import numpy as np
 
@@ -125,12 +126,63 @@ def cube_tables() -> CubeTables:
     return CubeTables(counts, padded, edges, (in_face > 0) & (in_face < 4))
 
 
+class Domain(Protocol):
+    """Where the surface is looked for."""
+
+    def holds(self, axes: Sequence[np.ndarray]) -> np.ndarray:
+        """Which points of the lattice with these coordinates along x, y and z lie in it."""
+        ...
+
+    def meets(self, axes: Sequence[np.ndarray]) -> np.ndarray:
+        """Which cells of that lattice have a part in it."""
+        ...
+
+
+@dataclass(frozen=True)
+class Ball:
+    """About the origin."""
+
+    radius: float
+
+    def holds(self, axes: Sequence[np.ndarray]) -> np.ndarray:
+        x, y, z = (axis**2 for axis in axes)
+        total = x[:, None, None] + y[None, :, None] + z[None, None, :]
+        inside: np.ndarray = total <= self.radius**2 * (1 + 1e-9)
+        return inside
+
+    def meets(self, axes: Sequence[np.ndarray]) -> np.ndarray:
+        return self.holds(
+            [np.clip(0.0, axis[:-1], axis[1:]) for axis in axes]
+        )  # the cell's point nearest to the centre
+
+
+@dataclass(frozen=True)
+class Box:
+    """With faces on planes of the lattice: `low` and `high` [3] are its corners' coordinates."""
+
+    low: np.ndarray
+    high: np.ndarray
+
+    def holds(self, axes: Sequence[np.ndarray]) -> np.ndarray:
+        return self._all([(a >= low) & (a <= high) for a, low, high in zip(axes, self.low, self.high, strict=True)])
+
+    def meets(self, axes: Sequence[np.ndarray]) -> np.ndarray:
+        rows = zip(axes, self.low, self.high, strict=True)
+        return self._all([(a[1:] > low) & (a[:-1] < high) for a, low, high in rows])
+
+    @staticmethod
+    def _all(along: Sequence[np.ndarray]) -> np.ndarray:
+        x, y, z = along
+        inside: np.ndarray = x[:, None, None] & y[None, :, None] & z[None, None, :]
+        return inside
+
+
 @dataclass(frozen=True)
 class Isosurface:
     """A triangle mesh and what it cost.
 
     Attributes:
-        vertices: [V, 3] float32.
+        vertices: [V, 3] float32; of a box float64.
         faces: [F, 3] int32, counter-clockwise seen from where the distance is positive.
         evaluated: number of points at which the signed distance was computed.
     """
@@ -176,9 +228,82 @@ def extract_isosurface(
             "expected resolution >= 2, block >= 1, radius > 0, lipschitz > 0, "
             f"got {resolution}, {block}, {radius}, {lipschitz}"
         )
-    grid = _Grid(sdf, resolution, block, radius, lipschitz)
-    queue = grid.occupied_blocks()
-    seeds: dict[tuple[int, int, int], np.ndarray] = {}
+    cell = 2.0 * radius / resolution
+
+    def values(index: np.ndarray) -> np.ndarray:
+        return sdf((-radius + cell * index).astype(np.float32))
+
+    grid = _Grid(values, np.full(3, -radius), cell, resolution, block, Ball(radius), lipschitz)
+    mesh = _march(grid, {}, progress)
+    return replace(mesh, vertices=mesh.vertices.astype(np.float32))
+
+
+def extract_box(
+    values: SignedDistance,
+    low: np.ndarray,
+    high: np.ndarray,
+    cell: float,
+    block: int = 64,
+    lipschitz: float = 2.0,
+    progress: Callable[[int, int], None] | None = None,
+) -> Isosurface:
+    """The zero level set in a box of a lattice that goes on beyond it, as `extract_isosurface` finds it.
+
+    The surface ends in an open border at the box's faces. On the upright ones all points are looked at, whatever the
+    distances suggest: a box beside it, which sees the same values there, has the same border, to the last bit.
+
+    Args:
+        values: [N, 3] indices of lattice points -> [N] values, negative inside. The point i is at i * cell.
+        low, high: [3] indices of the box's corners.
+        cell: side of a cell, of which all multiples are exact (`geometry.tiling.lattice_cell`).
+
+    Returns:
+        The mesh; its vertices are float64.
+
+    Raises:
+        ValueError: the box is empty, or as `extract_isosurface`.
+    """
+    sides = high - low
+    if (sides < 1).any() or block < 1 or not cell > 0:
+        raise ValueError(f"expected a box, block >= 1 and cell > 0, got {low} to {high}, {block} and {cell}")
+    resolution = max(int(sides.max()), 2)
+    domain = Box(low * cell, high * cell)
+    grid = _Grid(lambda index: values(index + low), low * cell, cell, resolution, block, domain, lipschitz)
+    return _march(grid, _border_cells(grid, sides), progress)
+
+
+def _border_cells(grid: _Grid, sides: np.ndarray) -> dict[tuple[int, int, int], np.ndarray]:
+    """Cells along the upright faces of a box, in each block, through whose outer face the surface goes: flat indices."""
+    found = []
+    for axis, other in ((0, 1), (1, 0)):
+        for plane in (0, int(sides[axis])):
+            shape = sides[other] + 1, sides[2] + 1
+            index = np.empty((*shape, 3), dtype=np.int64)
+            index[..., axis] = plane
+            index[..., other], index[..., 2] = np.indices(shape)
+            inside = grid.evaluate(index.reshape(-1, 3)).reshape(shape) < 0
+            corners = [inside[i : shape[0] - 1 + i, j : shape[1] - 1 + j] for i in (0, 1) for j in (0, 1)]
+            crossed = np.argwhere(np.logical_or.reduce(corners) & ~np.logical_and.reduce(corners))
+            cells = np.empty((len(crossed), 3), dtype=np.int64)
+            cells[:, axis] = min(plane, int(sides[axis]) - 1)
+            cells[:, other], cells[:, 2] = crossed.T
+            found.append(cells)
+    cells = np.concatenate(found)
+    keys = cells // grid.block
+    return {
+        key: np.unique(np.ravel_multi_index(tuple((cells[here] - np.array(key) * grid.block).T), (grid.block,) * 3))
+        for key in sorted({(i, j, k) for i, j, k in keys.tolist()})
+        if (here := (keys == key).all(1)).any()
+    }
+
+
+def _march(
+    grid: _Grid,
+    seeds: dict[tuple[int, int, int], np.ndarray],
+    progress: Callable[[int, int], None] | None,
+) -> Isosurface:
+    """Block by block; `seeds` are cells to look at besides those that the distances suggest."""
+    queue = list(dict.fromkeys([*grid.occupied_blocks(), *seeds]))
     done: dict[tuple[int, int, int], _BlockMesh] = {}
     finished = 0
     while queue:
@@ -217,20 +342,36 @@ class _BlockMesh:
 
 
 class _Grid:
-    """The grid, the values on its coarse lattice and on the planes between blocks."""
+    """The grid, the values on its coarse lattice and on the planes between blocks.
 
-    def __init__(self, sdf: SignedDistance, resolution: int, block: int, radius: float, lipschitz: float) -> None:
-        self.sdf, self.resolution, self.radius = sdf, resolution, radius
-        self.cell = 2.0 * radius / resolution
-        self.slack = lipschitz * self.cell * np.sqrt(3.0) / 2  # times the step: Lipschitz bound over a half-diagonal
+    Args:
+        values: [N, 3] int64 indices of lattice points -> [N] values.
+        start: [3] coordinates of the point 0, 0, 0.
+        resolution: cells along a side of the cube that the blocks fill.
+    """
+
+    def __init__(
+        self,
+        values: SignedDistance,
+        start: np.ndarray,
+        cell: float,
+        resolution: int,
+        block: int,
+        domain: Domain,
+        lipschitz: float,
+    ) -> None:
+        self.values, self.resolution, self.domain, self.cell = values, resolution, domain, cell
+        self.slack = lipschitz * cell * np.sqrt(3.0) / 2  # times the step: Lipschitz bound over a half-diagonal
         self.step = 1
         while self.step * 2 * COARSE_CELLS <= resolution:
             self.step *= 2
         self.block = -(-min(block, resolution) // self.step) * self.step
         self.blocks = -(-resolution // self.block)
         self.evaluated = 0
-        # Lattice coordinates go on past the cube where the last block sticks out; those points are outside the ball.
-        self.axis = -radius + self.cell * np.arange(self.blocks * self.block + 1)
+        # Lattice coordinates go on past the cube where the last block sticks out; those points are outside the domain.
+        index = np.arange(self.blocks * self.block + 1)
+        self.size = len(index)
+        self.axes = [s + cell * index for s in start]
         self.planes: dict[tuple[int, int], np.ndarray] = {}
         self.coarse = self._coarse_values()
 
@@ -238,8 +379,8 @@ class _Grid:
         """Values [N] float32 at lattice points [N, 3]."""
         values = np.empty(len(index), dtype=np.float32)
         for start in range(0, len(index), MAX_POINTS):
-            points = self.axis[index[start : start + MAX_POINTS]].astype(np.float32)
-            part = np.asarray(self.sdf(points))
+            points = index[start : start + MAX_POINTS]
+            part = np.asarray(self.values(points))
             if part.shape != (len(points),):
                 raise ValueError(f"expected {len(points)} distances, got shape {part.shape}")
             values[start : start + MAX_POINTS] = part
@@ -248,27 +389,22 @@ class _Grid:
         self.evaluated += len(index)
         return values
 
-    def _in_ball(self, squares: list[np.ndarray]) -> np.ndarray:
-        total = squares[0][:, None, None] + squares[1][None, :, None] + squares[2][None, None, :]
-        return total <= self.radius**2 * (1 + 1e-9)
-
     def _coarse_values(self) -> np.ndarray:
-        axis = self.axis[:: self.step]
-        values = np.full((len(axis),) * 3, np.nan, dtype=np.float32)
-        inside = _where(self._in_ball([axis**2] * 3))
+        axes = [axis[:: self.step] for axis in self.axes]
+        values = np.full((len(axes[0]),) * 3, np.nan, dtype=np.float32)
+        inside = _where(self.domain.holds(axes))
         values[tuple(inside.T)] = self.evaluate(inside * self.step)
         return values
 
     def occupied_blocks(self) -> list[tuple[int, int, int]]:
         """Blocks with a coarse cell that the surface may cross."""
-        axis = self.axis[:: self.step]
-        maybe = self._may_cross(self.coarse, self.step, [axis] * 3)
+        maybe = self._may_cross(self.coarse, self.step, [axis[:: self.step] for axis in self.axes])
         per = self.block // self.step
         blocks = maybe.reshape(self.blocks, per, self.blocks, per, self.blocks, per).any((1, 3, 5))
         return [(int(i), int(j), int(k)) for i, j, k in _where(np.asarray(blocks))]
 
     def _may_cross(self, values: np.ndarray, step: int, axes: list[np.ndarray]) -> np.ndarray:
-        """Cells of a lattice of this step that the surface may cross. NaN stands for corners outside the ball."""
+        """Cells of a lattice of this step that the surface may cross. NaN stands for corners outside the domain."""
         corners = _corner_views(values)
         known = ~np.isnan(values)
         all_known = np.logical_and.reduce(_corner_views(known))
@@ -279,16 +415,15 @@ class _Grid:
         positive = np.logical_or.reduce([c >= 0 for c in corners])
         # With corners missing, the nearest known one may be a whole diagonal away.
         bound = self.slack * step * np.where(all_known, 1.0, 2.0)
-        # The cell's point nearest to the centre tells whether any of it lies in the ball.
-        low = [np.clip(0.0, a[:-1], a[1:]) ** 2 for a in axes]
-        return self._in_ball(low) & (none_known | (nearest <= bound) | (negative & positive))
+        crossed: np.ndarray = self.domain.meets(axes) & (none_known | (nearest <= bound) | (negative & positive))
+        return crossed
 
     def march(self, key: tuple[int, int, int], seeds: np.ndarray | None) -> _BlockMesh:
         """Mesh one block. `seeds` [K], flat indices, are cells to look at besides those that the distances suggest."""
         origin = np.array(key) * self.block
-        axes = [self.axis[o : o + self.block + 1] for o in origin]
-        ball = self._in_ball([a**2 for a in axes])
-        usable = np.logical_and.reduce(_corner_views(ball))
+        axes = [axis[o : o + self.block + 1] for axis, o in zip(self.axes, origin, strict=True)]
+        known = self.domain.holds(axes)
+        usable = np.logical_and.reduce(_corner_views(known))
         values = self._load(origin)
 
         step = self.step
@@ -297,26 +432,26 @@ class _Grid:
         while step > 1:
             step //= 2
             active = active.repeat(2, 0).repeat(2, 1).repeat(2, 2)
-            self._fill(values, active, step, origin, ball)
+            self._fill(values, active, step, origin, known)
             view = values[::step, ::step, ::step]
             if step > 1:
                 active &= self._may_cross(view, step, [a[::step] for a in axes])
         active &= usable
         if seeds is not None:
             active.flat[seeds] = usable.flat[seeds]
-        self._fill(values, active, 1, origin, ball)
+        self._fill(values, active, 1, origin, known)
 
-        wanted = self._follow(values, active, usable, origin, ball, key)
+        wanted = self._follow(values, active, usable, origin, known, key)
         self._store(values, origin)
         return self._polygonise(values, active, origin, wanted)
 
-    def _fill(self, values: np.ndarray, active: np.ndarray, step: int, origin: np.ndarray, ball: np.ndarray) -> None:
+    def _fill(self, values: np.ndarray, active: np.ndarray, step: int, origin: np.ndarray, known: np.ndarray) -> None:
         """Evaluate, in place, the corners of the active cells of this step that are not known yet."""
         view = values[::step, ::step, ::step]
         needed = np.zeros(view.shape, dtype=bool)
         for corner in _corner_views(needed):
             corner |= active
-        needed &= np.isnan(view) & ball[::step, ::step, ::step]
+        needed &= np.isnan(view) & known[::step, ::step, ::step]
         index = _where(needed)
         if len(index):
             view[tuple(index.T)] = self.evaluate(index * step + origin)
@@ -327,7 +462,7 @@ class _Grid:
         active: np.ndarray,
         usable: np.ndarray,
         origin: np.ndarray,
-        ball: np.ndarray,
+        known: np.ndarray,
         key: tuple[int, int, int],
     ) -> dict[tuple[int, int, int], np.ndarray]:
         """Activate, in place, cells the surface enters from active ones; return those of other blocks."""
@@ -351,14 +486,15 @@ class _Grid:
             cells = np.unique(np.concatenate(new), axis=0)
             if len(cells):
                 active[tuple(cells.T)] = True
-                self._fill(values, active, 1, origin, ball)
-        return {neighbour: self._in_ball_cells(neighbour, np.concatenate(w)) for neighbour, w in wanted.items()}
+                self._fill(values, active, 1, origin, known)
+        return {neighbour: self._usable_cells(neighbour, np.concatenate(w)) for neighbour, w in wanted.items()}
 
-    def _in_ball_cells(self, key: tuple[int, int, int], cells: np.ndarray) -> np.ndarray:
-        """Those of a block's cells [K, 3] whose corners are all in the ball, as flat indices."""
-        index = cells + np.array(key) * self.block
-        far = np.maximum(np.abs(self.axis[index]), np.abs(self.axis[index + 1]))
-        cells = cells[(far**2).sum(1) <= self.radius**2 * (1 + 1e-9)]
+    def _usable_cells(self, key: tuple[int, int, int], cells: np.ndarray) -> np.ndarray:
+        """Those of a block's cells [K, 3] whose corners are all in the domain, as flat indices."""
+        origin = np.array(key) * self.block
+        axes = [axis[o : o + self.block + 1] for axis, o in zip(self.axes, origin, strict=True)]
+        usable = np.logical_and.reduce(_corner_views(self.domain.holds(axes)))
+        cells = cells[usable[tuple(cells.T)]]
         return np.ravel_multi_index(tuple(cells.T), (self.block,) * 3)
 
     def _load(self, origin: np.ndarray) -> np.ndarray:
@@ -379,7 +515,7 @@ class _Grid:
         for axis, side, rows in self._sides(origin):
             key = (axis, int(origin[axis]) + side * self.block)
             if key not in self.planes:
-                self.planes[key] = np.full((len(self.axis),) * 2, np.nan, dtype=np.float32)
+                self.planes[key] = np.full((self.size,) * 2, np.nan, dtype=np.float32)
             self.planes[key][rows] = _plane_view(values, axis, side)
 
     def _sides(self, origin: np.ndarray) -> list[tuple[int, int, tuple[slice, slice]]]:
@@ -405,7 +541,7 @@ class _Grid:
         pattern = _patterns(values, cells)
         crossed = tables.counts[pattern] > 0
         cells, pattern = cells[crossed], pattern[crossed]
-        size = len(self.axis)
+        size = self.size
 
         # A grid edge is named by the lattice point where it begins, and its axis.
         def edge_id(cell: np.ndarray, edge: np.ndarray) -> np.ndarray:
@@ -422,7 +558,7 @@ class _Grid:
         end[np.arange(len(end)), edge // 4] += 1
         a, b = (values[tuple(p.T)].astype(np.float64) for p in (start, end))
         fraction = np.clip(a / np.where(a == b, 1.0, a - b), MIN_EDGE_FRACTION, 1 - MIN_EDGE_FRACTION)
-        positions = self.axis[start + origin]
+        positions = np.stack([axis[at] for axis, at in zip(self.axes, (start + origin).T, strict=True)], 1)
         positions[np.arange(len(end)), edge // 4] += fraction * self.cell
 
         owner = np.repeat(np.arange(len(cells)), tables.counts[pattern])
@@ -461,10 +597,10 @@ def _plane_view(values: np.ndarray, axis: int, side: int) -> np.ndarray:
 def _weld(parts: list[_BlockMesh], evaluated: int) -> Isosurface:
     """One mesh from the blocks' meshes: vertices on the same grid edge become one."""
     if not parts:
-        return Isosurface(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32), evaluated)
+        return Isosurface(np.zeros((0, 3)), np.zeros((0, 3), np.int32), evaluated)
     ids = np.concatenate([p.edge_ids for p in parts])
     _, first, vertex = np.unique(ids, return_index=True, return_inverse=True)
     positions = np.concatenate([p.positions for p in parts])[first]
     starts = np.cumsum([0, *(len(p.edge_ids) for p in parts)])
     faces = np.concatenate([vertex[start + p.triangles] for start, p in zip(starts, parts, strict=False)])
-    return Isosurface(positions.astype(np.float32), faces.astype(np.int32), evaluated)
+    return Isosurface(positions, faces.astype(np.int32), evaluated)
