@@ -18,6 +18,7 @@ from typer.core import TyperGroup
 
 from hineus_cli.at_once import Stopped
 from hineus_cli.commands.bench import bench
+from hineus_cli.commands.blocks import blocks
 from hineus_cli.commands.check import check
 from hineus_cli.commands.demo import demo
 from hineus_cli.commands.doctor import doctor
@@ -156,7 +157,7 @@ def build_app(pipeline: Sequence[Stage] = PIPELINE) -> typer.Typer:
     ) -> None:
         """Photos in, textured 3D asset out. Start with `hineus doctor`, then `hineus run PHOTOS`."""
 
-    for command in (run, check, status, view, relight, render, compare, bench, doctor, presets, demo):
+    for command in (run, check, status, blocks, view, relight, render, compare, bench, doctor, presets, demo):
         app.command()(command)
     app.add_typer(evaluate_app, name="evaluate")
     app.command("config")(show_config)

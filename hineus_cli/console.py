@@ -12,7 +12,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from types import TracebackType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -25,6 +25,11 @@ from stages.engine.runner import Listener, StageOutcome
 from stages.engine.stage import Stage
 from stages.engine.status import StageStatus
 from stages.engine.workspace import show_bytes
+
+if TYPE_CHECKING:
+    from stages.artifacts.blocks import Block
+    from stages.block_by_block import BlockOutcome
+    from stages.block_status import BlockStatus
 
 OURS = ("hineus_cli", "stages", "configs")
 CONSOLE_HANDLER = "hineus-console"
@@ -268,6 +273,46 @@ def status_table(statuses: Sequence[StageStatus], width: int) -> Table:
             cells += [show_bytes(made.size), f"{made.wall_s:.1f}", f"{made.cpu_s:.1f}", f"{made.peak_rss / GIB:.2f}"]
             cells.append(made.created.replace("T", " ").removesuffix("+00:00"))
         table.add_row(*cells[: len(table.columns)])
+    return table
+
+
+def block_table(blocks: Sequence[Block], cell: float) -> Table:
+    """Of a plan: name, photos, size of the core on the ground in the plan's unit and in cells, and what is around."""
+    table = table_of("block", "photos", "core", "cells")
+    table.add_column("neighbours")
+    for block in blocks:
+        side = block.core[1] - block.core[0]
+        table.add_row(
+            block.name,
+            str(len(block.photos)),
+            f"{side[0]:.4g} x {side[1]:.4g}",
+            " x ".join(f"{each / cell:.0f}" for each in side),
+            ", ".join(block.neighbours),
+        )
+    return table
+
+
+def block_outcome_table(outcomes: Sequence[BlockOutcome]) -> Table:
+    """Of a run in blocks: name, photos, whether it is done, and the model or what it failed of."""
+    table = table_of("block", "photos")
+    table.add_column("state", no_wrap=True)
+    table.add_column("result", overflow="fold")
+    for outcome in outcomes:
+        state = Text(outcome.state, style="green" if outcome.state == "done" else "red")
+        table.add_row(outcome.name, str(outcome.photos), state, outcome.error or str(outcome.glb or ""))
+    return table
+
+
+def block_status_table(blocks: Sequence[BlockStatus]) -> Table:
+    """Of a whole's blocks: name, photos, how many stages are up to date, and which comes next and why."""
+    table = table_of("block", "photos", "fresh")
+    table.add_column("next", no_wrap=True)
+    table.add_column("why", overflow="fold")
+    for block in blocks:
+        state = "missing" if block.fresh == 0 else "stale" if block.waiting else "fresh"
+        fresh = Text(f"{block.fresh} of {block.stages}", style=_STATE_COLOURS[state])
+        following = "running" if block.is_running else block.waiting
+        table.add_row(block.name, str(block.photos), fresh, following, block.reason)
     return table
 
 

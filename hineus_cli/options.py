@@ -167,6 +167,30 @@ Time = Annotated[
 ]
 
 
+BLOCKS_HELP = (
+    "Blocks that the scene is cut into, each for one process: a number, or auto, as this machine's memory asks for."
+)
+Blocks = Annotated[
+    str | None,
+    typer.Option(
+        "--blocks", metavar="N|auto", help=f"A large scene, block by block. {BLOCKS_HELP}", show_default=False
+    ),
+]
+
+
+def block_count(text: str) -> int | None:
+    """ "auto", which is None, or a number of blocks.
+
+    Raises:
+        ConfigError: it is neither.
+    """
+    if text.strip() == "auto":
+        return None
+    if not re.fullmatch(r"[1-9]\d{0,4}", text.strip()):
+        raise ConfigError(f"{text[:40]} is no number of blocks.", "Try `--blocks auto`, or `--blocks 4`.")
+    return int(text)
+
+
 def hold_out_option(what_for: str) -> Any:
     """`--hold-out N`, which means the same in every command."""
     text = f"Hold every N-th photo out {what_for}. 8: every 8th, 12 %; 0: none."

@@ -21,9 +21,12 @@ from stages.artifacts import (
     SILHOUETTES,
     Pictures,
 )
+from stages.artifacts.blocks import NEIGHBOURS, read_tile
 from stages.engine.stage import Stage, StageContext
 from stages.errors import ReconstructionError
 from stages.geometry.cameras import PinholeCameras, PosedScene
+from stages.geometry.place import box_sides
+from stages.geometry.tiling import UPRIGHT
 
 logger = logging.getLogger(__name__)
 
@@ -39,6 +42,8 @@ SPECK = 0.1
 # Masks of whole photos may lack a part now and then: of the metal cow, whose masks were guessed, 0.15 lost 2 % of the
 # surface and this nothing, with as little of the table left (docs/benchmarks/auto-masks.md).
 BESIDE_OUTSIDE = 0.3
+# A vertex so near to a tile's border, in radii of the region, lies on it: 32-bit numbers miss it by 1e-7.
+AT_BORDER = 1e-5
 # What this part of the photos that see it shows on such masks stays: see `shown_on_masks`.
 BESIDE_SHOWN = 0.3
 
@@ -79,13 +84,15 @@ def run(context: StageContext[CleanupParams]) -> dict[str, Any]:
         inside, "outside_region", "Try `--set undistort.roi_scale=1.5`, or train for longer: `--set train.steps=20000`."
     )
     region = context.read(GIVEN_REGION)
+    borders = _borders(context, scene)
     sides = region.sides(scene.poses_from_scene) if region else []
     vertices, faces = _crop(vertices, faces, scene, sides, params)
     numbers["ground_removed"] = params.remove_ground and scene.ground is not None
     if scene.ground is not None and not params.keep_closed:
         under = ground.under_the_border(vertices, scene, UNDER_TOLERANCES * params.ground_tolerance)
         keep(np.asarray(~under[faces].all(1)), "under_ground", "Try `--set undistort.roi_scale=1.5`.")
-    large, numbers["specks_dropped"] = selection.large_pieces(faces, SPECK * params.min_component)
+    reaching = _reaching(borders, vertices, faces)
+    large, numbers["specks_dropped"] = selection.large_pieces(faces, SPECK * params.min_component, reaching)
     keep(large, "speck_faces", "Try `--set cleanup.min_component=0`.")
     if params.mask_hull:
         alone, beside = context.read(PINHOLE_PHOTOS), [context.read(OUTLINES), context.read(SILHOUETTES)]
@@ -100,7 +107,7 @@ def run(context: StageContext[CleanupParams]) -> dict[str, Any]:
     # The detail that decimation takes away, for the normal map.
     context.write(CLEAN_FULL_MESH, (vertices, faces))
     context.progress(1, 5, "lightening")
-    vertices, faces = decimate(vertices, faces, WORKING_FACES * params.target_faces)
+    vertices, faces = decimate(vertices, faces, WORKING_FACES * params.target_faces, _at(borders, vertices))
 
     context.progress(2, 5, "what the cameras see")
     if params.min_views > 0:
@@ -115,11 +122,13 @@ def run(context: StageContext[CleanupParams]) -> dict[str, Any]:
         keep(_seen_faces(vertices, faces, views >= params.min_views, params), "unseen_faces", hint)
 
     context.progress(3, 5, "pieces")
-    large, numbers["pieces_dropped"] = selection.large_pieces(faces, params.min_component)
+    reaching = _reaching(borders, vertices, faces)
+    large, numbers["pieces_dropped"] = selection.large_pieces(faces, params.min_component, reaching)
     keep(large, "piece_faces", "Try `--set cleanup.min_component=0`.")
 
     context.progress(4, 5, "decimating")
-    vertices, faces = decimate(*triangle_mesh.repair_manifold(vertices, faces), params.target_faces)
+    vertices, faces = triangle_mesh.repair_manifold(vertices, faces)
+    vertices, faces = decimate(vertices, faces, params.target_faces, _at(borders, vertices))
     state = triangle_mesh.mesh_state(faces)
     if not state.manifold:
         logger.warning("mesh is not manifold: %d edges, %d vertices", state.bad_edges, state.bad_vertices)
@@ -136,6 +145,28 @@ def run(context: StageContext[CleanupParams]) -> dict[str, Any]:
         "watertight": state.watertight,
         "manifold": state.manifold,
     }
+
+
+# ---------------------------------------------------------------- the borders of a tile
+def _borders(context: StageContext[CleanupParams], scene: PosedScene) -> list[tuple[np.ndarray, float]]:
+    """Planes (normal, offset) in the scene frame along which this mesh meets those of other blocks."""
+    if NEIGHBOURS not in context.sources:
+        return []
+    return box_sides(read_tile(context.sources[NEIGHBOURS]).box.core, scene.poses_from_scene, UPRIGHT)
+
+
+def _at(borders: list[tuple[np.ndarray, float]], vertices: np.ndarray) -> np.ndarray:
+    """Vertices [V] bool that lie on a border, and must stay there."""
+    from stages.surface.tiles import heights_above
+
+    at: np.ndarray = np.abs(heights_above(vertices, borders)) < AT_BORDER
+    return at
+
+
+def _reaching(borders: list[tuple[np.ndarray, float]], vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Faces [F] bool at a border: what they are part of may be large on the other side of it."""
+    reaching: np.ndarray = _at(borders, vertices)[faces].any(1)
+    return reaching
 
 
 def _outside_masks(
@@ -230,5 +261,6 @@ CLEANUP: Stage[CleanupParams] = Stage(
     run=run,
     reads=(SCENE, PINHOLE_PHOTOS, OUTLINES, SILHOUETTES, GIVEN_REGION, RAW_MESH),
     writes=(CLEAN_MESH, CLEAN_FULL_MESH),
+    sources=(NEIGHBOURS,),
     summary="floaters and unseen shells gone, manifold, decimated",
 )

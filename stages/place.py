@@ -55,7 +55,8 @@ def run(context: StageContext[PlaceParams]) -> dict[str, Any]:
     cameras = posed_cameras(photos, [photo.name for photo in photos], warps)
     records = context.read(IMAGE_SET).images
     # The world of poses that were given is theirs, whatever the photos' EXIF says.
-    use_gps = params.gps and context.read(GIVEN_POSES) is None
+    given = context.read(GIVEN_POSES)
+    use_gps = params.gps and given is None
     gps = _gps_of(cameras, records)
     located = _locate(cameras, gps) if use_gps else None
     surveyed = _survey(context, model, photos, records) if CONTROL in context.sources else None
@@ -63,7 +64,8 @@ def run(context: StageContext[PlaceParams]) -> dict[str, Any]:
     if params.marker_size is not None:
         found = _measure_markers(model, photos, cameras, context.read(PHOTOS), params)
 
-    place = Place(Similarity.identity())
+    whole = given.place.place() if given is not None and given.place is not None else None
+    place = whole or Place(Similarity.identity())
     warnings: list[str] = []
     if located is not None or surveyed is not None:
         seen = _up_of_photos(cameras, model, photos)
@@ -75,7 +77,8 @@ def run(context: StageContext[PlaceParams]) -> dict[str, Any]:
         place, more = _by_control(place, surveyed, seen, cameras.centers, gps if use_gps else {})
         warnings = more if surveyed.fit.similarity is not None else warnings + more  # GPS is not believed then
     place = _by_distance(place, params.known_distance)
-    place = _in_reach(place, cameras.centers, params.epsg)
+    if whole is None:  # of which all parts have one world
+        place = _in_reach(place, cameras.centers, params.epsg)
     up_from = "" if place.up is None else "GPS" if place.control_residual is None else "the control points"
     if params.up != "auto":
         direction = np.eye(3)["xyz".index(params.up[1])] * (1.0 if params.up[0] == "+" else -1.0)

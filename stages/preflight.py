@@ -7,10 +7,12 @@ import re
 import shlex
 import shutil
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
+
+import numpy as np
 
 from configs.params import Config
 from stages.artifacts import SkippedImage
@@ -231,6 +233,22 @@ def estimate(seen: Inspection, config: Config, device: str, workers: int) -> Nee
         disk_gb=DISK_BASE_GB + (seen.num_bytes + made_bytes + FEATURE_BYTES_PER_PIXEL * sum(looked_at)) / 1e9,
         minutes=_minutes(looked_at, compared, config, workers) if device == "cpu" else None,
     )
+
+
+def photos_held(sizes: Sequence[tuple[int, int]], config: Config, memory_gib: float) -> int:
+    """How many photos one process can be given with so much memory, by the models of `estimate`.
+
+    Args:
+        sizes: width and height of photos as ingest takes them; the median of these is every photo's.
+    """
+    side = config.undistort.max_side
+    pixels = [[w * h * min(1.0, most / max(w, h)) ** 2 for w, h in sizes] for most in (side, config.densify.side)]
+    trained_on, compared = (float(np.median(each)) for each in pixels)
+    free = memory_gib / MEMORY_MARGIN
+    held = (free - MEMORY_BASE_GIB) / (MEMORY_OF_PHOTOS * 3 * trained_on / GIB)
+    if config.densify.method != "off":
+        held = min(held, (free - STEREO_BASE_GIB) / (STEREO_GIB_PER_MP * compared / 1e6))
+    return max(0, int(held))
 
 
 def _minutes(looked_at: list[float], compared: float, config: Config, workers: int) -> float:

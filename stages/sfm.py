@@ -34,6 +34,7 @@ from stages.artifacts import (
     PhotoContents,
     PhotoFile,
     Pictures,
+    PlaceRecord,
     Registration,
     Unregistered,
 )
@@ -49,6 +50,7 @@ from stages.posing.evidence import MIN_VERIFIED, Evidence
 from stages.posing.joining import view_distance
 from stages.posing.known import match_photos
 from stages.posing.ladder import Solution, Step, climb, describe, photos_wanted
+from stages.posing.parts import rebuilt
 from stages.posing.reading import read_poses
 from stages.posing.triangulation import DATABASE, triangulate
 from stages.posing.turning import MIN_PARALLAX, Depth, from_one_place, judge_depth, refuse_one_place, relief, two_places
@@ -516,20 +518,25 @@ def _from_known_poses(context: StageContext[SfmParams]) -> dict[str, Any]:
     if len(cameras) < needed:
         hint = "Give the poses of these photos, or leave --poses out (`--no-poses`) to have them found."
         raise _too_few(len(cameras), unregistered, needed, "", hint)
-    with _working(context) as work:
-        model, matcher = triangulate(
-            work,
-            context.read(PHOTOS).images,
-            cameras,
-            params,
-            threads=_threads(context),
-            workers=context.workers,
-            cuda=pycolmap.has_cuda and context.device == "cuda",
-            progress=context.progress,
-        )
-    _check_given_places(model, work / DATABASE)
+    if poses.place is not None:
+        taken = {camera.name: (name, (record.width, record.height)) for name, (camera, record) in cameras.items()}
+        model, matcher = rebuilt(pycolmap.Reconstruction(str(poses.origin)), taken), "given points"
+    else:
+        with _working(context) as work:
+            model, matcher = triangulate(
+                work,
+                context.read(PHOTOS).images,
+                cameras,
+                params,
+                threads=_threads(context),
+                workers=context.workers,
+                cuda=pycolmap.has_cuda and context.device == "cuda",
+                progress=context.progress,
+            )
+        _check_given_places(model, work / DATABASE)
     contents = _contents(context.read(PHOTOS), [record.name for record in image_set.images])
-    context.write(GIVEN_POSES, GivenPoses(origin=poses.origin.name, region=poses.region))
+    place = poses.place and PlaceRecord.model_validate(poses.place)
+    context.write(GIVEN_POSES, GivenPoses(origin=poses.origin.name, region=poses.region, place=place))
     given = LastAdjustment(model, lenses=(), pose_error=None)
     lineage = _lineage_of_given(context, model, contents, image_set)
     numbers = _publish(context, given, cameras, unregistered, "known poses", matcher)

@@ -42,6 +42,7 @@ from stages.geometry.region import RegionOfInterest
 from stages.geometry.silhouettes import MIN_SHARE, agreeing, silhouette_agreement
 from stages.geometry.similarity import Similarity
 from stages.geometry.subjects import Subject, find_subjects
+from stages.geometry.up import Up
 from stages.posing.backdrop import seen_background
 from stages.posing.undistortion import (
     plan_warp,
@@ -85,6 +86,9 @@ def run(context: StageContext[UndistortParams]) -> dict[str, Any]:
         subjects = find_subjects(cameras, points, observations)
         about, warnings = _chosen(subjects, [photo.name for photo in photos], context.params.subject)
     region, ground, up = _find_layout(cameras, points, observations, masks, stated, about)
+    if known is not None and known.place is not None and known.place.up is not None:
+        whole = known.place.place()
+        up = Up(whole.up @ whole.world_from_poses.rotation, "the whole that this is a part of", sure=True)
     region = _set(region, given, context.params.roi_scale)
     lineage = _lineage(context, given)
     poses_from_scene, kept = _frame(context, lineage, scene_frame(region.center, region.radius, up.direction))

@@ -92,7 +92,7 @@ def test_a_network_gives_tiles_the_same_border_whatever_else_they_ask_for():
     another = TileValues(blended(fields, 1.0), low, high, CELL)
     one_by_one = np.concatenate([another(point[None]) for point in shared])
     assert at_once.tobytes() == one_by_one.tobytes()
-    inside = shared + [0, 5, 0]
+    inside = shared + np.array([0, 5, 0])
     apart = np.concatenate([another(point[None]) for point in inside])
     np.testing.assert_allclose(another(inside), apart, atol=1e-5)
 

@@ -122,7 +122,7 @@ def test_weights_sum_to_one_and_end_at_the_region(count, seed):
 def test_weights_are_smooth_and_even_at_a_border():
     core = np.array([[0.0, 0.0, 0.0], [8.0, 8.0, 4.0]])
     margin = np.array([1.0, 1.0, 1.0])
-    boxes = [BlockBox(core, margin), BlockBox(core + [8.0, 0, 0], margin)]
+    boxes = [BlockBox(core, margin), BlockBox(core + np.array([8.0, 0, 0]), margin)]
     x = np.linspace(5, 11, 601)
     first, _ = weights(boxes, np.column_stack([x, np.full_like(x, 4.0), np.full_like(x, 2.0)]))
     assert first[300] == pytest.approx(0.5)
@@ -135,9 +135,9 @@ def test_weights_are_smooth_and_even_at_a_border():
 def test_touching_is_by_the_region_and_not_by_the_core():
     core, margin = np.array([[0.0, 0.0, 0.0], [8.0, 8.0, 4.0]]), np.ones(3)
     box = BlockBox(core, margin)
-    assert box.touches(BlockBox(core + [8.0, 8.0, 0], margin))
-    assert box.touches(BlockBox(core + [9.0, 0, 50.0], margin))
-    assert not box.touches(BlockBox(core + [9.5, 0, 0], margin))
+    assert box.touches(BlockBox(core + np.array([8.0, 8.0, 0]), margin))
+    assert box.touches(BlockBox(core + np.array([9.0, 0, 50.0]), margin))
+    assert not box.touches(BlockBox(core + np.array([9.5, 0, 0]), margin))
 
 
 @given(st.floats(1e-6, 1e6))

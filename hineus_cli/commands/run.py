@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from hineus_cli.completing import stage_names
-from hineus_cli.options import Json, Until, Verbose, with_options_of_a_run
+from hineus_cli.options import Blocks, Json, Until, Verbose, block_count, with_options_of_a_run
 from hineus_cli.session import Session, as_argument, print_json
 from stages.engine.stage import Stage
 from stages.request import Request
@@ -36,11 +36,16 @@ def run(
         list[str] | None,
         typer.Option(help="Run this stage even if fresh. Repeatable.", show_default=False, autocompletion=stage_names),
     ] = None,
+    blocks: Blocks = None,
     as_json: Json = False,
     verbose: Verbose = False,
 ) -> None:
     """Photos to a textured asset: run every stage that is not up to date."""
-    _run(context.obj, replace(request, from_stage=from_stage, until=until, force=tuple(force or ())), verbose)
+    asked = replace(request, from_stage=from_stage, until=until, force=tuple(force or ()))
+    if blocks is None:
+        _run(context.obj, asked, verbose)
+    else:
+        _run_in_blocks(context.obj, asked, block_count(blocks), verbose)
 
 
 def stage_command(stage: Stage) -> Callable[..., None]:
@@ -76,6 +81,21 @@ def _run(session: Session, request: Request, verbose: bool) -> None:
     with session.running(verbose) as progress:
         result = reconstruct(request, session.pipeline, progress)
     _show(result)
+    if session.json:
+        print_json(result.as_dict())
+
+
+def _run_in_blocks(session: Session, request: Request, count: int | None, verbose: bool) -> None:
+    from hineus_cli.console import block_outcome_table, people, say
+    from stages.block_by_block import reconstruct_in_blocks
+
+    with session.running(verbose) as progress:
+        result = reconstruct_in_blocks(request, count, session.pipeline, progress)
+    people().print(block_outcome_table(result.outcomes))
+    if failure := result.failure():
+        raise failure
+    say(f"blocks: {result.whole.workspace.root} (to see how they stand: `hineus status "
+        f"{as_argument(result.whole.workspace.root)}`)")  # fmt: skip
     if session.json:
         print_json(result.as_dict())
 

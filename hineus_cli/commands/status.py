@@ -17,22 +17,21 @@ def status(
     verify: Annotated[bool, typer.Option("--verify", help="Read every output back and compare its hash.")] = False,
     as_json: Json = False,
 ) -> None:
-    """How each stage of a workspace stands: fresh, stale or missing, and why."""
-    from configs.load import load_config
-    from configs.params import Config
-    from hineus_cli.console import product, status_table
-    from stages.engine.fingerprint import SourceDigests
-    from stages.engine.status import Present, pipeline_status
+    """How each stage of a workspace stands: fresh, stale or missing, and why; and each block of a large scene."""
+    from dataclasses import asdict
+
+    from hineus_cli.console import block_status_table, product, status_table
+    from stages.block_status import block_statuses, workspace_status
     from stages.engine.workspace import Workspace
 
     opened = Workspace.open(workspace)
-    config = load_config(file=opened.config_path) if opened.config_path.exists() else Config()
-    sources = {name: None if path is None else Path(path) for name, path in opened.record.sources.items()}
-    present = Present(opened, config, SourceDigests(sources, opened.digest_cache))
-    statuses = pipeline_status(context.obj.pipeline, present, verify)
+    statuses = workspace_status(opened, context.obj.pipeline, verify)
+    blocks = list(block_statuses(opened.root, context.obj.pipeline))
     if not as_json:
         console = product()
         console.print(status_table(statuses, console.width))
+        if blocks:
+            console.print(block_status_table(blocks))
         return
     stages = [
         {
@@ -48,4 +47,7 @@ def status(
         }
         for each in statuses
     ]
-    typer.echo(json.dumps({"workspace": str(opened.root), "sources": dict(opened.record.sources), "stages": stages}))
+    answer = {"workspace": str(opened.root), "sources": dict(opened.record.sources), "stages": stages}
+    if blocks:
+        answer["blocks"] = [{**asdict(each), "workspace": str(each.workspace)} for each in blocks]
+    typer.echo(json.dumps(answer))

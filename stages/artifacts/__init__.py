@@ -26,7 +26,7 @@ from stages.artifacts.json_files import read_json, write_json
 from stages.artifacts.materials import KNOWN, LIGHT, LIGHT_HARMONICS, LIGHT_HDR, MATERIAL_COLOR, ORM
 from stages.artifacts.mesh import CLEAN_FULL_MESH, CLEAN_MESH, RAW_MESH
 from stages.artifacts.pictures import IMAGES, MASKS, Pictures, read_texture, texture_bytes, write_png
-from stages.artifacts.place import GIVEN_REGION, WORLD_PLACE
+from stages.artifacts.place import GIVEN_REGION, WORLD_PLACE, PlaceRecord, SimilarityRecord
 from stages.artifacts.report import PAGE
 from stages.artifacts.sfm import (
     FEATURES,

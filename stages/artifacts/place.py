@@ -24,7 +24,9 @@ class SimilarityRecord(Record):
         return Similarity(self.scale, self.rotation, self.translation)
 
 
-class _PlaceRecord(Record):
+class PlaceRecord(Record):
+    """See `Place`."""
+
     world_from_poses: SimilarityRecord
     metric: bool
     scale_from: str
@@ -37,6 +39,9 @@ class _PlaceRecord(Record):
     crs: str = ""
     offset: tuple[float, float, float] | None = None
 
+    def place(self) -> Place:
+        return Place(**{**dict(self), "world_from_poses": self.world_from_poses.similarity()})
+
 
 class _RegionRecord(Record):
     """Null throughout where the region is to be found."""
@@ -48,12 +53,11 @@ class _RegionRecord(Record):
 
 
 def _save_place(folder: Path, place: Place) -> None:
-    write_record(folder / _PLACE, _PlaceRecord.model_validate(place))
+    write_record(folder / _PLACE, PlaceRecord.model_validate(place))
 
 
 def _load_place(folder: Path) -> Place:
-    record = read_record(folder / _PLACE, _PlaceRecord)
-    return Place(**{**dict(record), "world_from_poses": record.world_from_poses.similarity()})
+    return read_record(folder / _PLACE, PlaceRecord).place()
 
 
 def _save_given_region(folder: Path, region: GivenRegion | None) -> None:

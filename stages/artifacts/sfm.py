@@ -10,6 +10,7 @@ from pydantic import Field
 
 from stages.artifacts.artifact import Artifact, place_artifact
 from stages.artifacts.json_files import Array, Record, read_record, record_artifact, write_record
+from stages.artifacts.place import PlaceRecord
 
 _GIVEN_POSES = "known_poses.json"
 
@@ -121,10 +122,17 @@ class KnownSphere(Record):
 
 
 class GivenPoses(Record):
-    """Poses that were given and not found: the name of their file or folder, and their region where they say one."""
+    """Poses that were given and not found.
+
+    Attributes:
+        origin: name of their file or folder.
+        region: where they say one.
+        place: where they lie in the world, where they are a part of a workspace that knows it.
+    """
 
     origin: str
     region: KnownSphere | None = None
+    place: PlaceRecord | None = None
 
 
 class PhotoFile(Record):

@@ -211,14 +211,20 @@ class GivenRegion:
 
     def sides(self, poses_from_scene: Similarity) -> list[tuple[Float[np.ndarray, " 3"], float]]:
         """Planes (normal, offset) in the scene frame with the box above them; none where there is no box."""
-        if self.box is None:
-            return []
-        world_from_scene, sides = self.world_from_poses.compose(poses_from_scene), []
-        for sign, corner in ((1.0, self.box[0]), (-1.0, self.box[1])):
-            for axis in range(3):
-                side = Plane(sign * np.eye(3)[axis], sign * float(corner[axis]), 0.0, 0.0).within(world_from_scene)
-                sides.append((side.normal, side.offset))
-        return sides
+        return [] if self.box is None else box_sides(self.box, self.world_from_poses.compose(poses_from_scene))
+
+
+def box_sides(
+    box: Float[np.ndarray, "2 3"], world_from_scene: Similarity, axes: Sequence[int] = (0, 1, 2)
+) -> list[tuple[Float[np.ndarray, " 3"], float]]:
+    """Planes (normal, offset) in the scene frame of the sides across these axes of a box in the world, which is above
+    all of them."""
+    sides = []
+    for sign, corner in ((1.0, box[0]), (-1.0, box[1])):
+        for axis in axes:
+            side = Plane(sign * np.eye(3)[axis], sign * float(corner[axis]), 0.0, 0.0).within(world_from_scene)
+            sides.append((side.normal, side.offset))
+    return sides
 
 
 def given_region(form: str, numbers: Sequence[float], world_from_poses: Similarity) -> GivenRegion:

@@ -23,6 +23,8 @@ OVERLAP = 0.125
 NARROWEST = 0.25
 # A photo sees a block that holds this part of the points it shows, and so many at least.
 SEEN_SHARE, SEEN_POINTS = 0.05, 8
+# Axes across which tiles meet.
+UPRIGHT = (0, 1)
 # Bits of the cell's mantissa: so few that multiples of it are exact, whatever program computes them.
 CELL_BITS = 8
 

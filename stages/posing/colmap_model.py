@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from stages.artifacts import WORLD_PLACE
 from stages.geometry.cameras import PinholeCameras
 from stages.inputs.bounded import read_bytes
 from stages.inputs.texts import read_text
@@ -39,7 +40,8 @@ def read_colmap(folder: Path) -> KnownPoses:
     with reading(f"The COLMAP model {folder}", "cameras, images and points3D, as .bin or as .txt"):
         read = _read_binary if (folder / "cameras.bin").is_file() else _read_text
         found = tuple(read(folder))
-    return KnownPoses(folder, found)
+    is_part = (folder / WORLD_PLACE.files[0]).is_file()
+    return KnownPoses(folder, found, place=WORLD_PLACE.load(folder) if is_part else None)
 
 
 def pinhole_model(cameras: PinholeCameras, pixels: Sequence[np.ndarray]) -> Any:

@@ -15,6 +15,7 @@ import numpy as np
 
 from stages.artifacts import KnownSphere
 from stages.errors import HineusError, InputError
+from stages.geometry.place import Place
 from stages.inputs.bounded import reason
 from stages.inputs.folders import readable, short_name
 from stages.inputs.formats import open_image
@@ -59,12 +60,15 @@ class KnownPoses:
         cameras: in the file's order; names are unique, and the numbers are those of cameras that can be.
         region: where the object is, if the file says so.
         masks: camera's name -> file of its mask, of formats that come with masks.
+        place: where they lie in the world, where they are a part of one of our workspaces. Then `origin` is a COLMAP
+            model whose points are theirs.
     """
 
     origin: Path
     cameras: tuple[KnownCamera, ...]
     region: KnownSphere | None = None
     masks: Mapping[str, Path] = field(default_factory=dict)
+    place: Place | None = None
 
     def __post_init__(self) -> None:
         seen: set[str] = set()

@@ -25,13 +25,16 @@ _PLAIN = {
 _TEXTURED = {**_COLLAPSE, "preserveboundary": True, "extratcoordw": 3.0}
 
 
-def decimate(vertices: np.ndarray, faces: np.ndarray, target_faces: int) -> tuple[np.ndarray, np.ndarray]:
+def decimate(
+    vertices: np.ndarray, faces: np.ndarray, target_faces: int, frozen: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """A mesh of about `target_faces` faces; the same one where it has no more.
 
     Args:
         vertices: [V, 3].
         faces: [F, 3], a 2-manifold with or without borders.
         target_faces: >= 4.
+        frozen: [V] bool, vertices that stay where they are; None: none.
 
     Returns:
         Vertices float32 and faces int32, a 2-manifold; closed, if the mesh was.
@@ -45,8 +48,15 @@ def decimate(vertices: np.ndarray, faces: np.ndarray, target_faces: int) -> tupl
         raise ValueError(f"expected target_faces >= 4, got {target_faces}")
     if len(faces) > target_faces:
         meshes = pymeshlab.MeshSet()
-        meshes.add_mesh(pymeshlab.Mesh(vertices.astype(np.float64), faces.astype(np.int32)))
-        meshes.meshing_decimation_quadric_edge_collapse(targetfacenum=target_faces, **_PLAIN)
+        held = np.zeros(len(vertices)) if frozen is None else frozen.astype(np.float64)
+        mesh = pymeshlab.Mesh(vertices.astype(np.float64), faces.astype(np.int32), v_scalar_array=held)
+        meshes.add_mesh(mesh)
+        if held.any():
+            meshes.compute_selection_by_condition_per_face(condselect="q0 + q1 + q2 == 0")
+        # Of what is selected only vertices move all of whose faces are.
+        meshes.meshing_decimation_quadric_edge_collapse(
+            targetfacenum=target_faces, **{**_PLAIN, "selected": bool(held.any())}
+        )
         light = meshes.current_mesh()
         vertices, faces = light.vertex_matrix(), light.face_matrix()
     vertices, faces = repair_manifold(vertices, faces)

@@ -273,7 +273,7 @@ def extract_box(
 
 
 def _border_cells(grid: _Grid, sides: np.ndarray) -> dict[tuple[int, int, int], np.ndarray]:
-    """Cells along the upright faces of a box, in each block, through whose outer face the surface goes: flat indices."""
+    """Cells of each block, as flat indices, through whose face on an upright side of the box the surface goes."""
     found = []
     for axis, other in ((0, 1), (1, 0)):
         for plane in (0, int(sides[axis])):

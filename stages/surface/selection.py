@@ -32,11 +32,16 @@ def inside_ball(vertices: np.ndarray, faces: np.ndarray, radius: float) -> np.nd
     return (np.linalg.norm(vertices, axis=1) <= radius)[faces].all(1)
 
 
-def large_pieces(faces: np.ndarray, min_part: float) -> tuple[np.ndarray, int]:
-    """Faces [F] bool of pieces with at least `min_part` of the largest piece's faces, and how many pieces go."""
+def large_pieces(faces: np.ndarray, min_part: float, spared: np.ndarray | None = None) -> tuple[np.ndarray, int]:
+    """Faces [F] bool of pieces with at least `min_part` of the largest piece's faces, and how many pieces go.
+
+    Pieces with a face that is `spared` [F] stay, however small.
+    """
     labels = label_pieces(len(faces), face_adjacency(faces))
     sizes = np.bincount(labels)
     keep = sizes >= min_part * sizes.max(initial=0)
+    if spared is not None:
+        keep |= np.bincount(labels, spared) > 0
     return keep[labels], int(np.count_nonzero(~keep))
 
 

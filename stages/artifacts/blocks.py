@@ -1,0 +1,152 @@
+"""Blocks of a large scene: their plan, which lies in the workspace of the whole, and what each block is given.
+
+<whole>/blocks/plan.json
+<whole>/blocks/<name>/                  the block's own workspace
+<whole>/blocks/<name>/given/photos      links to the whole's photos that see it; `masks` likewise
+<whole>/blocks/<name>/given/poses       a COLMAP model: the whole's cameras and points; how it lies in the world
+<whole>/blocks/<name>/given/neighbours  tile.json; links to the fields of the blocks around it
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from stages.artifacts.artifact import Artifact
+from stages.artifacts.json_files import Array, PathInside, Record, read_record
+from stages.artifacts.own_files import write_own
+from stages.artifacts.place import SimilarityRecord
+from stages.artifacts.train import FIELD, SCENE
+from stages.geometry.tiling import BlockBox
+
+NEIGHBOURS = "neighbours"  # the source of a block's stages that look beyond it
+LEARNED: tuple[Artifact[Any], ...] = (FIELD, SCENE)  # of a block, which those around it read
+PLAN_VERSION = 1
+_BLOCKS, _GIVEN, _PLAN, _TILE = "blocks", "given", "plan.json", "tile.json"
+
+
+class BoxRecord(Record):
+    """See `BlockBox`."""
+
+    core: Array
+    margin: Array
+
+    def box(self) -> BlockBox:
+        return BlockBox(self.core, self.margin)
+
+
+class Lattice(Record):
+    """The one lattice of all blocks, in the plan's frame: points origin + cell * (i, j, k)."""
+
+    origin: Array
+    cell: float
+
+
+class Block(Record):
+    """One block.
+
+    Attributes:
+        core: lowest and highest corner of what its tile covers; cores tile the ground plan without gaps.
+        region: of what it learns: the core and a margin around it.
+        photos: names in the whole's image set.
+        neighbours: names of the blocks whose region touches its core.
+    """
+
+    name: PathInside
+    core: Array
+    region: Array
+    photos: tuple[str, ...]
+    neighbours: tuple[str, ...]
+
+    def box(self) -> BlockBox:
+        return BlockBox(self.core, self.region[1] - self.core[1])
+
+
+class BlockPlan(Record):
+    """How a large scene is cut.
+
+    Attributes:
+        made_from: digest of the poses and of what was asked for. settings: of those that the blocks were given.
+        plan_from_poses: from the frame of the whole's poses to the plan's: its world, turned so that +Z is up.
+    """
+
+    version: int = PLAN_VERSION
+    made_from: str
+    settings: str
+    plan_from_poses: SimilarityRecord
+    lattice: Lattice
+    blocks: tuple[Block, ...]
+
+
+class Tile(Record):
+    """What a block's extraction needs to know.
+
+    Attributes:
+        name: of the block. cell: of the lattice, whose points are its multiples.
+        boxes: of the block and its neighbours, by name; all in the frame of the block's poses, which is the plan's.
+    """
+
+    name: PathInside
+    cell: float
+    boxes: Mapping[PathInside, BoxRecord]
+
+    @property
+    def box(self) -> BlockBox:
+        return self.boxes[self.name].box()
+
+
+# ---------------------------------------------------------------- where things lie
+def block_folder(whole: Path, name: str) -> Path:
+    """The workspace of a block."""
+    return whole / _BLOCKS / name
+
+
+def given_folder(block: Path, what: str) -> Path:
+    """What a block is given: "photos", "masks", "poses" or `NEIGHBOURS`."""
+    return block / _GIVEN / what
+
+
+def whole_of(block: Path) -> Path | None:
+    """The workspace that a workspace is a block of; None where it is none."""
+    whole = block.parent.parent
+    return whole if block.parent.name == _BLOCKS and plan_path(whole).is_file() else None
+
+
+# ---------------------------------------------------------------- files
+def plan_path(whole: Path) -> Path:
+    return whole / _BLOCKS / _PLAN
+
+
+def read_plan(whole: Path) -> BlockPlan | None:
+    """None where the workspace was not cut into blocks."""
+    return read_record(plan_path(whole), BlockPlan) if plan_path(whole).exists() else None
+
+
+def write_plan(whole: Path, plan: BlockPlan) -> None:
+    plan_path(whole).parent.mkdir(parents=True, exist_ok=True)
+    write_own(plan_path(whole), plan.model_dump_json(indent=1) + "\n")
+
+
+def read_tile(neighbours: Path) -> Tile:
+    """Of a block's source `NEIGHBOURS`."""
+    return read_record(neighbours / _TILE, Tile)
+
+
+def has_tile(neighbours: Path) -> bool:
+    """Whether a block has been given all that it needs: its tile comes last."""
+    return (neighbours / _TILE).is_file()
+
+
+def write_tile(neighbours: Path, tile: Tile) -> None:
+    write_own(neighbours / _TILE, tile.model_dump_json(indent=1) + "\n")
+
+
+def learned_folder(neighbours: Path, name: str) -> Path:
+    """Where a block finds what the neighbour of this name has learned."""
+    return neighbours / name
+
+
+def has_learned(folder: Path) -> bool:
+    """Whether all of what a neighbour learns is there."""
+    return all((folder / file).is_file() for artifact in LEARNED for file in artifact.files)
