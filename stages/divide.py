@@ -25,6 +25,7 @@ from stages.artifacts import IMAGE_SET, MODEL, PHOTOS, WORLD_PLACE, SimilarityRe
 from stages.artifacts.blocks import (
     LEARNED,
     NEIGHBOURS,
+    PLAN_VERSION,
     Block,
     BlockPlan,
     BoxRecord,
@@ -50,6 +51,7 @@ from stages.geometry.place import BOX_MARGIN, Place
 from stages.geometry.region import have_neighbours, surround_cameras
 from stages.geometry.similarity import Similarity
 from stages.geometry.tiling import BlockBox, cut_plan, lattice_cell, on_lattice, photos_of_blocks
+from stages.geometry.vectors import unit
 from stages.limits import total_memory
 from stages.place import PLACE
 from stages.posing.parts import rebuilt
@@ -60,6 +62,8 @@ log = logging.getLogger(__name__)
 
 FEWEST_POINTS = 100  # with fewer there is nothing to cut by
 FEWEST_PHOTOS = 12  # a block that is given fewer learns little: cuts end there, whatever the memory
+# The points of a large scene spread no more across its ground than this part of their narrower spread along it.
+MOST_RELIEF = 0.5
 MOST_BLOCKS = 100_000
 Z = np.array([0.0, 0.0, 1.0])
 
@@ -71,7 +75,7 @@ def divide(root: Path, count: int | None, anew: bool = False) -> BlockPlan:
 
     Args:
         count: blocks; None: so many that each has no more photos than a process can hold in this machine's memory.
-        anew: where there are blocks of another plan, remove them with all that they hold.
+        anew: remove the blocks that there are, with all that they hold, and cut again.
 
     Raises:
         WorkspaceError: the photos have no poses yet, or there are blocks of another plan.
@@ -83,7 +87,7 @@ def divide(root: Path, count: int | None, anew: bool = False) -> BlockPlan:
     with workspace.lock():
         made_from = _made_from(workspace, config, count)
         before = read_plan(workspace.root)
-        if before is not None and before.made_from != made_from:
+        if before is not None and (anew or before.made_from != made_from):
             _remove_blocks(workspace.root, before, anew)
             before = None
         settings = digest(config.model_dump(mode="json"))
@@ -122,7 +126,7 @@ def _made_from(workspace: Workspace, config: Config, count: int | None) -> str:
         manifest = workspace.published(artifact.stage)
         assert manifest is not None  # `check_current`
         digests.append(manifest.artifact_digest(artifact))
-    return digest([digests, count, config.extract.resolution, config.undistort.max_side])
+    return digest([PLAN_VERSION, digests, count, config.extract.resolution, config.undistort.max_side])
 
 
 def _remove_blocks(root: Path, plan: BlockPlan, anew: bool) -> None:
@@ -181,23 +185,31 @@ class _Whole:
                 "Let neighbouring photos overlap by two thirds.",
             )
         place = WORLD_PLACE.load(workspace.stage_folder(WORLD_PLACE.stage))
-        up = place.up if place.up is not None else _up_of_photos(cameras, points, observations, place)
+        near = surround_cameras(points, cameras.centers)
+        near[near] = have_neighbours(points[near])
+        up = place.up
+        if up is None:
+            up = unit(place.world_from_poses.rotation @ _up_of(cameras, points, observations, near))
         turn = rotation_onto(up, Z)
         plan_from_poses = Similarity(1.0, turn, np.zeros(3)).compose(place.world_from_poses)
-        centers, points = plan_from_poses.apply(cameras.centers), plan_from_poses.apply(points)
-        near = surround_cameras(points, centers)
-        near[near] = have_neighbours(points[near])
+        points = plan_from_poses.apply(points)
         return _Whole(
             model, names, into_frame(cameras, plan_from_poses.inverse()), points, observations, near, plan_from_poses,
             _place_of_plan(place, turn),
         )  # fmt: skip
 
 
-def _up_of_photos(cameras: PinholeCameras, points: np.ndarray, observations: np.ndarray, place: Place) -> np.ndarray:
-    """Up in the world as the photos tell it."""
-    direction = place.world_from_poses.rotation @ find_layout(cameras, points, observations).up.direction
-    up: np.ndarray = direction / np.linalg.norm(direction)
-    return up
+def _up_of(cameras: PinholeCameras, points: np.ndarray, observations: np.ndarray, near: np.ndarray) -> np.ndarray:
+    """Up [3] where nothing but the photos tells it: across the plane that the scene lies in, and towards the cameras.
+
+    Cameras that look down from the air say little of up. Where the scene lies in no plane, they are asked all the same.
+    """
+    middle = points[near].mean(0)
+    _, spread, axes = np.linalg.svd(points[near] - middle, full_matrices=False)
+    if spread[2] > MOST_RELIEF * spread[1]:
+        return find_layout(cameras, points, observations).up.direction
+    across = axes[2]
+    return across if (cameras.centers - middle).mean(0) @ across > 0 else -across
 
 
 def _place_of_plan(place: Place, turn: np.ndarray) -> Place:

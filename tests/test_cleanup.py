@@ -10,6 +10,7 @@ from rigs import capture, ring, scene_without_points, three_rings
 
 from configs.params import CleanupParams
 from stages import artifacts
+from stages.artifacts.blocks import NEIGHBOURS, BoxRecord, Tile, write_tile
 from stages.cleanup import CLEANUP
 from stages.engine.stage import StageContext
 from stages.errors import ReconstructionError
@@ -44,7 +45,16 @@ def stage(tmp_path):
         tmp_path / name for name in ("undistort", "train", "extract", "place", "out")
     )
 
-    def run(vertices, faces, masks=None, scene_extras=None, region=None, kind=artifacts.PINHOLE_PHOTOS, **params):
+    def run(
+        vertices,
+        faces,
+        masks=None,
+        scene_extras=None,
+        region=None,
+        kind=artifacts.PINHOLE_PHOTOS,
+        neighbours=None,
+        **params,
+    ):
         for folder in (undistort, train, extract, place, out):
             folder.mkdir()
         cameras = three_rings()
@@ -60,7 +70,7 @@ def stage(tmp_path):
                 cv2.imwrite(str(path), mask.astype(np.uint8) * 255)
         context = StageContext(
             inputs={"undistort": undistort, "train": train, "extract": extract, "place": place},
-            sources={},
+            sources={} if neighbours is None else {NEIGHBOURS: neighbours},
             out=out,
             scratch=tmp_path,
             params=CleanupParams(**params),
@@ -76,6 +86,33 @@ def test_small_pieces_go_and_their_number_is_told():
     assert dropped == 2
     assert np.linalg.norm(vertices[faces[keep]], axis=2).max() < 0.55
     assert selection.large_pieces(faces, 0.0) == (pytest.approx(np.ones(len(faces), bool)), 0)
+
+
+def test_small_pieces_that_are_spared_stay():
+    vertices, faces = join(ball(), ball(0.06, (0.8, 0, 0)), ball(0.06, (-0.8, 0, 0)))
+    spared = (vertices[:, 0] > 0.85)[faces].any(1)
+    keep, dropped = selection.large_pieces(faces, 0.1, spared)
+    assert dropped == 1
+    assert vertices[faces[keep], 0].min() > -0.6
+    assert vertices[faces[keep], 0].max() > 0.8
+
+
+def test_the_border_of_a_tile_stays_and_what_reaches_it(stage, tmp_path):
+    """A block whose core ends at x = 0.1 (scene): half a ball, and a crumb that goes on in the next block."""
+    core = np.array([[-9.0, -9, -9], [0.1, 9, 9]])  # the scene's frame is that of the poses here
+    around = tmp_path / NEIGHBOURS
+    around.mkdir()
+    write_tile(around, Tile(name="b00", cell=0.1, boxes={"b00": BoxRecord(core=core, margin=np.ones(3))}))
+    half = triangle_mesh.clip(*ball(resolution=64), np.array([-1.0, 0, 0]), -0.1)
+    crumb = triangle_mesh.clip(*ball(0.04, (0.1, 0.7, 0)), np.array([-1.0, 0, 0]), -0.1)
+    vertices, faces = join(half, crumb)
+    light = {"target_faces": 600, "min_component": 0.2, "min_views": 0}
+    numbers, kept, left = stage(vertices, faces, neighbours=around, **light)
+    assert numbers["pieces_dropped"] == numbers["specks_dropped"] == 0
+    border = lambda points: {tuple(each) for each in points[np.abs(points[:, 0] - 0.1) < 1e-6].tolist()}  # noqa: E731
+    assert len(border(kept)) > 50
+    assert border(kept) == border(vertices)
+    assert len(left) < len(faces) / 2
 
 
 def test_views_of_a_ball_are_those_on_its_near_side():
@@ -214,6 +251,19 @@ def test_decimation_keeps_a_border_in_place_and_lightens_it():
     rim = few[use.face, use.slot][use.counts[use.edge] == 1]
     np.testing.assert_allclose(light[rim, 2], 0.1, atol=0.005)
     np.testing.assert_allclose(np.linalg.norm(light[rim, :2], axis=1), np.sqrt(0.5**2 - 0.1**2), atol=0.01)
+
+
+def test_decimation_leaves_frozen_vertices_where_they_are_and_other_borders_to_themselves():
+    vertices, faces = ball(resolution=96)
+    upper, kept = triangle_mesh.clip(vertices, faces, np.array([0.0, 0, 1]), 0.1)
+    band, kept = triangle_mesh.clip(upper, kept, np.array([0.0, 0, -1]), -0.3)
+    frozen = np.abs(band[:, 2] - 0.1) < 1e-6
+    light, few = decimate(band, kept, len(kept) // 4, frozen)
+    assert len(few) < len(kept) / 2
+    assert triangle_mesh.mesh_state(few).manifold
+    rim = light[np.abs(light[:, 2] - 0.1) < 1e-6]
+    assert {tuple(each) for each in rim.tolist()} == {tuple(each) for each in band[frozen].tolist()}
+    assert (np.abs(light[:, 2] - 0.3) < 5e-3).sum() < (np.abs(band[:, 2] - 0.3) < 1e-6).sum() / 2
 
 
 def test_decimation_does_not_depend_on_what_pymeshlab_did_before():

@@ -16,7 +16,7 @@ def blocks(
     workspace: OfWorkspace = Path("."),
     count: Annotated[str, typer.Option(help=BLOCKS_HELP, metavar="N|auto")] = "auto",
     anew: Annotated[
-        bool, typer.Option("--anew", help="Remove the blocks of another plan, with all that they hold.")
+        bool, typer.Option("--anew", help="Remove the blocks that there are, with all that they hold, and cut again.")
     ] = False,
     as_json: Json = False,
 ) -> None:
