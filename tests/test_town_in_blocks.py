@@ -1,0 +1,65 @@
+"""A large scene in small: photos of a strip of land to two tiles that meet, by one command's worth of calls."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from small_town import HOUSES, photograph
+
+from stages import artifacts
+from stages.artifacts.blocks import block_folder, read_plan
+from stages.block_by_block import BlockRuns, reconstruct_in_blocks
+from stages.block_status import block_statuses
+from stages.pipeline import PIPELINE
+from stages.request import Request
+
+SETTINGS = ("train.steps=80", "train.steps_if_covered=1", "atlas.texture_size=128", "cleanup.target_faces=1500")
+
+
+def run(folder: Path) -> BlockRuns:
+    asked = Request(
+        photos=folder / "photos",
+        poses=folder / "transforms.json",
+        workspace=folder / "whole",
+        preset="tiny",
+        sets=SETTINGS,
+        device="cpu",
+        workers=1,
+    )
+    return reconstruct_in_blocks(asked, 2, PIPELINE)
+
+
+@pytest.mark.slow
+def test_photos_to_tiles_that_meet(tmp_path):
+    photograph(tmp_path)
+    result = run(tmp_path)
+    assert result.failure() is None
+    whole, plan = result.whole.workspace.root, read_plan(tmp_path / "whole")
+    assert all(outcome.glb.is_file() and outcome.report.is_file() for outcome in result.outcomes)
+    plan_from_poses = plan.plan_from_poses.similarity()
+
+    borders, heights = [], []
+    axis = int(np.argmax(np.abs(plan.blocks[0].core.mean(0) - plan.blocks[1].core.mean(0))[:2]))
+    at = plan.blocks[1].core[0, axis]
+    for block in plan.blocks:
+        folder = block_folder(whole, block.name)
+        frame = artifacts.SCENE.load(folder / "train").poses_from_scene
+        vertices = frame.apply(artifacts.RAW_MESH.load(folder / "extract")[0].astype(np.float64))
+        border = vertices[np.abs(vertices[:, axis] - at) < 1e-5]
+        borders.append(border[np.lexsort(np.round(border, 4).T)])
+        clean = frame.apply(artifacts.CLEAN_MESH.load(folder / "cleanup")[0].astype(np.float64))
+        heights.append(plan_from_poses.inverse().apply(clean))
+    assert len(borders[0]) == len(borders[1]) > 20
+    np.testing.assert_allclose(*borders, atol=1e-5)
+
+    surface = np.concatenate(heights)  # after so few steps the land is roughly where it should be
+    for x, y, height in HOUSES:
+        roof = surface[(np.abs(surface[:, :2] - (x, y)) < 0.25).all(1)]
+        assert np.quantile(roof[:, 2], 0.9) == pytest.approx(height, abs=0.3)
+
+    again = run(tmp_path)
+    assert all(outcome.action == "skipped" for outcome in again.whole.outcomes)
+    assert all(block.fresh == block.stages for block in block_statuses(whole, PIPELINE))
+    assert plan_from_poses.scale == 1.0, "the world of poses that are given is theirs"
