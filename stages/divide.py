@@ -37,6 +37,7 @@ from stages.artifacts.blocks import (
     learned_folder,
     plan_path,
     read_plan,
+    refuse_links,
     write_plan,
     write_tile,
 )
@@ -100,6 +101,7 @@ def divide(root: Path, count: int | None, anew: bool = False) -> BlockPlan:
             plan = before
             log.info("the blocks stay as they are cut: the poses have not changed")
         for block in plan.blocks:
+            refuse_links(block_folder(workspace.root, block.name))
             if before is None or before.settings != settings:
                 _settle(workspace, block, config)
             if before is None or not has_tile(given_folder(block_folder(workspace.root, block.name), NEIGHBOURS)):
@@ -141,6 +143,7 @@ def _remove_blocks(root: Path, plan: BlockPlan, anew: bool) -> None:
         )
     for block in plan.blocks:
         folder = block_folder(root, block.name)
+        refuse_links(folder)
         if folder.is_dir():
             with Workspace.open(folder, create=True).lock():  # nobody is at work in it
                 pass

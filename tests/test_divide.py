@@ -14,16 +14,17 @@ from small_town import flight, town_workspace
 from configs.load import load_config
 from configs.params import Config
 from stages import artifacts
-from stages.artifacts.blocks import NEIGHBOURS, block_folder, given_folder, read_plan, read_tile, whole_of
+from stages.artifacts.blocks import NEIGHBOURS, block_folder, given_folder, plan_path, read_plan, read_tile, whole_of
 from stages.block_status import block_statuses, workspace_status
 from stages.divide import divide, in_words
 from stages.engine.fingerprint import SourceDigests
-from stages.engine.runner import run_pipeline
+from stages.engine.runner import naming_command, run_pipeline
 from stages.engine.workspace import Workspace
 from stages.errors import WorkspaceError
 from stages.geometry.similarity import Similarity
 from stages.geometry.tiling import within
 from stages.pipeline import PIPELINE
+from stages.posing.parts import rebuilt
 from stages.posing.undistortion import registered_photos, sparse_points
 from stages.preflight import photos_held
 from stages.reconstruct import reconstruct
@@ -214,6 +215,45 @@ def test_more_memory_holds_more_photos():
     few, many = photos_held(sizes, config, 8.0), photos_held(sizes, config, 16.0)
     assert 100 < few < many
     assert photos_held([(400, 300)], config, 8.0) > few
+
+
+def test_what_lies_elsewhere_is_not_touched_through_a_link(whole, tmp_path):
+    """A workspace may come from somebody else: `given` that leads to one's own photos would be emptied."""
+    divide(whole, 2)
+    precious = tmp_path / "precious"
+    (precious / "photos").mkdir(parents=True)
+    (precious / "photos" / "only.jpg").touch()
+    given = given_folder(block_folder(whole, "b00"), "photos").parent
+    shutil.rmtree(given)
+    given.symlink_to(precious)
+    for anew in (False, True):
+        with pytest.raises(WorkspaceError, match="is a link"):
+            divide(whole, 2, anew)
+    assert (precious / "photos" / "only.jpg").exists()
+
+
+def test_a_plan_that_leads_out_of_its_folder_is_refused(whole):
+    divide(whole, 2)
+    plan_path(whole).write_text(plan_path(whole).read_text().replace("row_0/000.png", "../../000.png"))
+    with pytest.raises(WorkspaceError, match="leads out"):
+        read_plan(whole)
+
+
+def test_a_block_whose_neighbours_are_gone_names_the_command_that_gives_them(whole):
+    command = naming_command(NEIGHBOURS, block_folder(whole, "b00"))
+    assert command == f"hineus blocks {whole}"
+
+
+def test_photos_that_were_reduced_since_keep_their_poses(whole):
+    model = pycolmap.Reconstruction(str(artifacts.MODEL.load(whole / "sfm")))
+    names = [image.name for image in model.images.values()][:6]
+    small = rebuilt(model, {name: (f"small/{name}", (120, 90)) for name in names})
+    assert small.num_reg_images() == 6
+    assert small.compute_mean_reprojection_error() == pytest.approx(0.5)
+    for image in small.images.values():
+        assert (image.camera.width, image.camera.focal_length) == (120, pytest.approx(100.0))
+        place = image.points2D[0]
+        np.testing.assert_allclose(image.project_point(small.points3D[place.point3D_id].xyz), place.xy, atol=1e-6)
 
 
 def test_status_tells_of_each_block(whole):

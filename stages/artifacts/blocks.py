@@ -15,7 +15,7 @@ from typing import Any
 
 from stages.artifacts.artifact import Artifact
 from stages.artifacts.json_files import Array, PathInside, Record, read_record
-from stages.artifacts.own_files import write_own
+from stages.artifacts.own_files import refuse_link, write_own
 from stages.artifacts.place import SimilarityRecord
 from stages.artifacts.train import FIELD, SCENE
 from stages.geometry.tiling import BlockBox
@@ -56,8 +56,8 @@ class Block(Record):
     name: PathInside
     core: Array
     region: Array
-    photos: tuple[str, ...]
-    neighbours: tuple[str, ...]
+    photos: tuple[PathInside, ...]
+    neighbours: tuple[PathInside, ...]
 
     def box(self) -> BlockBox:
         return BlockBox(self.core, self.region[1] - self.core[1])
@@ -100,6 +100,16 @@ class Tile(Record):
 def block_folder(whole: Path, name: str) -> Path:
     """The workspace of a block."""
     return whole / _BLOCKS / name
+
+
+def refuse_links(block: Path) -> None:
+    """What is written for a block, or removed with it, is where it seems to be.
+
+    Raises:
+        WorkspaceError: a folder on the way is a link, so that other folders would be written to, or removed.
+    """
+    for folder in (block.parent, block, block / _GIVEN):
+        refuse_link(folder)
 
 
 def given_folder(block: Path, what: str) -> Path:

@@ -55,6 +55,16 @@ def refuse_foreign(
         waiting += [each for each in below if not (but and path == place and each.name.startswith(but))]
 
 
+def refuse_link(place: Path) -> None:
+    """Refuse a link at `place`, where a folder of ours belongs or nothing is yet.
+
+    Raises:
+        WorkspaceError: there is one.
+    """
+    if place.is_symlink():
+        raise _refusal(place, place.lstat())
+
+
 def inside(folder: Path, name: str) -> Path:
     """Where the file of this name lies in a folder.
 
