@@ -88,7 +88,7 @@ def run(context: StageContext[CleanupParams]) -> dict[str, Any]:
     sides = region.sides(scene.poses_from_scene) if region else []
     vertices, faces = _crop(vertices, faces, scene, sides, params)
     numbers["ground_removed"] = params.remove_ground and scene.ground is not None
-    if scene.ground is not None and not params.keep_closed:
+    if scene.ground is not None and not params.keep_closed and not borders:  # a tile's ground ends nowhere
         under = ground.under_the_border(vertices, scene, UNDER_TOLERANCES * params.ground_tolerance)
         keep(np.asarray(~under[faces].all(1)), "under_ground", "Try `--set undistort.roi_scale=1.5`.")
     reaching = _reaching(borders, vertices, faces)

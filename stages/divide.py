@@ -23,7 +23,6 @@ from configs.load import load_config
 from configs.params import Config, PlaceParams
 from stages.artifacts import IMAGE_SET, MODEL, PHOTOS, WORLD_PLACE, SimilarityRecord
 from stages.artifacts.blocks import (
-    LEARNED,
     NEIGHBOURS,
     PLAN_VERSION,
     Block,
@@ -34,7 +33,7 @@ from stages.artifacts.blocks import (
     block_folder,
     given_folder,
     has_tile,
-    learned_folder,
+    learned_links,
     plan_path,
     read_plan,
     refuse_links,
@@ -58,6 +57,7 @@ from stages.place import PLACE
 from stages.posing.parts import rebuilt
 from stages.posing.undistortion import plan_warp, posed_cameras, registered_photos, sparse_points
 from stages.preflight import GIB, photos_held
+from stages.train import TRAIN
 
 log = logging.getLogger(__name__)
 
@@ -307,12 +307,9 @@ def _give(workspace: Workspace, whole: _Whole, plan: BlockPlan, block: Block) ->
         WORLD_PLACE.save(poses, whole.place)
         around = given_folder(folder, NEIGHBOURS)
         learned = {
-            (learned_folder(around, name) / file).relative_to(around).as_posix(): block_folder(workspace.root, name)
-            / artifact.stage
-            / file
+            link.relative_to(around).as_posix(): block_folder(workspace.root, name) / TRAIN.name / file
             for name in block.neighbours
-            for artifact in LEARNED
-            for file in artifact.files
+            for file, link in learned_links(around, name).items()
         }
         _link_all(around, learned)
         near = [each for each in plan.blocks if each.name in (block.name, *block.neighbours)]

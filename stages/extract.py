@@ -14,7 +14,7 @@ import numpy as np
 
 from configs.params import ExtractParams
 from stages.artifacts import FIELD, POINT_CLOUD, RAW_MESH, SCENE
-from stages.artifacts.blocks import NEIGHBOURS, has_learned, learned_folder, read_tile
+from stages.artifacts.blocks import NEIGHBOURS, learned_by, read_tile
 from stages.engine.stage import Stage, StageContext
 from stages.errors import ReconstructionError
 from stages.geometry.cameras import PinholeCameras, PosedScene
@@ -119,10 +119,10 @@ def _tile(context: StageContext[ExtractParams], field: TrainedField, scene: Pose
     tile = read_tile(folder)
     fields, missing = [], []
     for name in sorted(tile.boxes):
-        learned = learned_folder(folder, name)
+        learned = learned_by(folder, name)
         if name == tile.name:
             fields.append(BlockField(tile.box, _in_plan(field, scene.poses_from_scene)))
-        elif has_learned(learned):
+        elif learned is not None:
             frame = SCENE.load(learned).poses_from_scene
             fields.append(
                 BlockField(tile.boxes[name].box(), _in_plan(load_field(FIELD.load(learned), context.device), frame))

@@ -12,7 +12,7 @@ from rigs import scene_without_points, three_rings
 
 from configs.params import ExtractParams
 from stages import artifacts
-from stages.artifacts.blocks import NEIGHBOURS, BoxRecord, Tile, write_tile
+from stages.artifacts.blocks import NEIGHBOURS, BoxRecord, Tile, learned_links, write_tile
 from stages.engine.stage import StageContext
 from stages.errors import ReconstructionError
 from stages.extract import EXTRACT, supported_resolution
@@ -53,10 +53,14 @@ def tiles(tmp_path, monkeypatch):
             boxes = {each: BoxRecord(core=box.core, margin=box.margin) for each, box in BOXES.items()}
             write_tile(around, Tile(name=name, cell=CELL, boxes=boxes))
             for each in heights:
-                folder = root / "train" if each == name else around / each
+                folder = root / ("train" if each == name else f"of_{each}")
                 folder.mkdir()
                 (folder / "field.pt").write_text(each)
                 artifacts.SCENE.save(folder, replace(scene_without_points(three_rings()), poses_from_scene=frame(each)))
+                if each != name:
+                    (around / each).mkdir()
+                    for file, link in learned_links(around, each).items():
+                        link.symlink_to(folder / file)
             for stage in ("densify", "out"):
                 (root / stage).mkdir()
             artifacts.POINT_CLOUD.save(root / "densify", cloud or PointCloud.empty())

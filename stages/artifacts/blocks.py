@@ -152,11 +152,12 @@ def write_tile(neighbours: Path, tile: Tile) -> None:
     write_own(neighbours / _TILE, tile.model_dump_json(indent=1) + "\n")
 
 
-def learned_folder(neighbours: Path, name: str) -> Path:
-    """Where a block finds what the neighbour of this name has learned."""
-    return neighbours / name
+def learned_links(neighbours: Path, name: str) -> dict[str, Path]:
+    """File of what the neighbour of this name learns -> the link to it."""
+    return {file: neighbours / name / file for artifact in LEARNED for file in artifact.files}
 
 
-def has_learned(folder: Path) -> bool:
-    """Whether all of what a neighbour learns is there."""
-    return all((folder / file).is_file() for artifact in LEARNED for file in artifact.files)
+def learned_by(neighbours: Path, name: str) -> Path | None:
+    """Where the neighbour of this name published what it has learned; None where it has not yet."""
+    links = list(learned_links(neighbours, name).values())
+    return links[0].resolve().parent if all(link.is_file() for link in links) else None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -25,7 +25,7 @@ def rebuilt(
 
     frame = old_from_new or Similarity.identity()
     images = sorted((image for image in model.images.values() if image.name in taken), key=lambda image: image.image_id)
-    kept = _kept_tracks(model, {image.image_id for image in images})
+    kept = _kept_tracks(model, images)
     found = pycolmap.Reconstruction()
     lenses: dict[tuple[int, tuple[int, int]], int] = {}
     new_place: dict[tuple[int, int], int] = {}
@@ -57,15 +57,16 @@ def rebuilt(
     return found
 
 
-def _kept_tracks(model: Any, images: set[int]) -> dict[int, list[tuple[int, int]]]:
+def _kept_tracks(model: Any, images: Sequence[Any]) -> dict[int, list[tuple[int, int]]]:
     """Points that enough of these images see -> where they see them: (image, place)."""
-    kept = {}
-    for number in sorted(model.points3D):
-        elements = model.points3D[number].track.elements
-        track = [(each.image_id, each.point2D_idx) for each in elements if each.image_id in images]
-        if len({image for image, _ in track}) >= MIN_SEEING:
-            kept[number] = track
-    return kept
+    tracks: dict[int, list[tuple[int, int]]] = {}
+    for image in images:
+        for place, feature in enumerate(image.points2D):
+            if feature.has_point3D():
+                tracks.setdefault(feature.point3D_id, []).append((image.image_id, place))
+    return {
+        number: track for number, track in sorted(tracks.items()) if len({image for image, _ in track}) >= MIN_SEEING
+    }
 
 
 def _resized(lens: Any, size: tuple[int, int], number: int) -> Any:
