@@ -104,10 +104,10 @@ class BlockRuns:
         failed = [outcome for outcome in self.outcomes if outcome.state == "failed"]
         if not failed:
             return None
+        others = "; the others are done" if len(failed) < len(self.outcomes) else ""
         first, root, names = failed[0], self.whole.workspace.root, ", ".join(outcome.name for outcome in failed)
         return ReconstructionError(
-            f"{len(failed)} of {len(self.outcomes)} blocks failed ({names}); the others are done. "
-            f"{first.name}: {first.error}",
+            f"{len(failed)} of {len(self.outcomes)} blocks failed ({names}){others}. {first.name}: {first.error}",
             f"{first.hint} The same command goes on with those that failed; one alone: "
             f"`hineus run --workspace {shlex.quote(str(block_folder(root, first.name)))}`.".lstrip(),
         )

@@ -80,6 +80,7 @@ def run(context: StageContext[PlaceParams]) -> dict[str, Any]:
     if whole is None:  # of which all parts have one world
         place = _in_reach(place, cameras.centers, params.epsg)
     up_from = "" if place.up is None else "GPS" if place.control_residual is None else "the control points"
+    up_from = "the whole that this is a part of" if whole is not None else up_from
     if params.up != "auto":
         direction = np.eye(3)["xyz".index(params.up[1])] * (1.0 if params.up[0] == "+" else -1.0)
         place, up_from = replace(place, up=direction), "the settings"

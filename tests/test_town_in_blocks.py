@@ -15,7 +15,7 @@ from stages.block_status import block_statuses
 from stages.pipeline import PIPELINE
 from stages.request import Request
 
-SETTINGS = ("train.steps=80", "train.steps_if_covered=1", "atlas.texture_size=128", "cleanup.target_faces=1500")
+SETTINGS = ("train.steps=40", "train.steps_if_covered=1", "atlas.texture_size=128", "cleanup.target_faces=1500")
 
 
 def run(folder: Path) -> BlockRuns:
