@@ -50,8 +50,6 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-MOST_GROUND_PIXELS = 1 << 27  # of an orthophoto: twice what the largest texture has
-
 
 @dataclass(frozen=True)
 class Asset:
@@ -326,6 +324,7 @@ def _write_points(
 ) -> tuple[dict[str, Any], dict[str, int]]:
     """Numbers of the dense points, and bytes of each of their files; none where there are no points."""
     from stages.files.points import laz_bytes, points_ply_bytes
+    from stages.posing.map_coordinates import cloud_on_map
 
     found, region, params = context.read(POINT_CLOUD), context.read(GIVEN_REGION), context.params
     chosen = found.chosen(asked_for(found, region, context.read(SCENE).poses_from_scene, params))
@@ -339,7 +338,7 @@ def _write_points(
     )
     warnings = []
     try:
-        on_map, offset, crs = _points_on_map(world, place)
+        on_map, offset, crs = cloud_on_map(place, world)
     except SystemRequirementError as error:
         on_map, offset, crs = world, (0.0, 0.0, 0.0), ""
         warnings.append(_not_on_map(error))
@@ -356,22 +355,6 @@ def _write_points(
         warnings.append(_too_far(far))
     about = {"points": len(chosen), **({"points_crs": crs} if crs else {})}
     return {**about, **({"warnings": warnings} if warnings else {})}, sizes
-
-
-def _points_on_map(world: PointCloud, place: Place) -> tuple[PointCloud, tuple[float, float, float], str]:
-    """The points less an offset, the offset, and the coordinate system in which they are together.
-
-    Raises:
-        SystemRequirementError: pyproj is missing.
-    """
-    from stages.posing.map_coordinates import map_from_world, map_of, on_map
-
-    if place.origin is None:
-        return world, place.offset or (0.0, 0.0, 0.0), place.crs
-    coordinates = on_map(place, world.points)
-    x, y, z = offset = np.round(np.median(coordinates, axis=0))
-    normals = world.normals @ map_from_world(place, np.median(world.points, axis=0)).rotation.T
-    return replace(world, points=coordinates - offset, normals=normals), (float(x), float(y), float(z)), map_of(place)
 
 
 def _not_on_map(error: SystemRequirementError) -> dict[str, str]:
@@ -467,35 +450,29 @@ def _ground_grid(context: StageContext[ExportParams], asset: Asset, mesh: artifa
         ConfigError: there are too many.
         ReconstructionError: no photo shows the mesh from above.
     """
-    from stages.drawing.from_above import ground_grid
+    from stages.drawing.from_above import MOST_PIXELS, finest_resolution, ground_grid, two_digits
     from stages.surface.triangle_mesh import face_normals
     from stages.texture.footprint import ground_sampling, pixels_per_area
 
     places, asked = mesh.vertices[:, :2], context.params.ground_resolution
-    finest = float(np.sqrt(np.prod(np.ptp(places, axis=0)) / MOST_GROUND_PIXELS))
-    if asked is not None and asked < finest:
-        raise ConfigError(
-            f"At `export.ground_resolution` = {asked:g} the orthophoto has more than {MOST_GROUND_PIXELS / 1e6:.0f} "
-            "million pixels.",
-            f"Try `--set export.ground_resolution={two_digits(finest):g}`, or divide the region.",
-        )
     if asked is None:
         own = asset.mesh
         density, _ = pixels_per_area(own.vertices, own.faces, context.read(SCENE).cameras)
         from_above = np.maximum(face_normals(mesh.vertices, mesh.faces)[:, 2], 0)
-        asked = asset.world_from_scene.scale * ground_sampling(density, from_above)
-        if asked == 0:
+        sampling = asset.world_from_scene.scale * ground_sampling(density, from_above)
+        if sampling == 0:
             raise ReconstructionError(
                 "No photo shows the model from above, so that there is no orthophoto.",
                 "Take orthophoto out of `export.formats`, or name a resolution: `--set export.ground_resolution=0.05`.",
             )
-    return ground_grid(places, two_digits(max(asked, finest)))
-
-
-def two_digits(length: float) -> float:
-    """The next longer length that has two digits."""
-    unit = 10.0 ** (np.floor(np.log10(length)) - 1)
-    return float(f"{np.ceil(round(length / unit, 6)) * unit:.2g}")
+        asked = two_digits(max(sampling, finest_resolution(places)))
+    elif asked < finest_resolution(places):
+        raise ConfigError(
+            f"At `export.ground_resolution` = {asked:g} the orthophoto has more than {MOST_PIXELS / 1e6:.0f} million "
+            "pixels.",
+            f"Try `--set export.ground_resolution={two_digits(finest_resolution(places)):g}`, or a smaller region.",
+        )
+    return ground_grid(places, asked)
 
 
 def _write_georeference(asset: Asset, place: Place) -> None:
@@ -574,7 +551,7 @@ def provenance(scene: PosedScene, place: Place, gltf_from_world: np.ndarray, run
 
 EXPORT: Stage[ExportParams] = Stage(
     name="export",
-    version=10,
+    version=11,
     settings=lambda config: config.export,
     run=run,
     reads=(

@@ -14,9 +14,9 @@ from configs.params import ExportParams
 from stages import artifacts
 from stages.artifacts import AtlasMesh, write_png
 from stages.drawing import from_above
-from stages.drawing.from_above import ground_grid, seen_from_above
+from stages.drawing.from_above import ground_grid, seen_from_above, two_digits
 from stages.errors import ConfigError, SystemRequirementError
-from stages.export import EXPORT, two_digits
+from stages.export import EXPORT
 from stages.geometry.earth import from_east_north_up
 from stages.geometry.place import Place
 from stages.geometry.similarity import Similarity

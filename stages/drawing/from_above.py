@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 # Samples along a side of a pixel, one of them at its centre: the colour is their mean, the height is the centre's.
 SAMPLES = 3
 MOST_SAMPLES = 1 << 24  # at once
+MOST_PIXELS = 1 << 27  # of a picture: twice what the largest texture has
 
 
 @dataclass(frozen=True)
@@ -46,6 +47,17 @@ def ground_grid(places: Float[np.ndarray, "n 2"], resolution: float) -> GroundGr
     return GroundGrid(
         float(lowest[0] * resolution), float((lowest[1] + height) * resolution), resolution, width, height
     )
+
+
+def finest_resolution(places: Float[np.ndarray, "n 2"]) -> float:
+    """The side of a pixel at which a picture of these places has `MOST_PIXELS`."""
+    return float(np.sqrt(np.prod(np.ptp(places, axis=0)) / MOST_PIXELS))
+
+
+def two_digits(length: float) -> float:
+    """The next longer length that has two digits."""
+    unit = 10.0 ** (np.floor(np.log10(length)) - 1)
+    return float(f"{np.ceil(round(length / unit, 6)) * unit:.2g}")
 
 
 def seen_from_above(

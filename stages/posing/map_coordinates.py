@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from stages.geometry.earth import earth_centred, east_north_up_axes, from_east_north_up
+from stages.geometry.earth import earth_centred, east_north_up, east_north_up_axes, from_east_north_up
 from stages.geometry.place import Place
+from stages.geometry.point_cloud import PointCloud
 from stages.geometry.similarity import Similarity, align_points
 from stages.posing.coordinates import to_geodetic, to_grid
 
@@ -51,10 +53,36 @@ def on_map(place: Place, world: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "
     return found
 
 
+def in_world(place: Place, positions: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"] | None:
+    """Latitude, longitude (degrees) and altitude as points of the world; None where its place on Earth is not known.
+
+    Raises:
+        ConfigError, SystemRequirementError: see `to_grid`.
+    """
+    if place.origin is not None:
+        return east_north_up(positions, place.origin)
+    return to_grid(positions, place.crs) - np.array(place.offset) if place.crs and place.offset else None
+
+
 def map_from_world(place: Place, center: Float[np.ndarray, " 3"]) -> Similarity:
     """`on_map` about a point of the world, as one similarity: what turns directions."""
     cube = center + NEARBY_M * np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)])
     return align_points(cube, on_map(place, cube))
+
+
+def cloud_on_map(place: Place, cloud: PointCloud) -> tuple[PointCloud, tuple[float, float, float], str]:
+    """Points of the world less an offset, that offset, and `map_of(place)`, in which they are together.
+
+    Raises:
+        ConfigError, SystemRequirementError: see `on_map`.
+    """
+    if place.origin is None:
+        return cloud, place.offset or (0.0, 0.0, 0.0), place.crs
+    coordinates = on_map(place, cloud.points)
+    offset = np.round(np.median(coordinates, axis=0))
+    turn = map_from_world(place, np.median(cloud.points, axis=0)).rotation
+    x, y, z = offset.tolist()
+    return replace(cloud, points=coordinates - offset, normals=cloud.normals @ turn.T), (x, y, z), map_of(place)
 
 
 def earth_centred_from_world(place: Place, center: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "4 4"] | None:
