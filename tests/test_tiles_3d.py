@@ -187,7 +187,15 @@ def test_what_cannot_be_joined_is_named():
         joined({"a/t.json": here, "b/t.json": there})
     with pytest.raises(ValueError, match="none"):
         joined({})
-    for broken in ({}, {**here, "root": {}}, {**here, "geometricError": "much"}):
+    for broken in (
+        {},
+        [],
+        {**here, "root": {}},
+        {**here, "root": []},
+        {**here, "geometricError": "much"},
+        {**here, "root": {**here["root"], "transform": [1.0] * 15}},
+        {**here, "root": {"boundingVolume": {"box": [float("nan")] * 12}}},
+    ):
         with pytest.raises(ValueError, match=r"c\.json is no tileset"):
             joined({"c.json": broken})
 

@@ -64,16 +64,18 @@ def _geotiff(
         ImportError: rasterio is missing.
     """
     import rasterio
+    from rasterio.crs import CRS
     from rasterio.enums import Resampling
+    from rasterio.io import MemoryFile
 
     count, height, width = bands.shape
     profile = {
         "driver": "GTiff", "count": count, "height": height, "width": width, "dtype": bands.dtype, "nodata": nodata,
         "transform": rasterio.Affine(resolution, 0, west, 0, -resolution, north),
-        "crs": rasterio.CRS.from_string(crs) if crs else None,
+        "crs": CRS.from_string(crs) if crs else None,
         "tiled": True, "compress": "deflate", "predictor": 3 if bands.dtype.kind == "f" else 2, "bigtiff": "if_safer",
     }  # fmt: skip
-    with rasterio.MemoryFile() as memory:
+    with MemoryFile() as memory:
         with memory.open(**profile) as out:
             out.write(bands)
             for name, value in about.items():

@@ -87,30 +87,29 @@ def joined(tilesets: Mapping[str, dict[str, Any]]) -> dict[str, Any]:
     """
     if not tilesets:
         raise ValueError("expected one tileset or more, got none")
-    placed = [uri for uri, each in tilesets.items() if "transform" in _root(each, uri)]
-    if 0 < len(placed) < len(tilesets):
-        odd = next(uri for uri in tilesets if uri not in placed)
-        raise ValueError(f"{len(placed)} of {len(tilesets)} tilesets say where on Earth they lie, {odd} does not")
-    boxes = {
-        uri: _moved(_numbers(_root(each, uri), "box"), _transform(_root(each, uri))) for uri, each in tilesets.items()
-    }
+    roots = {uri: _root(each, uri) for uri, each in tilesets.items()}
+    elsewhere = [uri for uri, each in roots.items() if not each.on_earth]
+    if 0 < len(elsewhere) < len(roots):
+        there = len(roots) - len(elsewhere)
+        raise ValueError(f"{there} of {len(roots)} tilesets say where on Earth they lie, {elsewhere[0]} does not")
+    boxes = {uri: _moved(each.box, each.transform) for uri, each in roots.items()}
     # axes of the first box: those of the Earth's centre would be askew
     axes = boxes[next(iter(boxes))].reshape(4, 3)[1:]
     axes = axes / np.linalg.norm(axes, axis=1, keepdims=True)
     corners = np.concatenate([_corners(box) for box in boxes.values()]) @ axes.T
     whole = np.array(_box(corners.min(0), corners.max(0))).reshape(4, 3) @ axes
-    errors = {uri: float(each["geometricError"]) for uri, each in tilesets.items()}
+    error = max(each.error for each in roots.values())
     children = [
-        {"boundingVolume": {"box": box.tolist()}, "geometricError": errors[uri], "content": {"uri": uri}}
+        {"boundingVolume": {"box": box.tolist()}, "geometricError": roots[uri].error, "content": {"uri": uri}}
         for uri, box in boxes.items()
     ]
     root = {
         "boundingVolume": {"box": whole.ravel().tolist()},
-        "geometricError": max(errors.values()),
+        "geometricError": error,
         "refine": "REPLACE",
         "children": children,
     }
-    return _file(max(*errors.values(), float(np.linalg.norm(np.ptp(corners, axis=0)))), root, None)
+    return _file(max(error, float(np.linalg.norm(np.ptp(corners, axis=0)))), root, None)
 
 
 def _file(error: float, root: dict[str, Any], extras: dict[str, Any] | None) -> dict[str, Any]:
@@ -141,19 +140,24 @@ def _corners(box: Float[np.ndarray, " 12"]) -> Float[np.ndarray, "8 3"]:
     return middle + signs @ np.stack(halves)
 
 
-def _root(tiles: dict[str, Any], uri: str) -> dict[str, Any]:
+@dataclass(frozen=True)
+class _Root:
+    """What `joined` asks of a tileset: its root's box [12] and transform [4, 4], and the error of drawing nothing."""
+
+    box: Float[np.ndarray, " 12"]
+    transform: Float[np.ndarray, "4 4"]
+    on_earth: bool
+    error: float
+
+
+def _root(tiles: dict[str, Any], uri: str) -> _Root:
     try:
-        root, error = tiles["root"], tiles["geometricError"]
-        if np.shape(root["boundingVolume"]["box"]) == (12,) and float(error) >= 0:
-            return dict(root)
-    except (KeyError, TypeError, ValueError):
-        pass
-    raise ValueError(f"{uri} is no tileset with a box about its root")
-
-
-def _numbers(root: dict[str, Any], volume: str) -> Float[np.ndarray, " 12"]:
-    return np.array(root["boundingVolume"][volume], dtype=np.float64)
-
-
-def _transform(root: dict[str, Any]) -> Float[np.ndarray, "4 4"]:
-    return np.reshape(root.get("transform", np.eye(4).ravel()), (4, 4)).astype(np.float64).T
+        root, error = tiles["root"], float(tiles["geometricError"])
+        box = np.reshape(root["boundingVolume"]["box"], 12).astype(np.float64)
+        transform = np.reshape(root.get("transform", np.eye(4).ravel()), (4, 4)).astype(np.float64).T
+    except (AttributeError, KeyError, TypeError, ValueError):
+        box = transform = np.array(np.nan)
+        root, error = {}, -1.0
+    if error < 0 or not np.isfinite([error, *box.ravel(), *transform.ravel()]).all():
+        raise ValueError(f"{uri} is no tileset with a box about its root")
+    return _Root(box, transform, "transform" in root, error)
