@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from stages.artifacts import AtlasMesh
-from stages.drawing.rasterizing import NO_FACE, corner_weights, rasterize
-from stages.drawing.rendering import sample_texture
+from stages.compiling import njit
+from stages.drawing.rasterizing import rasterize
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Float32, Shaped, UInt8
@@ -77,15 +77,13 @@ def seen_from_above(
     heights = np.full((grid.height, grid.width), np.nan, np.float32)
     samples = mesh.vertices - [grid.west, grid.north, 0.0]
     samples[:, :2] *= np.array([1, -1]) * SAMPLES / grid.resolution
+    # nearest is what has the greatest value: the height, from a level below all
+    above = samples[:, 2] - samples[:, 2].min() + 1.0
     for rows, faces in _bands(samples[:, 1], mesh.faces, grid):
-        hit, colors, levels = _sampled(samples, faces, mesh.uvs, texture, known, rows, grid.width)
-        count = hit.sum((1, 3))
-        mean = np.where(hit[..., None], colors, 0).sum((1, 3)) / np.maximum(count, 1)[..., None]
-        middle = SAMPLES // 2
-        shown = hit[:, middle, :, middle]
-        picture[:3, rows][:, shown] = np.clip(mean[shown] + 0.5, 0, 255).astype(np.uint8).T
-        picture[3, rows][shown] = 255
-        heights[rows][shown] = levels[:, middle, :, middle][shown]
+        count = rows.stop - rows.start
+        xy = samples[:, :2] - [0, rows.start * SAMPLES]
+        face_map, _ = rasterize(xy, above, faces, grid.width * SAMPLES, count * SAMPLES)
+        _paint(face_map, xy, samples[:, 2], mesh.uvs, faces, texture, known, picture[:, rows], heights[rows])
     return picture, heights
 
 
@@ -100,33 +98,46 @@ def _bands(
         yield rows, faces[(last >= rows.start * SAMPLES) & (first <= rows.stop * SAMPLES)]
 
 
-def _sampled(
-    samples: Float[np.ndarray, "v 3"],
-    faces: Shaped[np.ndarray, "f 3"],
-    uvs: Float[np.ndarray, "v 2"],
-    texture: UInt8[np.ndarray, "s s 3"],
-    known: Bool[np.ndarray, "t t"],
-    rows: slice,
-    columns: int,
-) -> tuple[Bool[np.ndarray, "r k c k"], Float32[np.ndarray, "r k c k 3"], Float32[np.ndarray, "r k c k"]]:
-    """Whether something known is there, its colour and its height, at the samples of some rows of pixels."""
-    count, width = rows.stop - rows.start, columns * SAMPLES
-    height = count * SAMPLES
-    xy = samples[:, :2] - [0, rows.start * SAMPLES]
-    # nearest is what has the greatest value: the height, from a level below all
-    above = samples[:, 2] - samples[:, 2].min() + 1.0
-    face_map = rasterize(xy, above, faces, width, height)[0].ravel()
-    index = np.flatnonzero(face_map != NO_FACE)
-    centers = np.stack([index % width, index // width], 1) + 0.5
-    weights = corner_weights(xy, np.ones(len(xy)), faces, face_map[index], centers)
-    corners = faces[face_map[index]]
-    places = np.einsum("pc,pcd->pd", weights, uvs[corners])
-    side = len(known)
-    column, row = (np.clip(np.array([places[:, 0], 1 - places[:, 1]]) * side, 0, side - 1)).astype(np.int64)
-    hit, levels = np.zeros(height * width, bool), np.zeros(height * width, np.float32)
-    colors = np.zeros((height * width, 3), np.float32)
-    hit[index] = known[row, column]
-    colors[index] = sample_texture(texture, places)
-    levels[index] = (weights * samples[corners, 2]).sum(1)
-    shape = (count, SAMPLES, columns, SAMPLES)
-    return hit.reshape(shape), colors.reshape(*shape, 3), levels.reshape(shape)
+@njit(nogil=True, cache=True)
+def _paint(face_map, xy, levels, uvs, faces, texture, known, picture, heights):  # pragma: no cover - compiled
+    """Fill picture [4, H, W] and heights [H, W] from the faces at the samples [H SAMPLES, W SAMPLES]."""
+    total = np.zeros(3)
+    weight = np.zeros(3)
+    side, known_side = texture.shape[0], known.shape[0]
+    for row in range(heights.shape[0]):
+        for column in range(heights.shape[1]):
+            total[:] = 0.0
+            count = 0
+            for k in range(SAMPLES * SAMPLES):
+                y, x = row * SAMPLES + k // SAMPLES, column * SAMPLES + k % SAMPLES
+                face = face_map[y, x]
+                if face < 0:
+                    continue
+                a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]
+                px, py = x + 0.5, y + 0.5
+                area = (xy[b, 0] - xy[a, 0]) * (xy[c, 1] - xy[a, 1]) - (xy[b, 1] - xy[a, 1]) * (xy[c, 0] - xy[a, 0])
+                weight[0] = ((xy[b, 0] - px) * (xy[c, 1] - py) - (xy[b, 1] - py) * (xy[c, 0] - px)) / area
+                weight[1] = ((xy[c, 0] - px) * (xy[a, 1] - py) - (xy[c, 1] - py) * (xy[a, 0] - px)) / area
+                weight[2] = 1.0 - weight[0] - weight[1]
+                u = weight[0] * uvs[a, 0] + weight[1] * uvs[b, 0] + weight[2] * uvs[c, 0]
+                v = 1.0 - (weight[0] * uvs[a, 1] + weight[1] * uvs[b, 1] + weight[2] * uvs[c, 1])
+                i = min(max(int(v * known_side), 0), known_side - 1)
+                j = min(max(int(u * known_side), 0), known_side - 1)
+                if not known[i, j]:
+                    continue
+                tx = min(max(u * side - 0.5, 0.0), side - 1.0)
+                ty = min(max(v * side - 0.5, 0.0), side - 1.0)
+                x0, y0 = int(tx), int(ty)
+                x1, y1 = min(x0 + 1, side - 1), min(y0 + 1, side - 1)
+                fx, fy = tx - x0, ty - y0
+                for channel in range(3):
+                    upper = texture[y0, x0, channel] * (1 - fx) + texture[y0, x1, channel] * fx
+                    lower = texture[y1, x0, channel] * (1 - fx) + texture[y1, x1, channel] * fx
+                    total[channel] += upper * (1 - fy) + lower * fy
+                count += 1
+                if k == SAMPLES * SAMPLES // 2:
+                    heights[row, column] = weight[0] * levels[a] + weight[1] * levels[b] + weight[2] * levels[c]
+                    picture[3, row, column] = 255
+            if picture[3, row, column] > 0:
+                for channel in range(3):
+                    picture[channel, row, column] = np.uint8(total[channel] / count + 0.5)
