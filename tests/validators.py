@@ -46,3 +46,25 @@ def gltf_reports(files: list[Path]) -> list[dict]:
     for report in reports:
         assert (report["numErrors"], report["numWarnings"], report["numInfos"]) == (0, 0, 0), report["messages"]
     return reports
+
+
+def tileset_issues(files: list[Path]) -> list[str]:
+    """What Cesium's 3d-tiles-validator finds in tilesets and all they name; skips where it is not there.
+
+    TILES_VALIDATOR_DIR is where it was installed by npm, or its own folder where it was built.
+    """
+    folder = Path(os.environ.get("TILES_VALIDATOR_DIR", ROOT))
+    places = [folder / "node_modules" / "3d-tiles-validator" / "build" / "main.js", folder / "build" / "main.js"]
+    program = next((place for place in places if place.is_file()), None)
+    if not shutil.which("node") or program is None:
+        pytest.skip("needs node and `npm install 3d-tiles-validator`")
+    issues = []
+    for file in files:
+        done = subprocess.run(
+            ["node", str(program), "--tilesetFile", str(file)], capture_output=True, text=True, check=False, timeout=120
+        )
+        assert done.returncode == 0, done.stdout + done.stderr
+        report = json.loads(done.stdout.partition("Validation result:")[2])
+        assert report["numErrors"] + report["numWarnings"] + report["numInfos"] == len(report.get("issues", []))
+        issues += [f"{issue['type']}: {issue['message']}" for issue in report.get("issues", [])]
+    return issues

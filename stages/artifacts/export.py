@@ -7,8 +7,13 @@ from pathlib import Path
 from stages.artifacts.artifact import in_folder
 
 GEOREFERENCE, METADATA = "georeference.json", "metadata.xml"
+TILESET, ORTHOPHOTO, SURFACE_MODEL = "tileset.json", "orthophoto.tif", "dsm.tif"
 
-ASSET = in_folder("export", ("model*", "points.*", GEOREFERENCE, METADATA), lambda folder: folder)
+ASSET = in_folder(
+    "export",
+    ("model*", "points.*", GEOREFERENCE, METADATA, TILESET, ORTHOPHOTO, SURFACE_MODEL),
+    lambda folder: folder,
+)
 
 
 def asset_path(folder: Path, kind: str) -> Path:

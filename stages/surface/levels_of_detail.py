@@ -37,6 +37,19 @@ def lightened(atlas: AtlasMesh, faces: int) -> AtlasMesh:
     return _split(*next(decimate_textured(atlas.vertices, atlas.faces, atlas.uvs, [faces])), atlas)
 
 
+def deviation(light: AtlasMesh, atlas: AtlasMesh) -> float:
+    """The greatest distance between two surfaces, either way, at their vertices and the middles of their faces."""
+    return max(_farthest(light, atlas), _farthest(atlas, light))
+
+
+def _farthest(a: AtlasMesh, b: AtlasMesh) -> float:
+    """The greatest distance of points of `a` from `b`."""
+    import open3d as o3d
+
+    points = np.concatenate([a.vertices, a.vertices[a.faces].mean(1)]).astype(np.float32)
+    return float(raycaster(b.vertices, b.faces).compute_distance(o3d.core.Tensor(points)).numpy().max())
+
+
 def _split(vertices: np.ndarray, faces: np.ndarray, corner_uvs: np.ndarray, atlas: AtlasMesh) -> AtlasMesh:
     """An atlas mesh of UVs [3F, 2] for the corners of faces [F, 3]: a vertex for each position and UV."""
     vertices, corner_uvs = vertices.astype(np.float32), np.clip(corner_uvs, 0, 1).astype(np.float32)

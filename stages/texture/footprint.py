@@ -46,13 +46,28 @@ def texels_needed(density: np.ndarray, areas: np.ndarray) -> float:
         density: [F] pixels per unit of area, see `pixels_per_area`.
         areas: [F].
     """
-    shown = np.flatnonzero(density > 0)
+    return float(areas.sum() * _typical(density, areas))
+
+
+def ground_sampling(density: np.ndarray, areas: np.ndarray) -> float:
+    """Length on the surface that a pixel of the best view covers (the median); 0 where no photo shows it.
+
+    Args:
+        density: [F] pixels per unit of area, see `pixels_per_area`.
+        areas: [F] what each face counts: its area as seen from above.
+    """
+    typical = _typical(density, areas)
+    return typical**-0.5 if typical > 0 else 0.0
+
+
+def _typical(density: np.ndarray, areas: np.ndarray) -> float:
+    """The median over the area that photos show; 0 where they show none."""
+    shown = np.flatnonzero((density > 0) & (areas > 0))
     if not len(shown):
         return 0.0
     order = shown[np.argsort(density[shown])]
     cumulative = np.cumsum(areas[order])
-    typical = density[order[np.searchsorted(cumulative, cumulative[-1] / 2)]]
-    return float(areas.sum() * typical)
+    return float(density[order[np.searchsorted(cumulative, cumulative[-1] / 2)]])
 
 
 def texture_size_for(texels: float, fill: float) -> int:

@@ -150,8 +150,9 @@ def blend_texels(
     """Fill colors [T, 3] uint8 from the buffers of `gather_texels`.
 
     A view's distance d from the others is that of its low band from their weighted median. Views at d = robust_sigma *
-    1.4826 * MAD and beyond count nothing, nearer ones (1 - (./d)^2)^2 (Tukey's biweight). With `diffuse`, a view
-    that is brighter than the median is twice as far from it: a highlight adds light, and moves from photo to photo.
+    1.4826 * MAD and beyond count nothing, nearer ones (1 - (./d)^2)^2 (Tukey's biweight). Both medians go by the root
+    of the weights: what passes below the photographer is in the photos that weigh most. With `diffuse`, a view that is
+    brighter than the median is twice as far from it: a highlight adds light, and moves from photo to photo.
 
     Low band: mean of the views with the root of their weight, for sheen moves from one photo to the next and none of
     them is right. High band: with the weight, rather those that resolve the most (docs/benchmarks/textures.md). Where
@@ -161,7 +162,7 @@ def blend_texels(
     places = best_weights.shape[1]
     values, highs = np.empty((3, places), dtype=np.float32), np.empty((3, places), dtype=np.float32)
     weights, deviations = np.empty(places, dtype=np.float32), np.empty(places, dtype=np.float32)
-    up_to = np.empty(places, dtype=np.float32)
+    up_to, votes = np.empty(places, dtype=np.float32), np.empty(places, dtype=np.float32)
     median = np.empty(3)
     low = np.empty(3)
     high = np.empty(3)
@@ -187,10 +188,11 @@ def blend_texels(
             continue
         total = np.float32(0.0)
         for k in range(count):
-            total += weights[k]
+            votes[k] = np.sqrt(weights[k])
+            total += votes[k]
         half = np.float32(0.5) * total
         for c in range(3):
-            median[c] = _weighted_middle(values[c, :count], weights[:count], half, up_to)
+            median[c] = _weighted_middle(values[c, :count], votes[:count], half, up_to)
         for k in range(count):
             deviations[k] = 0.0
             for c in range(3):
@@ -200,7 +202,7 @@ def blend_texels(
                 elif diffuse:
                     off *= 2.0
                 deviations[k] = max(deviations[k], off)
-        spread = max(1.4826 * _weighted_middle(deviations[:count], weights[:count], half, up_to), NOISE_FLOOR)
+        spread = max(1.4826 * _weighted_middle(deviations[:count], votes[:count], half, up_to), NOISE_FLOOR)
         low[:] = 0.0
         high[:] = 0.0
         low_total = high_total = 0.0
@@ -208,7 +210,7 @@ def blend_texels(
             near = 1.0 - (deviations[k] / (robust_sigma * spread)) ** 2
             if near <= 0:
                 continue
-            low_weight = near * near * np.sqrt(weights[k])
+            low_weight = near * near * votes[k]
             high_weight = near * near * weights[k]
             low_total += low_weight
             high_total += high_weight

@@ -1,0 +1,28 @@
+"""`hineus tileset`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from hineus_cli.options import Json
+from hineus_cli.session import print_json
+
+
+def tileset(
+    workspaces: Annotated[
+        list[Path], typer.Argument(help="Folders of workspaces that have 3D Tiles.", show_default=False)
+    ],
+    out: Annotated[Path, typer.Option(help="The .json file to write.")] = Path("tileset.json"),
+    as_json: Json = False,
+) -> None:
+    """Write one 3D Tiles tileset over those of several workspaces (`export.tiles`)."""
+    from hineus_cli.console import say
+    from stages.tilesets import join_tilesets
+
+    told = join_tilesets(workspaces, out)
+    say(f"{told['file']}: {told['tiles']} workspaces")
+    if as_json:
+        print_json(told)
