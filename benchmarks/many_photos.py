@@ -1,4 +1,4 @@
-"""Poses of many photos: which pairs are matched, what is found, and what it costs, from 100 to 1000 photos.
+"""Poses of many photos: which pairs are matched, what is found, and what it costs, from 50 to 1000 photos.
 
 python -m benchmarks.many_photos                    all sizes with all mappers
 python -m benchmarks.many_photos --photos 100 200   of these sizes
@@ -29,7 +29,7 @@ from typing import Any
 from benchmarks.pages import NOT_MEASURED, markdown_table, write_tables
 from benchmarks.run_sets import GIB, OUT, RESULTS, ROOT
 
-SIZES = (100, 200, 400, 1000)
+SIZES = (50, 100, 200, 400, 1000)
 MAPPERS = ("global", "incremental", "hierarchical")
 FEATURES = 2000
 # Pairs of photos that both have so many features of the same points ought to be matched; a match of the whole graph
@@ -78,7 +78,7 @@ def match(folder: Path, photos: int, gps: bool) -> dict[str, Any]:
     from stages.posing.pairs import likely_pairs, match_pairs
     from stages.posing.settings import match_options
 
-    pycolmap.logging.minloglevel = 1
+    pycolmap.logging.minloglevel = 2
     survey = pickle.loads((folder / "survey.pickle").read_bytes())
     database = folder / ("plain.db" if gps else "choosing.db")
     shutil.copyfile(folder / "unmatched.db", database)
@@ -131,7 +131,7 @@ def solve(folder: Path, mapper: str) -> dict[str, Any]:
     from stages.geometry.similarity import align_points
     from stages.posing.workbench import Base, Workbench
 
-    pycolmap.logging.minloglevel = 1
+    pycolmap.logging.minloglevel = 2
     survey = pickle.loads((folder / "survey.pickle").read_bytes())
 
     class Matched(Workbench):
