@@ -18,7 +18,7 @@ NOT_MEASURED = "Not measured yet."
 # Each has `tables()`: names and Markdown.
 BENCHMARKS = (
     "run_sets", "stereo", "held_out", "textures", "hard_variants", "last_adjustment", "ablate", "suites", "growth",
-    "regions", "region_cuts", "auto_masks", "charts", "splats", "materials.tables", "what_to_expect",
+    "many_photos", "regions", "region_cuts", "auto_masks", "charts", "splats", "materials.tables", "what_to_expect",
 )  # fmt: skip
 
 

@@ -64,16 +64,21 @@ class SfmParams(Section):
 
     matcher: Literal["auto", "preemptive", "exhaustive", "sequential", "spatial"] = Field(
         "auto",
-        description="which image pairs are matched; preemptive: only pairs whose largest features match; auto: "
-        "preemptive up to `preemptive_max` photos, then spatial or sequential",
+        description="which image pairs are matched; preemptive: only pairs whose largest features match; sequential, "
+        "spatial: COLMAP's neighbours in name or in space; auto: preemptive",
     )
     preemptive_max: int = Field(
         150,
         ge=2,
         le=MOST_PHOTOS,
-        description="with more photos than this, auto matches neighbours only, in space (GPS) or in name",
+        description="up to so many photos preemptive compares all pairs; of more, those near in space (GPS), next in "
+        "name or alike. More views of 360-degree pictures than this are matched with neighbours only",
     )
-    mapper: Literal["incremental", "global"] = Field("incremental", description="how poses are solved")
+    mapper: Literal["incremental", "global", "hierarchical"] = Field(
+        "incremental",
+        description="how poses are solved; incremental: one photo after another; global: all at once; hierarchical: "
+        "incremental in overlapping clusters of photos, which are merged",
+    )
     wanted: float = Field(
         0.95,
         ge=0,

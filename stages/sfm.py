@@ -709,7 +709,7 @@ def _too_few(
 
 SFM: Stage[SfmParams] = Stage(
     name="sfm",
-    version=11,
+    version=12,
     settings=lambda config: config.sfm,
     run=run,
     reads=(PHOTOS, IMAGE_SET),

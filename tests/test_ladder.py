@@ -352,6 +352,31 @@ def test_the_rungs_are_those_that_the_capture_allows(tmp_path: Path, monkeypatch
     ]  # fmt: skip
 
 
+def test_of_many_photos_only_pairs_that_may_show_the_same_are_ever_matched(tmp_path: Path, monkeypatch):
+    asked = []
+
+    def candidates(path: Path, positions: object, seed: int) -> list[tuple[int, int]]:
+        asked.append(path.name)
+        return [(1, 2), (2, 4)]
+
+    monkeypatch.setattr("stages.posing.workbench.candidate_pairs", candidates)
+    bench = workbench(tmp_path, names=FOUR, preemptive_max=3)
+    assert (bench.matcher, bench._match_all(Base())) == (PREEMPTIVE, False)
+    assert "all pairs that may show the same" in [rung.name for rung in bench.rungs()]
+    placed = Solution(frozenset(FOUR[:3]), 10, 0.5, base=Base())
+    assert bench._pairs_to_try(Base(), None) == [(1, 2), (2, 4)]
+    assert bench._pairs_to_try(Base(), placed) == [(2, 4)]
+    compared = []
+    monkeypatch.setattr("stages.posing.workbench.likely_pairs", lambda path, among: compared.append(among) or [])
+    bench._match(Base())
+    assert compared == [[(1, 2), (2, 4)]]
+    assert asked == ["plain.db"]  # once for these features
+    (tmp_path / "few").mkdir()
+    few = workbench(tmp_path / "few", names=FOUR, preemptive_max=4)
+    assert few._among(Base()) is None
+    assert len(few._pairs_to_try(Base(), None)) == 6
+
+
 def test_a_focal_length_that_the_poses_contradict_is_noticed(tmp_path: Path):
     import pycolmap
 

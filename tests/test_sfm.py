@@ -184,8 +184,11 @@ def test_photos_of_one_gps_position_are_no_neighbours_in_space():
     assert count_located([everywhere[0]] * 200) == 1
     assert count_located([]) == 0
     params = SfmParams()
-    assert choose_matcher(params, count_located(everywhere), 200) == "spatial"
-    assert choose_matcher(params, count_located([everywhere[0]] * 200), 200) == "sequential"
+    assert choose_matcher(params, count_located(everywhere), 200) == "preemptive"
+    # views of 360-degree pictures
+    assert choose_matcher(params, count_located(everywhere), 200, at_once=6) == "spatial"
+    assert choose_matcher(params, count_located([everywhere[0]] * 200), 200, at_once=6) == "sequential"
+    assert choose_matcher(params, 0, 60, at_once=6) == "exhaustive"
 
 
 def test_spatial_matching_without_gps_positions(tmp_path: Path):

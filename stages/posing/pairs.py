@@ -9,6 +9,7 @@ two passes around something they are all of the same one. So some of the further
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from itertools import combinations
@@ -18,7 +19,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 if TYPE_CHECKING:
-    from jaxtyping import Float, Int
+    from jaxtyping import Float, Int, Num, UInt8
+
+log = logging.getLogger(__name__)
 
 PREEMPTIVE, EXHAUSTIVE = "preemptive", "exhaustive"  # matchers, as `sfm.matcher` names them
 LARGEST = 300  # features of each photo that are looked at
@@ -31,29 +34,43 @@ TREES = 8  # pairs, at least, by which any some photos are connected with the re
 NEXT = 2  # photos to each side in the order of names are partners, too: most captures are a walk
 BEST = 3  # partners that share most are near a photo, with those next to it
 AT_ONCE = 64  # photos that one is compared with in one product
+NOT_COMPARED = -1
+# Where not all pairs are compared, so many times those are, too, that share a partner among the best of both.
+GROWTHS, THIRD_PARTIES = 2, 10
 # COLMAP's tests of a match, as angles between descriptors: to the nearest one, and to it over that to the second.
 MAX_ANGLE, MAX_RATIO = 0.7, 0.8
 
 
-def likely_pairs(database: Path) -> list[tuple[int, int]]:
-    """Pairs of image ids, sorted, the first of each the smaller one."""
-    ids, names, common = common_in(database)
+def likely_pairs(database: Path, among: Collection[tuple[int, int]] | None = None) -> list[tuple[int, int]]:
+    """Pairs of image ids, sorted, the first of each the smaller one.
+
+    Args:
+        among: the pairs that are compared; all without.
+    """
+    ids, names, common = common_in(database, among)
     chosen = {*choose_pairs(common), *_next_in_name(names)}
+    log.info("%d pairs are matched, %.1f a photo, of %d", len(chosen), 2 * len(chosen) / max(len(ids), 1),
+             len(among) if among is not None else len(ids) * (len(ids) - 1) // 2)  # fmt: skip
     return [(ids[i], ids[j]) for i, j in sorted(chosen)]
 
 
-def near_pairs(database: Path, left_out: Collection[str]) -> list[tuple[int, int]]:
+def near_pairs(
+    database: Path, left_out: Collection[str], among: Collection[tuple[int, int]] | None = None
+) -> list[tuple[int, int]]:
     """Pairs among each of some photos and the few likely to show the same: the best partners, and those next in name.
+
+    Args:
+        among: the pairs that are compared; all without.
 
     Returns:
         Pairs of image ids, sorted, the first of each the smaller one.
     """
-    ids, names, common = common_in(database)
+    ids, names, common = common_in(database, among)
     beside = _next_in_name(names)
     pairs = set[tuple[int, int]]()
     for i, name in enumerate(names):
         if name in left_out:
-            best = [int(j) for j in np.argsort(-common[i], kind="stable") if j != i][:BEST]
+            best = [int(j) for j in np.argsort(-common[i], kind="stable") if j != i and common[i, j] >= 0][:BEST]
             group = {i, *best, *(j for pair in beside if i in pair for j in pair)}
             pairs |= set(combinations(sorted(group), 2))
     return [(ids[i], ids[j]) for i, j in sorted(pairs)]
@@ -67,51 +84,89 @@ def _next_in_name(names: Sequence[str]) -> set[tuple[int, int]]:
     }  # fmt: skip
 
 
-def common_in(database: Path) -> tuple[list[int], list[str], Int[np.ndarray, "n n"]]:
-    """Ids and names of a database's images, and how many of the largest features of each two match."""
+def in_order(first: int, second: int) -> tuple[int, int]:
+    """A pair, the smaller one first."""
+    return min(first, second), max(first, second)
+
+
+def common_in(
+    database: Path, among: Collection[tuple[int, int]] | None = None
+) -> tuple[list[int], list[str], Int[np.ndarray, "n n"]]:
+    """Ids and names of a database's images, and how many of the largest features of each two match.
+
+    Args:
+        among: pairs of image ids that are compared, with partners of partners; all without.
+    """
     import pycolmap
 
     with pycolmap.Database.open(database) as opened:
         images = sorted(opened.read_all_images(), key=lambda image: image.image_id)
         ids = [image.image_id for image in images]
-        common = common_features([largest_descriptors(opened, image_id) for image_id in ids])
+        descriptors = [largest_descriptors(opened, image_id, LARGEST) for image_id in ids]
+    places = {image_id: place for place, image_id in enumerate(ids)}
+    if among is None:
+        return ids, [image.name for image in images], common_features(descriptors)
+    common = common_features(descriptors, [in_order(places[i], places[j]) for i, j in among])
+    for _ in range(GROWTHS):
+        further = common_features(descriptors, partners_of_partners(common))
+        common = np.maximum(common, further)
     return ids, [image.name for image in images], common
 
 
-def largest_descriptors(database: Any, image_id: int) -> Float[np.ndarray, "k 128"]:
+def partners_of_partners(common: Int[np.ndarray, "n n"]) -> list[tuple[int, int]]:
+    """Pairs (i < j) not compared so far of photos that both share much with a third one.
+
+    Args:
+        common: how many features each two photos have in common, see `common_features`.
+    """
+    best = np.argsort(-common, axis=1, kind="stable")[:, :THIRD_PARTIES]
+    clear = [[j for j in row if common[i, j] >= CLEAR] for i, row in enumerate(best.tolist())]
+    both = {in_order(i, k) for i, own in enumerate(clear) for j in own for k in clear[j] if k != i}
+    return sorted((i, k) for i, k in both if common[i, k] == NOT_COMPARED)
+
+
+def largest_descriptors(database: Any, image_id: int, count: int) -> UInt8[np.ndarray, "k 128"]:
     """Descriptors of the largest features of an image of an open COLMAP database, whole numbers.
 
     Features that match nothing (see `stages.posing.features.append`), whose descriptors are zero, are passed over.
     """
     if not database.num_descriptors_for_image(image_id):
-        return np.zeros((0, 128), np.float32)
+        return np.zeros((0, 128), np.uint8)
     keypoints = database.read_keypoints(image_id)
     areas = np.abs(keypoints[:, 2] * keypoints[:, 5] - keypoints[:, 3] * keypoints[:, 4])
     descriptors = np.asarray(database.read_descriptors(image_id).data)
     order = np.argsort(-areas, kind="stable")
     known = np.asarray(descriptors.any(axis=1))
-    return descriptors[order[known[order]][:LARGEST]].astype(np.float32)
+    return descriptors[order[known[order]][:count]]
 
 
-def common_features(descriptors: list[Float[np.ndarray, "_ 128"]]) -> Int[np.ndarray, "n n"]:
-    """How many features of each two photos match.
+def common_features(
+    descriptors: Sequence[Num[np.ndarray, "_ 128"]], among: Iterable[tuple[int, int]] | None = None
+) -> Int[np.ndarray, "n n"]:
+    """How many features of each two photos match; `NOT_COMPARED` where that was not looked at.
 
     Descriptors are whole numbers up to 255, so that their products are exact, whatever the number of threads.
+
+    Args:
+        among: pairs (i < j) of photos that are compared; all without.
     """
     number = len(descriptors)
-    common = np.zeros((number, number), np.int64)
-    ends = np.cumsum([len(each) for each in descriptors])
-    stacked = np.concatenate(descriptors) if descriptors else np.zeros((0, 128), np.float32)
-    lengths = np.maximum(np.linalg.norm(stacked, axis=1), 1)
-    for i, own in enumerate(descriptors):
+    partners: list[list[int]] = [list(range(i + 1, number)) if among is None else [] for i in range(number)]
+    for i, j in sorted(among or ()):
+        partners[i].append(j)
+    common = np.full((number, number), 0 if among is None else NOT_COMPARED, np.int32)
+    np.fill_diagonal(common, 0)
+    lengths = [np.maximum(np.linalg.norm(each.astype(np.float32), axis=1), 1) for each in descriptors]
+    for i, later in enumerate(partners):
+        own = descriptors[i].astype(np.float32)
         # of one photo and many later ones at once: many small products would lose their time between threads
-        for start in range(i + 1, number, AT_ONCE):
-            stop = min(start + AT_ONCE, number)
-            others = slice(ends[start - 1], ends[stop - 1])
-            cosines = own @ stacked[others].T
-            cosines /= lengths[ends[i] - len(own) : ends[i], None]
-            cosines /= lengths[others]
-            for j, block in enumerate(np.split(cosines, ends[start : stop - 1] - ends[start - 1], axis=1), start):
+        for start in range(0, len(later), AT_ONCE):
+            some = later[start : start + AT_ONCE]
+            cosines = own @ np.concatenate([descriptors[j] for j in some]).astype(np.float32).T
+            cosines /= lengths[i][:, None]
+            cosines /= np.concatenate([lengths[j] for j in some])
+            ends = np.cumsum([len(descriptors[j]) for j in some])
+            for j, block in zip(some, np.split(cosines, ends[:-1], axis=1), strict=True):
                 common[i, j] = common[j, i] = count_matches(block)
     return common
 
@@ -136,14 +191,14 @@ def choose_pairs(common: Int[np.ndarray, "n n"]) -> list[tuple[int, int]]:
     """Pairs (i < j) to match, given how many features each two photos have in common."""
     chosen = set(_connecting(common))
     for i in range(len(common)):
-        chosen |= {(min(i, j), max(i, j)) for j in _partners(common, i)}
+        chosen |= {in_order(i, j) for j in _partners(common, i)}
     return sorted(chosen)
 
 
 def _partners(common: Int[np.ndarray, "n n"], i: int) -> list[int]:
     """The best partners of one photo, and some of its further clear ones."""
     own = common[i]
-    ranked = [int(j) for j in np.argsort(-own, kind="stable") if j != i]
+    ranked = [int(j) for j in np.argsort(-own, kind="stable") if j != i and own[j] != NOT_COMPARED]
     clear = [j for j in ranked if own[j] >= CLEAR]
     partners, further = ranked[: max(LEAST, min(MOST, len(clear)))], clear[MOST:]
     if further:
@@ -159,14 +214,18 @@ def _partners(common: Int[np.ndarray, "n n"], i: int) -> list[int]:
 
 def _connecting(common: Int[np.ndarray, "n n"]) -> list[tuple[int, int]]:
     """Spanning trees whose pairs have most in common, one after another, each of pairs that those before left."""
+    from scipy.sparse import csr_array
     from scipy.sparse.csgraph import minimum_spanning_tree
 
-    costs = np.triu(common.max(initial=0) + 1 - common, 1)  # above zero, which would be no edge
+    first, second = np.nonzero(np.triu(common != NOT_COMPARED, 1))
+    weights = common.max(initial=0) + 1 - common[first, second]  # above zero, which would be no edge
+    costs = csr_array((weights, (first, second)), shape=common.shape)
     found = []
     for _ in range(TREES):
-        first, second = minimum_spanning_tree(costs).nonzero()
-        found += [(min(i, j), max(i, j)) for i, j in zip(first.tolist(), second.tolist(), strict=True)]
-        costs[first, second] = 0
+        tree = minimum_spanning_tree(costs)
+        found += [in_order(i, j) for i, j in zip(*(ends.tolist() for ends in tree.nonzero()), strict=True)]
+        costs = costs - csr_array(tree)
+        costs.eliminate_zeros()
     return found
 
 

@@ -208,17 +208,16 @@ def _matched(database: Path) -> tuple[dict[Names, Pair], bool]:
         lenses = {camera.camera_id: camera for camera in opened.read_all_cameras()}
         images = {image.image_id: image for image in opened.read_all_images()}
         known = [lenses[image.camera_id].has_prior_focal_length for image in images.values()]
-        places = {i: _places(opened.read_keypoints(i), lenses[image.camera_id]) for i, image in images.items()}
         pair_ids, counts = opened.read_two_view_geometry_num_inliers()
         enough = [pair for pair, count in zip(pair_ids, counts, strict=True) if count >= 2 * MIN_VERIFIED]
         for pair_id in enough[:: -(-len(enough) // MAX_PAIRS) or 1]:
             first, second = pycolmap.pair_id_to_image_pair(pair_id)
             matches = opened.read_two_view_geometry(first, second).inlier_matches
             matches = matches[:: -(-len(matches) // MAX_MATCHES)]
-            lens = lenses[images[first].camera_id]
+            lens, other = (lenses[images[i].camera_id] for i in (first, second))
             pairs[images[first].name, images[second].name] = Pair(
-                places[first][matches[:, 0]],
-                places[second][matches[:, 1]],
+                _places(opened.read_keypoints(first)[matches[:, 0]], lens),
+                _places(opened.read_keypoints(second)[matches[:, 1]], other),
                 max(lens.width, lens.height) / lens.mean_focal_length(),
             )
     return pairs, 2 * sum(known) > len(known)

