@@ -11,6 +11,7 @@ import shutil
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Set as AbstractSet
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
@@ -456,7 +457,7 @@ class Workbench:
         """Image ids of all pairs with a photo that has no pose; of all pairs where no photo has one."""
         return self._pairs_with(base, self.names - (frozenset() if best is None else best.registered))
 
-    def _pairs_with(self, base: Base, names: Collection[str]) -> list[tuple[int, int]]:
+    def _pairs_with(self, base: Base, names: AbstractSet[str]) -> list[tuple[int, int]]:
         """Image ids of all pairs with one of these photos; of many photos, of those that may show the same."""
         import pycolmap
 
