@@ -225,7 +225,7 @@ class Workbench:
             forget_focal_priors(self.database(base), self.params.camera_model, self._known)
         self._features_and_matches(base, best)
         if self.matcher == PREEMPTIVE:  # few of the likely partners of a new photo may be known ones
-            self._match_pairs(base, self._pairs_with(base, self.known.new))
+            self._match_pairs(base, self._pairs_with(base, frozenset(self.known.new)))
         self.depth = judge_depth(self.database())
         if not self.known.changed:
             return self._solution_of(base, [renamed_model(self.known)])
