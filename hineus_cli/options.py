@@ -178,6 +178,39 @@ Blocks = Annotated[
 ]
 
 
+Jobs = Annotated[
+    int | None,
+    typer.Option(
+        min=1,
+        max=100_000,
+        help="With --blocks: how many blocks are worked on at once; default: 1. More need hineus[cluster].",
+        show_default=False,
+    ),
+]
+Executor = Annotated[
+    str | None,
+    typer.Option(
+        metavar="local|slurm",
+        help="With --blocks: where Snakemake runs them. Its other executors go by the names of their plugins. "
+        "All machines must see the workspace, the photos and this environment.",
+        show_default=False,
+    ),
+]
+
+
+def refuse_without_blocks(jobs: int | None, executor: str | None) -> None:
+    """
+    Raises:
+        ConfigError: one of these is given.
+    """
+    for option, value in (("--jobs", jobs), ("--executor", executor)):
+        if value is not None:
+            raise ConfigError(
+                f"`{option}` says how blocks are run, and there are none.",
+                f"Add `--blocks auto`, or leave out `{option}`.",
+            )
+
+
 def block_count(text: str) -> int | None:
     """ "auto", which is None, or a number of blocks.
 

@@ -124,15 +124,8 @@ def reconstruct_in_blocks(
     Raises:
         HineusError: the whole has no poses or cannot be cut. What fails in a block is in its outcome.
     """
-    for option, value in (("--from", request.from_stage), ("--until", request.until), ("--force", request.force)):
-        if value:
-            raise ConfigError(
-                f"`{option}` does not go with `--blocks`.",
-                "Use it on the whole without `--blocks`, or on the workspace of one block.",
-            )
-    whole = reconstruct(replace(request, until=PLACE.name), pipeline, listener)
+    whole, plan = poses_and_plan(request, count, pipeline, listener)
     root = whole.workspace.root
-    plan = divide(root, count)
     steps, failed = steps_of(plan), dict[str, HineusError]()
     runs: dict[str, Reconstruction] = {}
     for number, step in enumerate(steps, 1):
@@ -149,6 +142,24 @@ def reconstruct_in_blocks(
             failed[step.name] = told = _told(error)
             log.error("block %s failed: %s %s", step.block, told.message, told.hint)
     return BlockRuns(whole, plan, tuple(_outcomes(root, plan, steps, failed, runs)))
+
+
+def poses_and_plan(
+    request: Request, count: int | None, pipeline: Sequence[Stage[Any]], listener: Listener | None
+) -> tuple[Reconstruction, BlockPlan]:
+    """What comes before all blocks: poses of all photos, and the cut.
+
+    Raises:
+        HineusError: see `reconstruct_in_blocks`.
+    """
+    for option, value in (("--from", request.from_stage), ("--until", request.until), ("--force", request.force)):
+        if value:
+            raise ConfigError(
+                f"`{option}` does not go with `--blocks`.",
+                "Use it on the whole without `--blocks`, or on the workspace of one block.",
+            )
+    whole = reconstruct(replace(request, until=PLACE.name), pipeline, listener)
+    return whole, divide(whole.workspace.root, count)
 
 
 def _told(error: Exception) -> HineusError:

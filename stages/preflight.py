@@ -225,14 +225,31 @@ def estimate(seen: Inspection, config: Config, device: str, workers: int) -> Nee
     sfm_gib = SFM_BASE_GIB + workers * SFM_GIB_PER_THREAD_MP * max(looked_at, default=0) / 1e6
     masks_bytes = bytes_to_read_masks(seen.masks.files.values())
     read_gib = max([masks_bytes, *(photo.bytes_to_read for photo in seen.photos)]) / GIB
-    stereo_gib = STEREO_BASE_GIB + STEREO_GIB_PER_MP * compared / 1e6
-    later_gib = MEMORY_BASE_GIB + MEMORY_OF_PHOTOS * 3 * trained_on / GIB
     made_bytes = DISK_BYTES_PER_PIXEL * trained_on + STEREO_BYTES_PER_PIXEL * compared
     return Needs(
-        memory_gib=max(read_gib, sfm_gib, stereo_gib, later_gib),
+        memory_gib=max(read_gib, sfm_gib, _learning_gib(trained_on, compared, config)),
         disk_gb=DISK_BASE_GB + (seen.num_bytes + made_bytes + FEATURE_BYTES_PER_PIXEL * sum(looked_at)) / 1e9,
         minutes=_minutes(looked_at, compared, config, workers) if device == "cpu" else None,
     )
+
+
+def _learning_gib(trained_on: float, compared: float, config: Config) -> float:
+    """Peak of all that follows the poses, for so many pixels."""
+    stereo_gib = 0.0 if config.densify.method == "off" else STEREO_BASE_GIB + STEREO_GIB_PER_MP * compared / 1e6
+    return max(stereo_gib, MEMORY_BASE_GIB + MEMORY_OF_PHOTOS * 3 * trained_on / GIB)
+
+
+def memory_asked_for(sizes: Sequence[tuple[int, int]], config: Config) -> int:
+    """Bytes of memory that a process with these photos, whose poses are known, asks of whoever shares memory out.
+
+    Args:
+        sizes: width and height of photos as ingest takes them.
+    """
+    trained_on, compared = (
+        sum(w * h * min(1.0, most / max(w, h)) ** 2 for w, h in sizes)
+        for most in (config.undistort.max_side, min(config.undistort.max_side, config.densify.side))
+    )
+    return int(MEMORY_MARGIN * GIB * _learning_gib(trained_on, compared, config))
 
 
 def photos_held(sizes: Sequence[tuple[int, int]], config: Config, memory_gib: float) -> int:

@@ -86,7 +86,7 @@ def reconstruct(request: Request, pipeline: Sequence[Stage], listener: Listener 
     sources = choose_sources(request, workspace, digests)
     preset, config = choose_config(request, workspace, digests)
     device = choose_device(request.device)
-    with workspace.lock(), log_to_file(workspace.log_path), temporary_files(workspace.root / ".work"):
+    with workspace.lock(request.wait), log_to_file(workspace.log_path), temporary_files(workspace.root / ".work"):
         with storage_errors(workspace.root, "keeping the photos' digests"):
             digests.save()
         _tell_sources(request, workspace, sources)

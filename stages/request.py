@@ -25,6 +25,7 @@ class Request:
         from_stage, until, force: see `run_pipeline`.
         device: "auto", "cpu" or "cuda".
         workers: CPU threads; default all that this process may use.
+        wait: until no other process works in the workspace, instead of an error.
     """
 
     photos: Path | None = None
@@ -46,3 +47,4 @@ class Request:
     force: Sequence[str] = ()
     device: str = "auto"
     workers: int | None = None
+    wait: bool = False

@@ -9,7 +9,17 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from hineus_cli.completing import stage_names
-from hineus_cli.options import Blocks, Json, Until, Verbose, block_count, with_options_of_a_run
+from hineus_cli.options import (
+    Blocks,
+    Executor,
+    Jobs,
+    Json,
+    Until,
+    Verbose,
+    block_count,
+    refuse_without_blocks,
+    with_options_of_a_run,
+)
 from hineus_cli.session import Session, as_argument, print_json
 from stages.engine.stage import Stage
 from stages.request import Request
@@ -37,15 +47,21 @@ def run(
         typer.Option(help="Run this stage even if fresh. Repeatable.", show_default=False, autocompletion=stage_names),
     ] = None,
     blocks: Blocks = None,
+    jobs: Jobs = None,
+    executor: Executor = None,
+    wait: Annotated[
+        bool, typer.Option("--wait", help="Wait until no other process works in the workspace, instead of an error.")
+    ] = False,
     as_json: Json = False,
     verbose: Verbose = False,
 ) -> None:
     """Photos to a textured asset: run every stage that is not up to date."""
-    asked = replace(request, from_stage=from_stage, until=until, force=tuple(force or ()))
+    asked = replace(request, from_stage=from_stage, until=until, force=tuple(force or ()), wait=wait)
     if blocks is None:
+        refuse_without_blocks(jobs, executor)
         _run(context.obj, asked, verbose)
     else:
-        _run_in_blocks(context.obj, asked, block_count(blocks), verbose)
+        _run_in_blocks(context.obj, asked, block_count(blocks), jobs, executor, verbose)
 
 
 def stage_command(stage: Stage) -> Callable[..., None]:
@@ -85,12 +101,20 @@ def _run(session: Session, request: Request, verbose: bool) -> None:
         print_json(result.as_dict())
 
 
-def _run_in_blocks(session: Session, request: Request, count: int | None, verbose: bool) -> None:
+def _run_in_blocks(
+    session: Session, request: Request, count: int | None, jobs: int | None, executor: str | None, verbose: bool
+) -> None:
     from hineus_cli.console import block_outcome_table, people, say
     from stages.block_by_block import reconstruct_in_blocks
+    from stages.block_jobs import reconstruct_at_once
+    from stages.workflow import LOCAL, Capacity
 
     with session.running(verbose) as progress:
-        result = reconstruct_in_blocks(request, count, session.pipeline, progress)
+        if executor is None and jobs in (None, 1):
+            result = reconstruct_in_blocks(request, count, session.pipeline, progress)
+        else:
+            capacity = Capacity(jobs or 1, executor or LOCAL, request.workers)
+            result = reconstruct_at_once(request, count, capacity, session.pipeline, progress)
     people().print(block_outcome_table(result.outcomes))
     if failure := result.failure():
         raise failure

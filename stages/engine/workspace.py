@@ -16,10 +16,12 @@ from __future__ import annotations
 
 import errno
 import json
+import logging
 import os
 import shlex
 import shutil
 import socket
+import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
@@ -53,6 +55,8 @@ from stages.inputs.folders import WORKSPACE_RECORD, is_workspace, readable
 from stages.inputs.texts import parse_json
 from stages.limits import largest_file
 
+log = logging.getLogger(__name__)
+
 FORMAT = 1
 LOCK, WORK, LOG, CONFIG = ".lock", ".work", "hineus.log", "config.yaml"
 # What lies beside the stages' folders; of those in the first row the contents are changed where they lie.
@@ -64,6 +68,7 @@ WORKSPACE_SUFFIX = "_hineus"  # of the folder that is made beside photos
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 NOT_OF_THE_DISK = (errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.EAGAIN)  # told as what ran out
 MOST_PID = 1 << 31
+WAIT_S = 1.0  # between two looks whether a lock is free
 LOCKS_UNSUPPORTED = (errno.ENOLCK, errno.ENOTSUP, errno.ENOSYS)
 
 DATABASE_PAGE = 4096
@@ -162,8 +167,11 @@ class Workspace:
 
     # ------------------------------------------------------------ lock
     @contextmanager
-    def lock(self) -> Iterator[None]:
+    def lock(self, wait: bool = False) -> Iterator[None]:
         """Hold the workspace alone; nests within one object. The kernel frees it however the process ends.
+
+        Args:
+            wait: until no other process holds it.
 
         Raises:
             WorkspaceError: another process holds it, the folder cannot be written, or writing in it would change
@@ -178,7 +186,7 @@ class Workspace:
             (self.root / WORK).mkdir(exist_ok=True)
             descriptor = open_own(self.root / LOCK, os.O_RDWR | os.O_CREAT)
         try:
-            self._take(descriptor)
+            self._take(descriptor, wait)
             self._locked = True
             try:
                 yield
@@ -189,11 +197,15 @@ class Workspace:
             self._locked = False
             os.close(descriptor)
 
-    def _take(self, descriptor: int) -> None:
+    def _take(self, descriptor: int, wait: bool) -> None:
         try:
             take(descriptor)
         except BlockingIOError:
-            raise _busy_error(self.root, _lock_holder(self.root)) from None
+            busy = _busy_error(self.root, _lock_holder(self.root))
+            if not wait:
+                raise busy from None
+            log.info("%s Waiting for its end.", busy.message)
+            _take_in_turn(descriptor)
         except OSError as error:
             # Some network file systems have no locks. Working without one is better than not working.
             if error.errno not in LOCKS_UNSUPPORTED:
@@ -386,6 +398,13 @@ def _lock_holder(root: Path) -> _Holder | None:
         return _Holder(pid, str(data["host"]), str(data["since"])) if 0 < pid < MOST_PID else None
     except (OSError, ValueError, KeyError, TypeError):
         return None
+
+
+def _take_in_turn(descriptor: int) -> None:
+    while True:
+        time.sleep(WAIT_S)
+        with suppress(BlockingIOError):
+            return take(descriptor)
 
 
 def _busy_error(root: Path, holder: _Holder | None) -> WorkspaceError:
