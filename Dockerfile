@@ -16,7 +16,7 @@ ARG TORCH=torch==2.13.0
 ARG TORCH_INDEX=https://download.pytorch.org/whl/cpu
 RUN /opt/hineus/bin/pip install --no-cache-dir --index-url "${TORCH_INDEX}" "${TORCH}"
 COPY . /source
-ARG EXTRAS=raw,collision,masks,features,geo
+ARG EXTRAS=raw,collision,masks,features,geo,survey
 RUN /opt/hineus/bin/pip install --no-cache-dir "/source[${EXTRAS}]"
 
 FROM ${BASE}

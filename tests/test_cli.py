@@ -179,7 +179,7 @@ def test_run_and_every_stage_have_the_same_options(folder: Path) -> None:
 
     commands = get_command(build_app(TOY)).commands
     names = {name: [parameter.name for parameter in commands[name].params] for name in ("run", "sfm")}
-    only_run = {"from_stage", "until"}
+    only_run = {"from_stage", "until", "blocks", "jobs", "executor", "wait"}
     assert [name for name in names["run"] if name not in only_run] == names["sfm"]
     assert all(parameter.help for parameter in commands["sfm"].params)
 

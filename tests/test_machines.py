@@ -504,8 +504,8 @@ def test_doctor_looks_at_every_dependency() -> None:
         each.split(">")[0] for name in extras for each in extras[name] if name not in ("dev", "bench", "triton")
     }
     assert for_users == {distribution for distribution, _ in machine_check.OPTIONAL.values()}
-    # the image is for the CPU, and what `splats` brings is for GPUs
-    in_image = [name for name in extras if name not in ("dev", "bench", "triton", "splats")]
+    # the image is for one CPU machine: what `splats` brings is for GPUs, and `cluster` starts other processes
+    in_image = [name for name in extras if name not in ("dev", "bench", "triton", "splats", "cluster")]
     container = (REPOSITORY / "Dockerfile").read_text(encoding="utf-8")
     assert f"ARG EXTRAS={','.join(in_image)}\n" in container
     assert all(package in container for package in SYSTEM_LIBRARIES.values())

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -223,6 +224,20 @@ def test_the_command_joins_workspaces(tmp_path, monkeypatch):
     made = json.loads((tmp_path / "all" / "tiles.json").read_text())
     uris = [child["content"]["uri"] for child in made["root"]["children"]]
     assert uris == ["../a/export/tileset.json", "../b%202/export/tileset.json"]
+
+
+def test_a_scene_in_blocks_has_a_tileset_over_all_of_them(tmp_path, monkeypatch):
+    from stages import tilesets
+
+    for name in ("b00", "b01"):
+        with_tiles(tmp_path / "whole" / "blocks" / name, None)
+    blocks = [SimpleNamespace(name=name) for name in ("b00", "b01")]
+    monkeypatch.setattr(tilesets, "read_plan", lambda root: SimpleNamespace(blocks=blocks))
+    told = tilesets.join_tilesets([tmp_path / "whole"], tmp_path / "whole" / "tileset.json")
+    assert told["tiles"] == 2
+    made = json.loads((tmp_path / "whole" / "tileset.json").read_text())
+    uris = [child["content"]["uri"] for child in made["root"]["children"]]
+    assert uris == ["blocks/b00/export/tileset.json", "blocks/b01/export/tileset.json"]
 
 
 def test_what_the_command_cannot_join_is_told(tmp_path, monkeypatch):

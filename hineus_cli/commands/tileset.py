@@ -13,7 +13,8 @@ from hineus_cli.session import print_json
 
 def tileset(
     workspaces: Annotated[
-        list[Path], typer.Argument(help="Folders of workspaces that have 3D Tiles.", show_default=False)
+        list[Path],
+        typer.Argument(help="Folders of workspaces that have 3D Tiles, or of one in blocks.", show_default=False),
     ],
     out: Annotated[Path, typer.Option(help="The .json file to write.")] = Path("tileset.json"),
     as_json: Json = False,

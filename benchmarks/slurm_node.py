@@ -1,0 +1,285 @@
+"""Blocks on a cluster of one node: a Slurm of our own, a run through it, and what becomes of it when the node dies.
+
+python -m benchmarks.slurm_node [--seconds 20]
+
+Needs Debian's slurm-wlm and munge (`apt-get install slurm-wlm munge`), hineus[cluster], and root. Everything lies in a
+temporary folder; nothing is left running. The run is a plan of two blocks: four steps that count seconds in a file and
+go on from there, as training does from its checkpoint. In the middle of the first the node dies: its daemon, the jobs
+and all below them are killed at once. Later it comes back. What is told at the end: how often each step was begun,
+whether the run finished, and how many seconds were counted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+import psutil
+
+from stages.block_by_block import Step
+from stages.block_jobs import Job, run_jobs
+from stages.workflow import Capacity
+
+PROGRAMS = ("munged", "slurmctld", "slurmd", "sbatch")
+NODE = "one"
+CONTROLLER_PORT, NODE_PORT = 26817, 26818
+LOST_AFTER_S = 10  # a node that says nothing for so long is down
+PATIENCE_S = 60.0
+CONFIGURATION = """\
+ClusterName=benchmark
+SlurmctldHost={host}(127.0.0.1)
+SlurmctldPort={controller_port}
+SlurmdPort={node_port}
+AuthType=auth/munge
+AuthInfo=socket={folder}/munge.socket
+CredType=cred/munge
+SlurmUser=root
+SlurmdUser=root
+StateSaveLocation={folder}/state
+SlurmdSpoolDir={folder}/spool
+SlurmctldPidFile={folder}/slurmctld.pid
+SlurmdPidFile={folder}/slurmd.pid
+SlurmctldLogFile={folder}/slurmctld.log
+SlurmdLogFile={folder}/slurmd.log
+ProctrackType=proctrack/linuxproc
+TaskPlugin=task/none
+MpiDefault=none
+SelectType=select/cons_tres
+SelectTypeParameters=CR_Core_Memory
+SchedulerParameters=defer,batch_sched_delay=1,sched_interval=2
+SlurmdTimeout={lost_after}
+ReturnToService=2
+NodeName={node} NodeHostname={host} NodeAddr=127.0.0.1 CPUs={cores} RealMemory={memory}
+PartitionName=all Nodes={node} Default=YES MaxTime=INFINITE State=UP
+"""
+# Without a database of accounts; on a real cluster such a profile names partition and account (docs/large-scenes.md).
+PROFILE = """\
+slurm-no-account: true
+slurm-status-command: squeue
+slurm-init-seconds-before-status-checks: 2
+default-resources:
+  slurm_partition: all
+"""
+# Counts seconds in a file and goes on from what is there; notes when it begins and ends.
+STEP = """
+import sys, time
+from pathlib import Path
+name, folder, seconds = sys.argv[1], Path(sys.argv[2]), int(sys.argv[3])
+count = folder / f"{name}.count"
+def note(what):
+    with (folder / "journal").open("a") as journal:
+        journal.write(f"{what} {name}\\n")
+def counted():
+    return int(count.read_text() or 0) if count.exists() else 0
+note("begun")
+while counted() < seconds:
+    time.sleep(1)
+    count.write_text(str(counted() + 1))
+    note("counted")
+note("done")
+"""
+
+
+def is_possible() -> bool:
+    """Whether such a Slurm can be started here."""
+    from importlib.util import find_spec
+
+    return (
+        all(shutil.which(name) or Path("/usr/sbin", name).exists() for name in PROGRAMS)
+        and os.geteuid() == 0
+        and find_spec("snakemake_executor_plugin_slurm") is not None
+    )
+
+
+@dataclass(frozen=True)
+class SlurmNode:
+    """A controller and one node.
+
+    Attributes:
+        folder: with all of their files. environment: in which Slurm's commands find them.
+    """
+
+    folder: Path
+    environment: Mapping[str, str]
+
+    def start_node(self) -> None:
+        self._start("slurmd", "-N", NODE, "-f", str(self.folder / "slurm.conf"))
+
+    def kill_node(self) -> None:
+        """As if its power went: the daemon, the jobs and all below them."""
+        if not (self.folder / "slurmd.pid").exists():
+            return
+        daemon = psutil.Process(int((self.folder / "slurmd.pid").read_text()))
+        steps = [
+            each for each in psutil.process_iter(["name"]) if each.info["name"] == "slurmstepd" and self._is_ours(each)
+        ]
+        for process in [daemon, *steps, *(below for step in steps for below in step.children(recursive=True))]:
+            with _gone_is_fine():
+                process.send_signal(signal.SIGKILL)
+
+    def told(self, *command: str) -> str:
+        """What one of Slurm's commands says; nothing where its daemons do not answer yet."""
+        return subprocess.run(
+            command, env=dict(self.environment), capture_output=True, text=True, check=False, timeout=PATIENCE_S
+        ).stdout.strip()
+
+    def await_state(self, state: str) -> None:
+        """
+        Raises:
+            TimeoutError: the node does not get there.
+        """
+        _await(lambda: self.told("sinfo", "--noheader", "--format=%T").startswith(state), f"node {state}")
+
+    def _is_ours(self, process: psutil.Process) -> bool:
+        try:
+            return process.environ().get("SLURM_CONF") == self.environment["SLURM_CONF"]
+        except psutil.Error:
+            return False
+
+    def _start(self, program: str, *options: str) -> None:
+        found = shutil.which(program) or f"/usr/sbin/{program}"
+        subprocess.run([found, *options], env=dict(self.environment), check=True, timeout=PATIENCE_S)
+
+    def _end(self) -> None:
+        for name in ("slurmd", "slurmctld", "munged"):
+            file = self.folder / f"{name}.pid"
+            if file.exists():
+                with _gone_is_fine():
+                    process = psutil.Process(int(file.read_text()))
+                    process.terminate()
+                    process.wait(PATIENCE_S)
+
+
+@contextmanager
+def slurm_node() -> Iterator[SlurmNode]:
+    """Started, and ended with all that it runs."""
+    folder = Path(tempfile.mkdtemp(prefix="slurm_node."))
+    folder.chmod(0o755)
+    (folder / "munge.key").write_bytes(os.urandom(1024))
+    (folder / "munge.key").chmod(0o400)
+    for name in ("state", "spool", "profile"):
+        (folder / name).mkdir()
+    (folder / "profile" / "config.yaml").write_text(PROFILE)
+    (folder / "slurm.conf").write_text(
+        CONFIGURATION.format(
+            host=socket.gethostname(),
+            folder=folder,
+            node=NODE,
+            cores=os.cpu_count(),
+            memory=psutil.virtual_memory().total // 2**20 - 1024,
+            controller_port=CONTROLLER_PORT,
+            node_port=NODE_PORT,
+            lost_after=LOST_AFTER_S,
+        )
+    )
+    environment = {
+        **os.environ,
+        "SLURM_CONF": str(folder / "slurm.conf"),
+        "SNAKEMAKE_PROFILE": str(folder / "profile"),
+    }
+    node = SlurmNode(folder, environment)
+    munge = [f"--{name}-file={folder / file}" for name, file in (("key", "munge.key"), ("pid", "munged.pid"))]
+    munge += [f"--log-file={folder / 'munged.log'}", f"--seed-file={folder / 'seed'}"]
+    try:
+        node._start("munged", f"--socket={folder / 'munge.socket'}", *munge, "--force")
+        node._start("slurmctld", "-f", str(folder / "slurm.conf"))
+        node.start_node()
+        node.await_state("idle")
+        yield node
+    finally:
+        node.kill_node()
+        node._end()
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _gone_is_fine() -> suppress:
+    return suppress(psutil.NoSuchProcess, psutil.TimeoutExpired)
+
+
+def _await(holds: Callable[[], bool], what: str, patience: float = PATIENCE_S) -> None:
+    end = time.monotonic() + patience
+    while not holds():
+        if time.monotonic() > end:
+            raise TimeoutError(f"no {what} after {patience:.0f} s")
+        time.sleep(0.5)
+
+
+def counting_jobs(folder: Path, seconds: int) -> list[Job]:
+    """Two blocks; each learns, and is finished once both have learned."""
+    (folder / "step.py").write_text(STEP)
+    names, steps = ("b00", "b01"), []
+    steps += [Step(f"train {name}", name, "train") for name in names]
+    for name, other in (names, names[::-1]):
+        steps.append(Step(f"finish {name}", name, None, (f"train {name}",), (f"train {other}",)))
+    program = [sys.executable, "-I", str(folder / "step.py")]
+    return [Job(step, [*program, step.name, str(folder), str(seconds)], 256 << 20) for step in steps]
+
+
+def journal(folder: Path) -> Counter[str]:
+    """How often each line was written."""
+    path = folder / "journal"
+    return Counter(path.read_text().splitlines() if path.exists() else [])
+
+
+def run_with_a_dead_node(folder: Path, seconds: int) -> dict[str, object]:
+    """The run; in its middle the node dies."""
+    with slurm_node() as node:
+        before = dict(os.environ)
+        os.environ.update(node.environment)
+        lost: list[int] = []
+
+        def strike() -> None:
+            _await(lambda: journal(folder)["counted train b00"] >= seconds // 2, "step in its middle", 10 * PATIENCE_S)
+            lost.append(journal(folder)["counted train b00"])
+            node.kill_node()
+            node.await_state("down")
+            node.start_node()
+
+        striking = threading.Thread(target=strike)
+        striking.start()
+        try:
+            start = time.monotonic()
+            failed = run_jobs(counting_jobs(folder, seconds), folder, Capacity(2, "slurm", workers=1), set())
+            wall = time.monotonic() - start
+        finally:
+            striking.join()
+            os.environ.clear()
+            os.environ.update(before)
+        told = journal(folder)
+        return {
+            "failed": sorted(failed),
+            "begun": {line[6:]: count for line, count in sorted(told.items()) if line.startswith("begun")},
+            "done": sorted(line[5:] for line in told if line.startswith("done")),
+            "killed_after_s": lost[0],
+            "counted_s": sum(count for line, count in told.items() if line.startswith("counted")),
+            "asked_for_s": 4 * seconds,
+            "wall_s": round(wall),
+        }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seconds", type=int, default=20, help="that each step counts")
+    wanted = parser.parse_args()
+    if not is_possible():
+        sys.exit("It needs root, `apt-get install slurm-wlm munge` and `pip install 'hineus[cluster]'`.")
+    with tempfile.TemporaryDirectory() as folder:
+        for name, value in run_with_a_dead_node(Path(folder), wanted.seconds).items():
+            print(f"{name}: {value}")
+
+
+if __name__ == "__main__":
+    main()
