@@ -2,11 +2,11 @@
 
 python -m benchmarks.slurm_node [--seconds 20]
 
-Needs Debian's slurm-wlm and munge (`apt-get install slurm-wlm munge`), hineus[cluster], and root. Everything lies in a
-temporary folder; nothing is left running. The run is a plan of two blocks: four steps that count seconds in a file and
-go on from there, as training does from its checkpoint. In the middle of the first the node dies: its daemon, the jobs
-and all below them are killed at once. Later it comes back. What is told at the end: how often each step was begun,
-whether the run finished, and how many seconds were counted.
+Needs Debian's slurm-wlm and munge (`apt-get install slurm-wlm munge`), hineus[cluster], and root. Everything lies in
+a temporary folder, but for a link at /etc/slurm/slurm.conf, where jobs look; nothing is left. The run is a plan of
+two blocks: four steps that count seconds in a file and go on from there, as training does from its checkpoint. In the
+middle of the first the node dies: its daemon, the jobs and all below them are killed at once. Later it comes back.
+What is told at the end: how often each step was begun, whether the run finished, and how many seconds were counted.
 """
 
 from __future__ import annotations
@@ -36,6 +36,7 @@ from stages.workflow import Capacity
 PROGRAMS = ("munged", "slurmctld", "slurmd", "sbatch")
 NODE = "one"
 CONTROLLER_PORT, NODE_PORT = 26817, 26818
+SYSTEM_CONFIGURATION = Path("/etc/slurm/slurm.conf")  # Snakemake's executor passes none on to jobs
 LOST_AFTER_S = 10  # a node that says nothing for so long is down
 PATIENCE_S = 60.0
 CONFIGURATION = """\
@@ -63,7 +64,7 @@ SchedulerParameters=defer,batch_sched_delay=1,sched_interval=2
 SlurmdTimeout={lost_after}
 ReturnToService=2
 NodeName={node} NodeHostname={host} NodeAddr=127.0.0.1 CPUs={cores} RealMemory={memory}
-PartitionName=all Nodes={node} Default=YES MaxTime=INFINITE State=UP
+PartitionName=blocks Nodes={node} Default=YES MaxTime=INFINITE State=UP
 """
 # Without a database of accounts; on a real cluster such a profile names partition and account (docs/large-scenes.md).
 PROFILE = """\
@@ -71,7 +72,7 @@ slurm-no-account: true
 slurm-status-command: squeue
 slurm-init-seconds-before-status-checks: 2
 default-resources:
-  slurm_partition: all
+  slurm_partition: blocks
 """
 # Counts seconds in a file and goes on from what is there; notes when it begins and ends.
 STEP = """
@@ -100,6 +101,7 @@ def is_possible() -> bool:
     return (
         all(shutil.which(name) or Path("/usr/sbin", name).exists() for name in PROGRAMS)
         and os.geteuid() == 0
+        and not SYSTEM_CONFIGURATION.exists()
         and find_spec("snakemake_executor_plugin_slurm") is not None
     )
 
@@ -193,6 +195,8 @@ def slurm_node() -> Iterator[SlurmNode]:
     node = SlurmNode(folder, environment)
     munge = [f"--{name}-file={folder / file}" for name, file in (("key", "munge.key"), ("pid", "munged.pid"))]
     munge += [f"--log-file={folder / 'munged.log'}", f"--seed-file={folder / 'seed'}"]
+    SYSTEM_CONFIGURATION.parent.mkdir(exist_ok=True)
+    SYSTEM_CONFIGURATION.symlink_to(folder / "slurm.conf")
     try:
         node._start("munged", f"--socket={folder / 'munge.socket'}", *munge, "--force")
         node._start("slurmctld", "-f", str(folder / "slurm.conf"))
@@ -202,6 +206,7 @@ def slurm_node() -> Iterator[SlurmNode]:
     finally:
         node.kill_node()
         node._end()
+        SYSTEM_CONFIGURATION.unlink()
         shutil.rmtree(folder, ignore_errors=True)
 
 
@@ -275,7 +280,10 @@ def main() -> None:
     parser.add_argument("--seconds", type=int, default=20, help="that each step counts")
     wanted = parser.parse_args()
     if not is_possible():
-        sys.exit("It needs root, `apt-get install slurm-wlm munge` and `pip install 'hineus[cluster]'`.")
+        sys.exit(
+            "It needs root, `apt-get install slurm-wlm munge`, `pip install 'hineus[cluster]'`, and no "
+            f"{SYSTEM_CONFIGURATION}."
+        )
     with tempfile.TemporaryDirectory() as folder:
         for name, value in run_with_a_dead_node(Path(folder), wanted.seconds).items():
             print(f"{name}: {value}")
