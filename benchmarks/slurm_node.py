@@ -125,9 +125,7 @@ class SlurmNode:
         if not (self.folder / "slurmd.pid").exists():
             return
         daemon = psutil.Process(int((self.folder / "slurmd.pid").read_text()))
-        steps = [
-            each for each in psutil.process_iter(["name"]) if each.info["name"] == "slurmstepd" and self._is_ours(each)
-        ]
+        steps = [each for each in psutil.process_iter(["name"]) if each.info["name"].startswith("slurmstepd")]
         for process in [daemon, *steps, *(below for step in steps for below in step.children(recursive=True))]:
             with _gone_is_fine():
                 process.send_signal(signal.SIGKILL)
@@ -144,12 +142,6 @@ class SlurmNode:
             TimeoutError: the node does not get there.
         """
         _await(lambda: self.told("sinfo", "--noheader", "--format=%T").startswith(state), f"node {state}")
-
-    def _is_ours(self, process: psutil.Process) -> bool:
-        try:
-            return process.environ().get("SLURM_CONF") == self.environment["SLURM_CONF"]
-        except psutil.Error:
-            return False
 
     def _start(self, program: str, *options: str) -> None:
         found = shutil.which(program) or f"/usr/sbin/{program}"
