@@ -366,6 +366,7 @@ def test_of_many_photos_only_pairs_that_may_show_the_same_are_ever_matched(tmp_p
     placed = Solution(frozenset(FOUR[:3]), 10, 0.5, base=Base())
     assert bench._pairs_to_try(Base(), None) == [(1, 2), (2, 4)]
     assert bench._pairs_to_try(Base(), placed) == [(2, 4)]
+    assert bench._pairs_with(Base(), FOUR[:1]) == [(1, 2)]
     compared = []
     monkeypatch.setattr("stages.posing.workbench.likely_pairs", lambda path, among: compared.append(among) or [])
     bench._match(Base())

@@ -464,7 +464,7 @@ class Workbench:
         with pycolmap.Database.open(self.database(base)) as database:
             images = {image.image_id: image.name for image in database.read_all_images()}
         pairs = combinations(sorted(images), 2) if self._among(base) is None else self._among(base)
-        return [pair for pair in pairs or () if not names.isdisjoint((images[pair[0]], images[pair[1]]))]
+        return [(i, j) for i, j in pairs or () if images[i] in names or images[j] in names]
 
     def _import(self, base: Base) -> None:
         """One camera a group of photos that share intrinsics, with its focal prior."""
