@@ -128,7 +128,7 @@ def test_new_photos_are_placed_beside_known_ones_that_stay(eight: Path, tmp_path
 
 @pytest.mark.slow
 def test_new_photos_are_matched_with_all_known_ones(eight: Path, tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr("stages.posing.workbench.likely_pairs", lambda database: [])
+    monkeypatch.setattr("stages.posing.workbench.likely_pairs", lambda database, among: [])
     numbers, folder = run(tmp_path, named(*range(9)), eight)
     assert (numbers["registered"], numbers["kept"]) == (9, ADDED)
     assert artifacts.REGISTRATION.load(folder).matcher == "preemptive"
