@@ -27,6 +27,7 @@ from stages.evaluation.photos import images
 from stages.evaluation.photos.images import find_lpips, score_image
 from stages.evaluation.photos.regions import judge, laid_on_white
 from stages.gaussians.keeping import write_gaussians
+from stages.geometry.point_cloud import PointCloud
 from stages.neural.drawing import FieldDrawer, FieldDrawing
 from stages.neural.fields import Fields
 from stages.neural.trained_field import field_state
@@ -196,6 +197,7 @@ def workspace(tmp_path: Path) -> Workspace:
     with opened.lock():
         opened.remember({}, None, {})
     publish(opened, "undistort", lambda out: write_undistorted(out, cameras, masks=True))
+    publish(opened, "densify", lambda out: artifacts.POINT_CLOUD.save(out, PointCloud.empty()))
 
     def train(out: Path) -> None:
         fields = Fields(field_shape(PARAMS, len(cameras), background=False))
