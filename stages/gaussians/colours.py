@@ -206,14 +206,13 @@ def _take_in(ids, sums, centers, position, normal, right):  # pragma: no cover -
         length = np.sqrt(x * x + y * y + z * z)
         basis = np.empty(terms, np.float32)
         fill_basis(x / length, y / length, z / length, basis)
-        at = np.uintp(0)
+        at = 0
         for i in range(terms):
-            weighted = total * basis[i]
             for c in range(3):
                 right[n, i, c] += basis[i] * sums[m, 1 + c]
-            for j in range(np.uintp(i + 1)):
-                normal[n, at + j] += weighted * basis[j]
-            at += np.uintp(i + 1)
+            for j in range(i + 1):
+                normal[n, at] += total * basis[i] * basis[j]
+                at += 1
 
 
 @njit(parallel=True, cache=True, nogil=True)

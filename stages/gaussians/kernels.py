@@ -418,12 +418,7 @@ def weigh(
         x1, y1 = min(x0 + TILE, width), min(y0 + TILE, height)
         open_ = np.ones(TILE * TILE, np.float32)
         alphas = np.empty(TILE, np.float32)
-        finished = False
         for p in range(starts[tile], starts[tile + 1]):
-            parts[p, 0] = parts[p, 1] = parts[p, 2] = parts[p, 3] = _0
-            finished = finished or ((p - starts[tile]) % _LOOK == _LOOK - 1 and open_.max() <= _0)
-            if finished:
-                continue
             n = members[p]
             left, top, bottom, count = _part(boxes[n], x0, y0, x1, y1)
             dx = np.float32(left) + _HALF - means[n, 0]
