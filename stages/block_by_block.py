@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
-from stages.artifacts.blocks import BlockPlan, block_folder
+from stages.artifacts.blocks import Block, BlockPlan, block_folder
 from stages.divide import divide
 from stages.engine.run_log import TRACEBACKS
 from stages.engine.runner import Listener
@@ -80,6 +80,20 @@ class BlockOutcome:
     hint: str = ""
     glb: Path | None = None
     report: Path | None = None
+
+    @staticmethod
+    def of(whole: Path, block: Block, error: HineusError | None, glb: Path | None, report: Path | None) -> BlockOutcome:
+        """Of a block of the plan, which failed where there is an error."""
+        return BlockOutcome(
+            name=block.name,
+            workspace=block_folder(whole, block.name),
+            photos=len(block.photos),
+            state="failed" if error else "done",
+            error=error.message if error else "",
+            hint=error.hint if error else "",
+            glb=glb,
+            report=report,
+        )
 
 
 @dataclass(frozen=True)
@@ -177,19 +191,8 @@ def _outcomes(
     runs: Mapping[str, Reconstruction],
 ) -> list[BlockOutcome]:
     errors = {step.block: failed[step.name] for step in reversed(steps) if step.name in failed}
-    outcomes = []
-    for block in plan.blocks:
-        place, error, run = block_folder(root, block.name), errors.get(block.name), runs.get(block.name)
-        outcomes.append(
-            BlockOutcome(
-                name=block.name,
-                workspace=place,
-                photos=len(block.photos),
-                state="failed" if error else "done",
-                error=error.message if error else "",
-                hint=error.hint if error else "",
-                glb=run.glb if run else None,
-                report=run.report if run else None,
-            )
-        )
-    return outcomes
+    return [
+        BlockOutcome.of(root, block, errors.get(block.name), run.glb if run else None, run.report if run else None)
+        for block in plan.blocks
+        for run in [runs.get(block.name)]
+    ]

@@ -219,17 +219,8 @@ def _is_done(root: Path, step: Step, pipeline: Sequence[Stage[Any]]) -> bool:
 
 
 def _outcome(root: Path, block: Block, jobs: Sequence[Job], failed: Mapping[str, HineusError]) -> BlockOutcome:
-    errors = [failed[job.name] for job in jobs if job.step.block == block.name and job.name in failed]
+    error = next((failed[job.name] for job in jobs if job.step.block == block.name and job.name in failed), None)
     folder = block_folder(root, block.name)
     glb = artifacts.asset_path(folder / "export", "glb")
     report = artifacts.PAGE.load(folder / "report")
-    return BlockOutcome(
-        name=block.name,
-        workspace=folder,
-        photos=len(block.photos),
-        state="failed" if errors else "done",
-        error=errors[0].message if errors else "",
-        hint=errors[0].hint if errors else "",
-        glb=glb if glb.exists() else None,
-        report=report if report.exists() else None,
-    )
+    return BlockOutcome.of(root, block, error, glb if glb.exists() else None, report if report.exists() else None)

@@ -214,14 +214,10 @@ def preflight(
 
 def estimate(seen: Inspection, config: Config, device: str, workers: int) -> Needs:
     """From simple models of what was measured; see the constants."""
-
-    def pixels(most: int) -> list[float]:
-        return [width * height * min(1.0, most / max(width, height)) ** 2 for width, height in seen.sizes]
-
-    looked_at = pixels(min(config.ingest.max_side, config.sfm.max_image_size))
+    looked_at = _pixels(seen.sizes, min(config.ingest.max_side, config.sfm.max_image_size))
     side = min(config.ingest.max_side, config.undistort.max_side)
-    trained_on = sum(pixels(side))
-    compared = 0.0 if config.densify.method == "off" else sum(pixels(min(side, config.densify.side)))
+    trained_on = sum(_pixels(seen.sizes, side))
+    compared = 0.0 if config.densify.method == "off" else sum(_pixels(seen.sizes, min(side, config.densify.side)))
     sfm_gib = SFM_BASE_GIB + workers * SFM_GIB_PER_THREAD_MP * max(looked_at, default=0) / 1e6
     masks_bytes = bytes_to_read_masks(seen.masks.files.values())
     read_gib = max([masks_bytes, *(photo.bytes_to_read for photo in seen.photos)]) / GIB
@@ -231,6 +227,11 @@ def estimate(seen: Inspection, config: Config, device: str, workers: int) -> Nee
         disk_gb=DISK_BASE_GB + (seen.num_bytes + made_bytes + FEATURE_BYTES_PER_PIXEL * sum(looked_at)) / 1e9,
         minutes=_minutes(looked_at, compared, config, workers) if device == "cpu" else None,
     )
+
+
+def _pixels(sizes: Sequence[tuple[int, int]], most: int) -> list[float]:
+    """Of each photo, shrunk where its longer side has more than `most`."""
+    return [width * height * min(1.0, most / max(width, height)) ** 2 for width, height in sizes]
 
 
 def _learning_gib(trained_on: float, compared: float, config: Config) -> float:
@@ -245,10 +246,8 @@ def memory_asked_for(sizes: Sequence[tuple[int, int]], config: Config) -> int:
     Args:
         sizes: width and height of photos as ingest takes them.
     """
-    trained_on, compared = (
-        sum(w * h * min(1.0, most / max(w, h)) ** 2 for w, h in sizes)
-        for most in (config.undistort.max_side, min(config.undistort.max_side, config.densify.side))
-    )
+    side = config.undistort.max_side
+    trained_on, compared = (sum(_pixels(sizes, most)) for most in (side, min(side, config.densify.side)))
     return int(MEMORY_MARGIN * GIB * _learning_gib(trained_on, compared, config))
 
 
@@ -259,8 +258,7 @@ def photos_held(sizes: Sequence[tuple[int, int]], config: Config, memory_gib: fl
         sizes: width and height of photos as ingest takes them; the median of these is every photo's.
     """
     side = config.undistort.max_side
-    pixels = [[w * h * min(1.0, most / max(w, h)) ** 2 for w, h in sizes] for most in (side, config.densify.side)]
-    trained_on, compared = (float(np.median(each)) for each in pixels)
+    trained_on, compared = (float(np.median(_pixels(sizes, most))) for most in (side, config.densify.side))
     free = memory_gib / MEMORY_MARGIN
     held = (free - MEMORY_BASE_GIB) / (MEMORY_OF_PHOTOS * 3 * trained_on / GIB)
     if config.densify.method != "off":

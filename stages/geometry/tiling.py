@@ -208,5 +208,10 @@ def weights(boxes: list[BlockBox], points: Float[np.ndarray, "p 3"]) -> Float[np
 def _bump(box: BlockBox, points: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, " p"]:
     low, high = box.region
     inward = np.minimum(points - low, high - points) / (2 * box.margin)
-    t = np.clip(inward, 0.0, 1.0)
-    return (t * t * (3 - 2 * t)).prod(1)
+    return eased(inward).prod(1)
+
+
+def eased(t: Float[np.ndarray, " *n"]) -> Float[np.ndarray, " *n"]:
+    """3 t^2 - 2 t^3 from 0 to 1; 0 before and 1 after."""
+    t = np.clip(t, 0.0, 1.0)
+    return t * t * (3 - 2 * t)

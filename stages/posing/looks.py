@@ -2,8 +2,7 @@
 
 Features are sorted to a few words, which are found among the photos' own features, and what they differ from their
 word by is summed up word by word [Jegou et al., Aggregating Local Descriptors into a Compact Image Representation,
-CVPR 2010: VLAD]. Of two photos that show the same, these sums point the same way. A vocabulary tree as COLMAP's finds
-as many of the true pairs of a made-up survey, but its thousands of words take ten times the CPU time to learn.
+CVPR 2010: VLAD]. Of two photos that show the same, these sums point the same way.
 """
 
 from __future__ import annotations

@@ -66,7 +66,7 @@ def in_world(place: Place, positions: Float[np.ndarray, "n 3"]) -> Float[np.ndar
 
 def map_from_world(place: Place, center: Float[np.ndarray, " 3"]) -> Similarity:
     """`on_map` about a point of the world, as one similarity: what turns directions."""
-    cube = center + NEARBY_M * np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)])
+    cube = _about(center)
     return align_points(cube, on_map(place, cube))
 
 
@@ -98,6 +98,11 @@ def earth_centred_from_world(place: Place, center: Float[np.ndarray, " 3"]) -> F
         return matrix
     if not place.crs:
         return None
-    cube = center + NEARBY_M * np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)])
+    cube = _about(center)
     positions = to_geodetic(on_map(place, cube), place.crs, "points about the model")
     return align_points(cube, earth_centred(positions)).matrix()
+
+
+def _about(center: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "8 3"]:
+    """Corners of a cube about a point."""
+    return center + NEARBY_M * np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)])

@@ -463,8 +463,9 @@ class Workbench:
 
         with pycolmap.Database.open(self.database(base)) as database:
             images = {image.image_id: image.name for image in database.read_all_images()}
-        pairs = combinations(sorted(images), 2) if self._among(base) is None else self._among(base)
-        return [(i, j) for i, j in pairs or () if images[i] in names or images[j] in names]
+        among = self._among(base)
+        pairs = combinations(sorted(images), 2) if among is None else among
+        return [(i, j) for i, j in pairs if images[i] in names or images[j] in names]
 
     def _import(self, base: Base) -> None:
         """One camera a group of photos that share intrinsics, with its focal prior."""

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from stages.geometry.tiling import BlockBox, weights
+from stages.geometry.tiling import BlockBox, eased, weights
 from stages.surface.isosurface import Isosurface, extract_box
 
 if TYPE_CHECKING:
@@ -120,10 +120,7 @@ def fading(
     Args:
         sides: planes (normal, offset) with the tile above them, and `cell`, in the frame of the vertices.
     """
-    heights = heights_above(vertices, sides)
-    t = np.clip(heights / (FADE_CELLS * cell), 0.0, 1.0)
-    faded: np.ndarray = t * t * (3 - 2 * t)
-    return faded
+    return eased(heights_above(vertices, sides) / (FADE_CELLS * cell))
 
 
 def heights_above(
