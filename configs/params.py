@@ -384,6 +384,12 @@ class ExportParams(Section):
     tiles: bool = Field(
         False, description="3D Tiles for viewers of maps: tileset.json over the GLB and the levels of `export.lods`"
     )
+    heights: Literal["sea_level", "ellipsoid"] = Field(
+        "sea_level",
+        description="what GPS altitudes and control points' heights count from; sea_level: on the Earth (3D Tiles, "
+        "georeference.json, metadata.xml) the model is raised by the geoid, EGM2008, which `pip install "
+        "'hineus[survey]'` brings; ellipsoid (WGS 84): it stands there as it is, see `docs/howto.md`",
+    )
     ground_resolution: float | None = Field(
         None,
         gt=0,

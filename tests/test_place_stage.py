@@ -142,9 +142,9 @@ def test_control_points_in_a_frame_of_their_own(inputs, tmp_path: Path):
     assert "5 of 5 control points were used" in shown["sentence"]
     assert "1 only check it" in shown["sentence"]
     assert shown["points"][0]["marks"] == "8 of 8"
-    assert metadata_xml(found) is None
-    assert georeference(found, np.eye(3))["offset"] == found.offset
-    json.dumps(georeference(found, np.eye(3)))
+    assert metadata_xml(found, None) is None
+    assert georeference(found, np.eye(3), None)["offset"] == found.offset
+    json.dumps(georeference(found, np.eye(3), None))
 
 
 def test_control_points_on_earth_go_before_gps(inputs, tmp_path: Path):
@@ -157,11 +157,11 @@ def test_control_points_on_earth_go_before_gps(inputs, tmp_path: Path):
     assert found.scale_from == "6 control points"
     there = from_east_north_up(found.world_from_poses.apply(DOTS), found.origin)
     np.testing.assert_allclose(earth_centred(there), earth_centred(degrees[:, [1, 0, 2]]), atol=0.1)
-    matrix = np.array(georeference(found, np.eye(3))["earth_centred_from_world"])
+    matrix = np.array(georeference(found, np.eye(3), None)["earth_centred_from_world"])
     np.testing.assert_allclose(
         found.world_from_poses.apply(DOTS) @ matrix[:3, :3].T + matrix[:3, 3], earth_centred(there), atol=1e-3
     )
-    assert "<SRS>ENU:-16.7999" in metadata_xml(found)
+    assert "<SRS>ENU:-16.7999" in metadata_xml(found, None)
 
 
 def test_the_results_in_a_map_s_grid(inputs, tmp_path: Path):
@@ -175,7 +175,7 @@ def test_the_results_in_a_map_s_grid(inputs, tmp_path: Path):
     )
     assert found.crs == "EPSG:32632"
     east, north, up = found.offset
-    assert f"<SRS>EPSG:32632</SRS>\n <SRSOrigin>{east:.3f},{north:.3f},{up:.3f}" in metadata_xml(found)
+    assert f"<SRS>EPSG:32632</SRS>\n <SRSOrigin>{east:.3f},{north:.3f},{up:.3f}" in metadata_xml(found, None)
 
 
 def test_a_grid_needs_a_place_on_earth(inputs, tmp_path: Path):

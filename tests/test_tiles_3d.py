@@ -88,7 +88,7 @@ def test_the_deviation_of_a_level_is_that_of_its_ridge():
 @pytest.mark.slow
 def test_tiles_stand_upright_where_the_world_lies_on_the_earth(tmp_path):
     turned = Similarity(1.0, rotation_about(np.array([0.2, 1, 0.4]), 0.5), np.array([5.0, -3, 2]))
-    folder, found = exported(tmp_path, replace(ON_EARTH, world_from_poses=turned))
+    folder, found = exported(tmp_path, replace(ON_EARTH, world_from_poses=turned), heights="ellipsoid")
     assert (folder / "model.glb").exists()  # tiles need it, whatever the formats are
     matrix = np.reshape(found["root"]["transform"], (4, 4)).T
     import trimesh

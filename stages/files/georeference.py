@@ -7,18 +7,19 @@ from xml.sax.saxutils import escape
 
 import numpy as np
 
-from stages.geometry.earth import earth_centred, east_north_up_axes
+from stages.geometry.earth import earth_centred_from_local
 from stages.geometry.place import Place
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
 
-def georeference(place: Place, gltf_from_world: Float[np.ndarray, "3 3"]) -> dict[str, Any] | None:
+def georeference(place: Place, gltf_from_world: Float[np.ndarray, "3 3"], geoid: float | None) -> dict[str, Any] | None:
     """How coordinates of the files lead to those of the Earth, a map or the control points; None where none do.
 
     Args:
         gltf_from_world: the rotation to Y up.
+        geoid: metres above the ellipsoid of what altitudes count from; None: not known, taken for zero.
     """
     if place.origin is None and place.offset is None:
         return None
@@ -34,12 +35,11 @@ def georeference(place: Place, gltf_from_world: Float[np.ndarray, "3 3"]) -> dic
         "gps_residual_m": place.gps_residual,
     }
     if place.origin is not None:
-        matrix = np.eye(4)
-        matrix[:3, :3] = east_north_up_axes(place.origin).T
-        matrix[:3, 3] = earth_centred(np.array([place.origin]))[0]
+        matrix = earth_centred_from_local(place.origin, geoid or 0.0)
         keys = ("latitude_deg", "longitude_deg", "altitude_m")
         found |= {
             "origin": dict(zip(keys, place.origin, strict=True)),
+            "geoid_m": geoid,
             "earth_centred_from_world": matrix.tolist(),  # EPSG:4978, as 3D Tiles want it
         }
     else:
@@ -47,11 +47,15 @@ def georeference(place: Place, gltf_from_world: Float[np.ndarray, "3 3"]) -> dic
     return found
 
 
-def metadata_xml(place: Place) -> str | None:
-    """`metadata.xml` of ContextCapture, which importers of meshes into maps read; None where no map is known."""
+def metadata_xml(place: Place, geoid: float | None) -> str | None:
+    """`metadata.xml` of ContextCapture, which importers of meshes into maps read; None where no map is known.
+
+    Args:
+        geoid: see `georeference`.
+    """
     if place.origin is not None:
         latitude, longitude, altitude = place.origin
-        system, origin = f"ENU:{latitude:.9f},{longitude:.9f}", (0.0, 0.0, altitude)
+        system, origin = f"ENU:{latitude:.9f},{longitude:.9f}", (0.0, 0.0, altitude + (geoid or 0.0))
     elif place.crs and place.offset is not None:
         system, origin = place.crs, place.offset
     else:

@@ -66,3 +66,12 @@ def from_east_north_up(
 ) -> Float[np.ndarray, "n 3"]:
     """The inverse of `east_north_up`."""
     return geodetic(metres @ east_north_up_axes(origin) + earth_centred(np.array([origin])))
+
+
+def earth_centred_from_local(origin: tuple[float, float, float], raised: float) -> Float[np.ndarray, "4 4"]:
+    """From metres east, north and up of `origin`, which lies `raised` metres over its altitude, to `earth_centred`."""
+    latitude, longitude, altitude = origin
+    matrix = np.eye(4)
+    matrix[:3, :3] = east_north_up_axes(origin).T
+    matrix[:3, 3] = earth_centred(np.array([[latitude, longitude, altitude + raised]]))[0]
+    return matrix

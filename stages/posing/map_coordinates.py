@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from stages.geometry.earth import earth_centred, east_north_up, east_north_up_axes, from_east_north_up
+from stages.geometry.earth import earth_centred, earth_centred_from_local, east_north_up, from_east_north_up
 from stages.geometry.place import Place
 from stages.geometry.point_cloud import PointCloud
 from stages.geometry.similarity import Similarity, align_points
@@ -85,21 +85,36 @@ def cloud_on_map(place: Place, cloud: PointCloud) -> tuple[PointCloud, tuple[flo
     return replace(cloud, points=coordinates - offset, normals=cloud.normals @ turn.T), (x, y, z), map_of(place)
 
 
-def earth_centred_from_world(place: Place, center: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "4 4"] | None:
+def latitude_and_longitude(place: Place) -> tuple[float, float] | None:
+    """Degrees of the world's origin; None where it is not known where on Earth that is.
+
+    Raises:
+        ConfigError, SystemRequirementError: see `to_geodetic`.
+    """
+    if place.origin is not None:
+        return place.origin[:2]
+    if not place.crs or place.offset is None:
+        return None
+    latitude, longitude, _ = to_geodetic(np.array([place.offset]), place.crs, "the origin")[0].tolist()
+    return latitude, longitude
+
+
+def earth_centred_from_world(
+    place: Place, center: Float[np.ndarray, " 3"], geoid: float
+) -> Float[np.ndarray, "4 4"] | None:
     """To metres from the Earth's centre (EPSG:4978); None where the place is not known.
 
     Args:
         center: where a map's coordinates, which are no straight lines, are met best.
+        geoid: metres above the ellipsoid of what altitudes count from.
     """
     if place.origin is not None:
-        matrix = np.eye(4)
-        matrix[:3, :3] = east_north_up_axes(place.origin).T
-        matrix[:3, 3] = earth_centred(np.array([place.origin]))[0]
-        return matrix
+        return earth_centred_from_local(place.origin, geoid)
     if not place.crs:
         return None
     cube = _about(center)
     positions = to_geodetic(on_map(place, cube), place.crs, "points about the model")
+    positions[:, 2] += geoid
     return align_points(cube, earth_centred(positions)).matrix()
 
 
