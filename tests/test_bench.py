@@ -30,7 +30,7 @@ from stages.evaluation.suites import runs as bench_module
 from stages.evaluation.suites.registry import SUITES, find_scenes
 from stages.evaluation.suites.runs import load_results
 from stages.evaluation.suites.scene import Wanted
-from stages.evaluation.suites.scores import posed_mesh, result_mesh
+from stages.evaluation.suites.scores import Part, posed_mesh, result_mesh
 from stages.evaluation.suites.tables import score_table, tables_of
 from stages.geometry.cameras import PinholeCameras
 from stages.geometry.place import Place
@@ -206,13 +206,29 @@ def test_a_mesh_is_scored_in_the_frame_of_its_poses_whatever_gps_made_of_the_wor
     corners = np.eye(3)
     artifacts.CLEAN_MESH.save(workspace.stage_folder("cleanup"), (corners, np.array([[0, 1, 2]])))
     world = scene.world_from_scene(moved).apply(corners)
-    ours = result_mesh(workspace, {"cleanup"}, tmp_path / "ours.ply")
+    ours = result_mesh([Part(workspace, Similarity.identity())], {"cleanup"}, tmp_path / "ours.ply")
     assert ours is not None
     np.testing.assert_allclose(read_mesh(ours)[0], (world - [10, 0, 0]) / 2, atol=1e-5)
     trimesh.Trimesh(world, [[0, 1, 2]], process=False).export(tmp_path / "theirs.ply")
     theirs = posed_mesh(workspace, tmp_path / "theirs.ply", tmp_path / "moved.ply")
     np.testing.assert_allclose(read_mesh(theirs)[0], (world - [10, 0, 0]) / 2, atol=1e-5)
-    assert result_mesh(workspace, {"undistort"}, tmp_path / "none.ply") is None
+    assert result_mesh([Part(workspace, Similarity.identity())], {"undistort"}, tmp_path / "none.ply") is None
+
+
+def test_peers_are_not_for_scenes_in_blocks(data: Path):
+    write_suite("known", data)
+    result = hineus_bench("known", str(data), "--blocks", "2", "--peer", "poisson")
+    assert result.exit_code == ConfigError.exit_code
+    assert "`--peer` does not go with `--blocks`" in result.stderr
+
+
+def test_a_block_that_fails_is_in_the_result_of_the_scene(data: Path):
+    write_suite("urbanscene3d", data)
+    result = hineus_bench("urbanscene3d", str(data), "--blocks", "2", "--until", "train", "--json")
+    (told,) = json.loads(result.stdout)["results"]
+    assert "`--until` does not go with `--blocks`" in told["error"]["message"]
+    assert told["asked"]["blocks"] == "2"
+    assert not (Path("bench") / "urbanscene3d" / "residence-pixsfm" / "tiny-seed0").exists()
 
 
 def test_results_do_not_go_among_the_data(data: Path):

@@ -14,7 +14,8 @@ from typer.testing import CliRunner
 
 from hineus_cli.app import build_app
 from stages import artifacts
-from stages.drawing.rendering import look_at
+from stages.artifacts import AtlasMesh
+from stages.drawing.rendering import look_at, render_together
 from stages.engine.workspace import Workspace
 from stages.errors import ConfigError, HineusError, InputError, WorkspaceError
 from stages.files.video import count_frames
@@ -161,3 +162,20 @@ def test_the_command_says_what_it_drew(workspace, tmp_path):
     found = json.loads(done.stdout.strip().splitlines()[-1])
     assert (found["what"], found["sides"], found["path"]) == ("splats", 1, "orbit")
     assert (tmp_path / "a.png").exists()
+
+
+def test_of_meshes_drawn_together_the_nearest_is_seen():
+    def square(depth: float, side: float) -> AtlasMesh:
+        corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) * side + [0, 0, depth]
+        up = np.tile(np.float32([0, 0, -1]), (4, 1))
+        faces = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
+        return AtlasMesh(corners.astype(np.float32), up, np.zeros((4, 2), np.float32), faces, 1)
+
+    camera = look_at(np.zeros(3), np.array([0, 0, 1.0]), np.array([0, -1.0, 0]), 40, 40, fov_deg=90)
+    red, blue = (np.full((1, 1, 3), color, np.uint8) for color in ((200, 0, 0), (0, 0, 200)))
+    near, far = (square(1.0, 0.5), red), (square(2.0, 1.5), blue)
+    picture = render_together([near, far], camera)
+    np.testing.assert_array_equal(picture, render_together([far, near], camera))
+    assert picture[20, 20].tolist() == [200, 0, 0]
+    assert picture[20, 8].tolist() == [0, 0, 200]
+    assert picture[20, 2].tolist() == [255, 255, 255]

@@ -6,12 +6,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from small_town import HEIGHT, LAND, photograph, town
+from small_town import HEIGHT, LAND, SIZE, photograph, town
 
 from stages import artifacts
 from stages.artifacts.blocks import block_folder, read_plan
 from stages.block_by_block import BlockRuns, reconstruct_in_blocks
 from stages.block_status import block_statuses
+from stages.engine.workspace import Workspace
+from stages.evaluation.photos.novel_views import NovelViews
+from stages.evaluation.reading import read_mesh
+from stages.evaluation.suites.scores import Part, result_mesh, score_tiles
 from stages.pipeline import PIPELINE
 from stages.request import Request
 from stages.surface.triangle_mesh import raycaster
@@ -62,6 +66,16 @@ def test_photos_to_tiles_that_meet(tmp_path):
     vertices, faces = town()
     truth = raycaster(vertices.astype(np.float32), faces.astype(np.int32))
     assert np.median(truth.compute_distance(o3d.core.Tensor(flown)).numpy()) < 0.1 * HEIGHT
+
+    parts = [Part(Workspace.open(outcome.workspace), plan_from_poses.inverse()) for outcome in result.outcomes]
+    views = NovelViews(tmp_path, tuple(f"photos/{i:03d}.png" for i in (3, 12)), tmp_path / "transforms.json")
+    scored = score_tiles(views, None, parts)
+    assert scored["counted"] == 2
+    for photo in scored["photos"]:  # tiles of both blocks make the picture
+        assert photo["mesh"]["object"]["pixels"] > 0.8 * SIZE[0] * SIZE[1]
+        assert photo["mesh"]["object"]["psnr"] > 15
+    joined = read_mesh(result_mesh(parts, {"cleanup"}, tmp_path / "joined.ply"))[0]
+    np.testing.assert_allclose(np.sort(joined, 0), np.sort(surface, 0), atol=1e-4)
 
     again = run(tmp_path)
     assert all(outcome.action == "skipped" for outcome in again.whole.outcomes)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from hineus_cli.options import Device, Json, Preset, Sets, Until, Verbose, Workers, hold_out_option
+from hineus_cli.options import Blocks, Device, Json, Preset, Sets, Until, Verbose, Workers, hold_out_option
 from hineus_cli.session import print_json
 
 if TYPE_CHECKING:
@@ -45,6 +45,7 @@ def bench(
             show_default=False,
         ),
     ] = None,
+    blocks: Blocks = None,
     device: Device = "auto",
     workers: Workers = None,
     as_json: Json = False,
@@ -54,6 +55,7 @@ def bench(
     from dataclasses import asdict
 
     from hineus_cli.console import product
+    from hineus_cli.options import block_count
     from stages.evaluation.peers.running import parse_peer
     from stages.evaluation.suites.paper import paper_tables
     from stages.evaluation.suites.registry import find_suite
@@ -75,6 +77,7 @@ def bench(
         until=until,
         device=device,
         workers=workers,
+        blocks=None if blocks is None else block_count(blocks) or "auto",
     )
     with session.running(verbose) as progress:
         results = list(run_bench(request, session.pipeline, progress))

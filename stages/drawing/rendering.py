@@ -3,6 +3,8 @@ tests."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 
 from stages.artifacts import AtlasMesh
@@ -83,10 +85,21 @@ def render_textured(
     supersample: int = 2,
     background: tuple[int, int, int] = BACKGROUND,
 ) -> np.ndarray:
-    """Draw a textured mesh.
+    """Draw a textured mesh: see `render_together`."""
+    return render_together([(mesh, texture)], camera, shaded, supersample, background)
+
+
+def render_together(
+    meshes: Iterable[tuple[AtlasMesh, np.ndarray]],
+    camera: PinholeCameras,
+    shaded: bool = False,
+    supersample: int = 2,
+    background: tuple[int, int, int] = BACKGROUND,
+) -> np.ndarray:
+    """Draw textured meshes that share a frame.
 
     Args:
-        texture: [S, S, 3] uint8, row 0 at v = 1; a [1, 1, 3] one, shaded, shows the shape alone.
+        meshes: each with its texture [S, S, 3] uint8, row 0 at v = 1; a [1, 1, 3] one, shaded, shows the shape alone.
         camera: one camera (the first is used).
         shaded: a headlight shades the colours; else the texture is shown as it is.
         supersample: samples along a pixel's side.
@@ -95,23 +108,33 @@ def render_textured(
         [H, W, 3] uint8.
     """
     width, height = (int(side) * supersample for side in camera.sizes[0])
-    xy, inverse_depth = projected(camera, 0, mesh.vertices)
-    xy = xy * supersample
-    face_map, _ = rasterize(xy, inverse_depth, mesh.faces, width, height)
     image = np.empty((height * width, 3), dtype=np.float32)
     image[:] = background
-    hit = np.flatnonzero(face_map.ravel() != NO_FACE)
-    if len(hit):
-        face_ids = face_map.ravel()[hit]
-        centers = np.stack([hit % width, hit // width], 1) + 0.5
-        weights = corner_weights(xy, inverse_depth, mesh.faces, face_ids, centers)
-        corners = mesh.faces[face_ids]
-        colors = sample_texture(texture, np.einsum("pc,pcd->pd", weights, mesh.uvs[corners]))
-        if shaded:
-            shading = unit(np.einsum("pc,pcd->pd", weights, mesh.normals[corners]))
-            towards = unit(camera.centers[0] - np.einsum("pc,pcd->pd", weights, mesh.vertices[corners]))
-            facing = np.abs((shading * towards).sum(1, keepdims=True))
-            colors = colors * (0.35 + 0.65 * facing)
-        image[hit] = colors
+    nearest = np.zeros(height * width, dtype=np.float32)  # inverse depth
+    for mesh, texture in meshes:
+        xy, inverse_depth = projected(camera, 0, mesh.vertices)
+        xy = xy * supersample
+        face_map, nearness = (each.ravel() for each in rasterize(xy, inverse_depth, mesh.faces, width, height))
+        hit = np.flatnonzero((face_map != NO_FACE) & (nearness > nearest))
+        if len(hit):
+            nearest[hit], face_ids = nearness[hit], face_map[hit]
+            centers = np.stack([hit % width, hit // width], 1) + 0.5
+            weights = corner_weights(xy, inverse_depth, mesh.faces, face_ids, centers)
+            image[hit] = _colors_at(mesh, texture, face_ids, weights, camera.centers[0] if shaded else None)
     image = image.reshape(height // supersample, supersample, width // supersample, supersample, 3).mean((1, 3))
     return np.clip(image + 0.5, 0, 255).astype(np.uint8)
+
+
+def _colors_at(
+    mesh: AtlasMesh, texture: np.ndarray, face_ids: np.ndarray, weights: np.ndarray, headlight: np.ndarray | None
+) -> np.ndarray:
+    """Colours [P, 3] at barycentric weights [P, 3] of faces [P], shaded by a light at a point where there is one."""
+    corners = mesh.faces[face_ids]
+    colors = sample_texture(texture, np.einsum("pc,pcd->pd", weights, mesh.uvs[corners]))
+    if headlight is None:
+        return colors
+    shading = unit(np.einsum("pc,pcd->pd", weights, mesh.normals[corners]))
+    towards = unit(headlight - np.einsum("pc,pcd->pd", weights, mesh.vertices[corners]))
+    facing = np.abs((shading * towards).sum(1, keepdims=True))
+    shaded: np.ndarray = colors * (0.35 + 0.65 * facing)
+    return shaded

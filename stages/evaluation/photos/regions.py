@@ -70,13 +70,12 @@ def judge(
         splats_everywhere: they show what is around the object, too.
     """
     counted = (silhouette if mask is None else mask) & field.drawn
-    on_white = photo if mask is None else np.where(mask[..., None], photo, np.uint8(WHITE))
+    on_white = _on_white(photo, mask)
     seen = field.colors if field.background else laid_on_white(field)
     field_truth = photo if field.background else None if mask is None else on_white
 
     def scores(image: np.ndarray, colors: np.ndarray, whole: np.ndarray | None) -> RegionScores:
-        inside = score_image(colors, photo, counted, lpips) if counted.any() else None
-        return RegionScores(inside, None if whole is None else score_image(image, whole, None, lpips))
+        return _scores(image, colors, photo, counted, whole, lpips)
 
     surface_truth = None if mask is None else on_white
     pictures = {"photo": photo if field.background else on_white, "field": seen, "mesh": mesh}
@@ -86,6 +85,31 @@ def judge(
         None if splats is None else scores(splats, splats, photo if splats_everywhere else surface_truth),
         pictures if splats is None else {**pictures, "splats": splats},
     )
+
+
+def judge_surface(
+    photo: np.ndarray, mask: np.ndarray | None, mesh: np.ndarray, silhouette: np.ndarray, lpips: Lpips | None = None
+) -> RegionScores:
+    """Scores of a drawing of a textured mesh where no field is drawn beside it: see `judge`."""
+    counted = silhouette if mask is None else mask
+    return _scores(mesh, mesh, photo, counted, None if mask is None else _on_white(photo, mask), lpips)
+
+
+def _scores(
+    image: np.ndarray,
+    colors: np.ndarray,
+    photo: np.ndarray,
+    counted: np.ndarray,
+    whole: np.ndarray | None,
+    lpips: Lpips | None,
+) -> RegionScores:
+    """Of colours against the photo where it counts, and of an image against a whole one where there is one."""
+    inside = score_image(colors, photo, counted, lpips) if counted.any() else None
+    return RegionScores(inside, None if whole is None else score_image(image, whole, None, lpips))
+
+
+def _on_white(photo: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
+    return photo if mask is None else np.where(mask[..., None], photo, np.uint8(WHITE))
 
 
 def laid_on_white(field: FieldDrawing) -> np.ndarray:

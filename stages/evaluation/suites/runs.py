@@ -3,6 +3,7 @@
 OUT/SUITE/SCENE/PRESET-seed0/         the workspace; the engine resumes it
 OUT/SUITE/SCENE/PRESET-seed0.json     settings, seed, machine, time, memory, scores
 OUT/SUITE/SCENE/PRESET-seed0.ply      the mesh that was scored, in the frame of the poses
+OUT/SUITE/SCENE/PRESET-4-blocks-seed0/  and so on: of a run in four blocks
 OUT/SUITE/SCENE/peers/                what peers started from, and a folder each
 OUT/SUITE/SCENE/PRESET-peer-NAME.json
 """
@@ -16,21 +17,24 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from glob import escape
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from configs.dotted import flatten
 from configs.params import Config
 from stages import artifacts
-from stages.engine.runner import Listener
+from stages.block_by_block import reconstruct_in_blocks
+from stages.engine.manifest import Manifest
+from stages.engine.runner import Listener, StageOutcome
 from stages.engine.stage import Stage
 from stages.engine.workspace import Workspace, storage_errors
-from stages.errors import HineusError, InputError
+from stages.errors import ConfigError, HineusError, InputError
 from stages.evaluation.machine import machine
 from stages.evaluation.peers.running import MESH, Peer, run_peer
 from stages.evaluation.suites.registry import Suite, find_scenes
 from stages.evaluation.suites.scene import SuiteScene, Wanted
-from stages.evaluation.suites.scores import posed_mesh, result_mesh, score_result
+from stages.evaluation.suites.scores import Part, posed_mesh, result_mesh, score_result
 from stages.export_poses import export_poses
+from stages.geometry.similarity import Similarity
 from stages.inputs.folders import WORKSPACE_RECORD, is_workspace
 from stages.posing.exporting import write_colmap
 from stages.reconstruct import Reconstruction, default_preset, reconstruct
@@ -55,6 +59,7 @@ class BenchRequest:
         seeds: how many runs a scene, with seeds 0, 1, ...
         wanted: how scenes are read. peers: run on the same photos and poses.
         preset, sets, until, device, workers: see `Request`.
+        blocks: how many each scene is cut into, or "auto"; None: it is run in one.
     """
 
     suite: Suite
@@ -69,6 +74,13 @@ class BenchRequest:
     until: str | None = None
     device: str = "auto"
     workers: int | None = None
+    blocks: int | Literal["auto"] | None = None
+
+    @property
+    def run_name(self) -> str:
+        """Of the files of a run, but for its seed."""
+        cut = "" if self.blocks is None else "-in-blocks" if self.blocks == "auto" else f"-{self.blocks}-blocks"
+        return f"{self.preset}{cut}"
 
 
 def run_bench(
@@ -85,6 +97,8 @@ def run_bench(
     scenes = find_scenes(request.suite, request.data, request.wanted, request.scenes)
     if request.out.resolve() == request.data.resolve():
         raise InputError("Results would lie among the data.", "Name another folder with `--out`.")
+    if request.peers and request.blocks is not None:
+        raise ConfigError("`--peer` does not go with `--blocks`.", "Peers are run on scenes in one.")
     request = replace(request, preset=request.preset or default_preset())
     for scene in scenes:
         folder = request.out / request.suite.name / scene.name
@@ -105,22 +119,22 @@ def _run(
     folder: Path,
     seed: int,
 ) -> dict[str, Any]:
-    place = folder / f"{request.preset}-seed{seed}"
+    place = folder / f"{request.run_name}-seed{seed}"
     file = place.with_name(f"{place.name}.json")
     result = {**_heading(request, scene, OURS), "seed": seed}
     try:
         if seed:
-            _share_poses(folder / f"{request.preset}-seed0", place)
-        done = reconstruct(_ask(request, scene, place, seed), pipeline, listener)
-        fresh = {outcome.name for outcome in done.outcomes}
-        made_from = {"scoring": SCORING, **_fingerprints(done.workspace, fresh)}
+            _share_poses(folder / f"{request.run_name}-seed0", place)
+        done = _reconstruct(request, _ask(request, scene, place, seed), pipeline, listener)
+        made_from = {"scoring": SCORING, **done.made_from}
         known = _load(file)
         if known and _is_current(known, made_from, result):
             return known
         result |= _costs(done)
-        result["settings"] = _differing(done.config.model_dump(mode="json"))
-        mesh = result_mesh(done.workspace, fresh, place.with_name(f"{place.name}.ply"))
-        result["scores"] = score_result(scene, done.workspace, mesh, fresh, done.device)
+        result["settings"] = _differing(done.whole.config.model_dump(mode="json"))
+        mesh = result_mesh(done.parts, done.fresh, place.with_name(f"{place.name}.ply"))
+        workspace, device = done.whole.workspace, done.whole.device
+        result["scores"] = score_result(scene, workspace, done.parts, mesh, done.fresh, device)
         result["made_from"] = made_from
     except HineusError as error:
         return _failed(result, error)
@@ -170,7 +184,53 @@ def _share_poses(first: Path, place: Path) -> None:
         shutil.rmtree(partial, ignore_errors=True)
 
 
-def _costs(done: Reconstruction) -> dict[str, Any]:
+@dataclass(frozen=True)
+class _Done:
+    """A run, in one or in blocks.
+
+    Attributes:
+        parts: where its results are. fresh: stages that are up to date in all of them.
+        outcomes: of all stages, those of each block as well.
+        photos: how many have poses; None: not so far yet.
+        made_from: fingerprints of what is there.
+    """
+
+    whole: Reconstruction
+    parts: tuple[Part, ...]
+    fresh: set[str]
+    outcomes: tuple[StageOutcome, ...]
+    photos: int | None
+    made_from: dict[str, str]
+
+
+def _reconstruct(request: BenchRequest, asked: Request, pipeline: Sequence[Stage], listener: Listener | None) -> _Done:
+    """Raises HineusError: the run, or one of its blocks, failed."""
+    if request.blocks is None:
+        whole = reconstruct(asked, pipeline, listener)
+        fresh = {outcome.name for outcome in whole.outcomes}
+        photos = next((int(o.numbers["images"]) for o in whole.outcomes if o.name == "undistort"), None)
+        itself = Part(whole.workspace, Similarity.identity())
+        return _Done(whole, (itself,), fresh, whole.outcomes, photos, _fingerprints(whole.workspace, fresh))
+    runs = reconstruct_in_blocks(asked, None if request.blocks == "auto" else request.blocks, pipeline, listener)
+    if failure := runs.failure():
+        raise failure
+    poses_from_plan = runs.plan.plan_from_poses.similarity().inverse()
+    parts = tuple(Part(Workspace.open(outcome.workspace), poses_from_plan) for outcome in runs.outcomes)
+    names, outcomes, made_from = [stage.name for stage in pipeline], [*runs.whole.outcomes], dict[str, str]()
+    for part in parts:
+        made = _fingerprints(part.workspace, names)
+        made_from |= {f"{part.workspace.root.name} {name}": fingerprint for name, fingerprint in made.items()}
+        outcomes += [_told(manifest) for name in names if (manifest := part.workspace.published(name))]
+    photos = len({photo for block in runs.plan.blocks for photo in block.photos})
+    return _Done(runs.whole, parts, set(names), tuple(outcomes), photos, made_from)
+
+
+def _told(manifest: Manifest) -> StageOutcome:
+    made = manifest.numbers, manifest.wall_s, manifest.cpu_s, manifest.peak_rss
+    return StageOutcome(manifest.identity.stage, "skipped", "", *made)
+
+
+def _costs(done: _Done) -> dict[str, Any]:
     stages = [
         {
             "name": outcome.name,
@@ -181,14 +241,14 @@ def _costs(done: Reconstruction) -> dict[str, Any]:
         for outcome in done.outcomes
     ]
     return {
-        "device": done.device,
+        "device": done.whole.device,
         "machine": machine(),
         "wall_s": round(sum(outcome.wall_s for outcome in done.outcomes), 2),
         "cpu_s": round(sum(outcome.cpu_s for outcome in done.outcomes), 2),
         # what peers are to be compared with: they start from photos that have poses
         "wall_after_poses_s": round(sum(o.wall_s for o in done.outcomes if o.name not in POSED), 2),
         "peak_rss": max(outcome.peak_rss for outcome in done.outcomes),
-        "photos": next((int(o.numbers["images"]) for o in done.outcomes if o.name == "undistort"), None),
+        "photos": done.photos,
         "stages": stages,
     }
 
@@ -225,7 +285,7 @@ def _run_peers(request: BenchRequest, scene: SuiteScene, folder: Path) -> Iterat
                 export_poses(workspace.root, given, write_colmap)
             result |= run_peer(peer, given, made)
             mesh = posed_mesh(workspace, made / MESH, file.with_suffix(".ply"))
-            result["scores"] = score_result(scene, workspace, mesh, set(), "cpu")
+            result["scores"] = score_result(scene, workspace, (), mesh, set(), "cpu")
             result["made_from"] = made_from
         except HineusError as error:
             yield _failed(result, error)
@@ -236,12 +296,13 @@ def _run_peers(request: BenchRequest, scene: SuiteScene, folder: Path) -> Iterat
 
 # ---------------------------------------------------------------- results
 def _heading(request: BenchRequest, scene: SuiteScene, method: str) -> dict[str, Any]:
+    cut = () if request.blocks is None else (f"blocks={request.blocks}",)
     return {
         "suite": request.suite.name,
         "scene": scene.name,
         "method": method,
         "preset": request.preset,
-        "asked": dict(text.partition("=")[::2] for text in request.sets) if method == OURS else {},
+        "asked": dict(text.partition("=")[::2] for text in (*request.sets, *cut)) if method == OURS else {},
         "masks": scene.masks is not None,
         "known_poses": scene.poses is not None,
         "lacking": list(scene.lacking),
