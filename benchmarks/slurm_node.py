@@ -1,12 +1,18 @@
 """Blocks on a cluster of one node: a Slurm of our own, a run through it, and what becomes of it when the node dies.
 
 python -m benchmarks.slurm_node [--seconds 20]
+python -m benchmarks.slurm_node --photos PHOTOS [--blocks 2] [--set ...]     real blocks, in PHOTOS_slurm
 
 Needs Debian's slurm-wlm and munge (`apt-get install slurm-wlm munge`), hineus[cluster], and root. Everything lies in
 a temporary folder, but for a link at /etc/slurm/slurm.conf, where jobs look; nothing is left. The run is a plan of
 two blocks: four steps that count seconds in a file and go on from there, as training does from its checkpoint. In the
 middle of the first the node dies: its daemon, the jobs and all below them are killed at once. Later it comes back.
-What is told at the end: how often each step was begun, whether the run finished, and how many seconds were counted.
+What is told at the end: how often each step was begun, whether the run finished, how many seconds were counted, and
+for how many GPUs the steps that learn had asked (the node says that it has two). Then the same is begun anew and
+stopped as by Ctrl-C, and it is told how many of its jobs are left in the queue.
+
+With photos the steps are those of `hineus run PHOTOS --blocks N --executor slurm`; the node dies in the middle of a
+training.
 """
 
 from __future__ import annotations
@@ -22,10 +28,11 @@ import tempfile
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 import psutil
 
@@ -33,6 +40,7 @@ from stages.block_by_block import Step
 from stages.block_jobs import Job, run_jobs
 from stages.workflow import Capacity
 
+T = TypeVar("T")
 PROGRAMS = ("munged", "slurmctld", "slurmd", "sbatch")
 NODE = "one"
 CONTROLLER_PORT, NODE_PORT = 26817, 26818
@@ -60,12 +68,14 @@ TaskPlugin=task/none
 MpiDefault=none
 SelectType=select/cons_tres
 SelectTypeParameters=CR_Core_Memory
+GresTypes=gpu
 SchedulerParameters=defer,batch_sched_delay=1,sched_interval=2
 SlurmdTimeout={lost_after}
 ReturnToService=2
-NodeName={node} NodeHostname={host} NodeAddr=127.0.0.1 CPUs={cores} RealMemory={memory}
+NodeName={node} NodeHostname={host} NodeAddr=127.0.0.1 CPUs={cores} RealMemory={memory} Gres=gpu:2
 PartitionName=blocks Nodes={node} Default=YES MaxTime=INFINITE State=UP
 """
+GPUS = f"NodeName={NODE} Name=gpu File=/dev/null,/dev/zero\n"  # nobody looks at them
 # Without a database of accounts; on a real cluster such a profile names partition and account (docs/large-scenes.md).
 PROFILE = """\
 slurm-no-account: true
@@ -179,6 +189,7 @@ def slurm_node() -> Iterator[SlurmNode]:
             lost_after=LOST_AFTER_S,
         )
     )
+    (folder / "gres.conf").write_text(GPUS)
     environment = {
         **os.environ,
         "SLURM_CONF": str(folder / "slurm.conf"),
@@ -222,7 +233,10 @@ def counting_jobs(folder: Path, seconds: int) -> list[Job]:
     for name, other in (names, names[::-1]):
         steps.append(Step(f"finish {name}", name, None, (f"train {name}",), (f"train {other}",)))
     program = [sys.executable, "-I", str(folder / "step.py")]
-    return [Job(step, [*program, step.name, str(folder), str(seconds)], 256 << 20) for step in steps]
+    return [
+        Job(step, [*program, step.name, str(folder), str(seconds)], 256 << 20, gpus=int(step.until == "train"))
+        for step in steps
+    ]
 
 
 def journal(folder: Path) -> Counter[str]:
@@ -231,16 +245,14 @@ def journal(folder: Path) -> Counter[str]:
     return Counter(path.read_text().splitlines() if path.exists() else [])
 
 
-def run_with_a_dead_node(folder: Path, seconds: int) -> dict[str, object]:
-    """The run; in its middle the node dies."""
-    with slurm_node() as node:
-        before = dict(os.environ)
-        os.environ.update(node.environment)
-        lost: list[int] = []
+def run_with_a_dead_node(run: Callable[[], T], is_in_the_middle: Callable[[], bool]) -> tuple[T, str]:
+    """What the run gives through a Slurm whose node dies in its middle; and what its jobs had asked for then."""
+    with slurm_node() as node, _in_environment(node.environment):
+        asked: list[str] = []
 
         def strike() -> None:
-            _await(lambda: journal(folder)["counted train b00"] >= seconds // 2, "step in its middle", 10 * PATIENCE_S)
-            lost.append(journal(folder)["counted train b00"])
+            _await(is_in_the_middle, "step in its middle", 20 * PATIENCE_S)
+            asked.append(node.told("squeue", "--noheader", "--Format=tres-per-job:40"))
             node.kill_node()
             node.await_state("down")
             node.start_node()
@@ -248,37 +260,110 @@ def run_with_a_dead_node(folder: Path, seconds: int) -> dict[str, object]:
         striking = threading.Thread(target=strike)
         striking.start()
         try:
-            start = time.monotonic()
-            failed = run_jobs(counting_jobs(folder, seconds), folder, Capacity(2, "slurm", workers=1), set())
-            wall = time.monotonic() - start
+            given = run()
         finally:
             striking.join()
-            os.environ.clear()
-            os.environ.update(before)
-        told = journal(folder)
+        return given, " ".join(asked[0].split())
+
+
+def count_with_a_dead_node(folder: Path, seconds: int) -> dict[str, object]:
+    """The steps that count; the node dies when the first has counted half of its seconds."""
+    start = time.monotonic()
+    failed, asked = run_with_a_dead_node(
+        lambda: run_jobs(counting_jobs(folder, seconds), folder, Capacity(2, "slurm", workers=1), set()),
+        lambda: journal(folder)["counted train b00"] >= seconds // 2,
+    )
+    told = journal(folder)
+    return {
+        "failed": sorted(failed),
+        "begun": {line[6:]: count for line, count in sorted(told.items()) if line.startswith("begun")},
+        "done": sorted(line[5:] for line in told if line.startswith("done")),
+        "gpus of the jobs when the node died": asked,
+        "counted_s": sum(count for line, count in told.items() if line.startswith("counted")),
+        "asked_for_s": 4 * seconds,
+        "wall_s": round(time.monotonic() - start),
+    }
+
+
+def left_after_ctrl_c(folder: Path) -> dict[str, object]:
+    """A run is stopped as by Ctrl-C while two of its jobs are at work."""
+    program = (
+        "import sys; from pathlib import Path; from benchmarks.slurm_node import *; "
+        "run_jobs(counting_jobs(Path(sys.argv[1]), 600), Path(sys.argv[1]), Capacity(2, 'slurm', workers=1), set())"
+    )
+    with slurm_node() as node, _in_environment(node.environment):
+        run = subprocess.Popen([sys.executable, "-c", program, str(folder)], stderr=subprocess.DEVNULL)
+        _await(lambda: {"begun train b00", "begun train b01"} <= set(journal(folder)), "jobs at work", 2 * PATIENCE_S)
+        before = node.told("squeue", "--noheader")
+        start = time.monotonic()
+        run.send_signal(signal.SIGINT)
+        run.wait(PATIENCE_S)
+        ended = time.monotonic() - start
+        with suppress(TimeoutError):
+            _await(lambda: not node.told("squeue", "--noheader"), "empty queue", 30.0)
+        left = node.told("squeue", "--noheader")
         return {
-            "failed": sorted(failed),
-            "begun": {line[6:]: count for line, count in sorted(told.items()) if line.startswith("begun")},
-            "done": sorted(line[5:] for line in told if line.startswith("done")),
-            "killed_after_s": lost[0],
-            "counted_s": sum(count for line, count in told.items() if line.startswith("counted")),
-            "asked_for_s": 4 * seconds,
-            "wall_s": round(wall),
+            "jobs before Ctrl-C": len(before.splitlines()),
+            "left in the queue after it": len(left.splitlines()),
+            "ended_after_s": round(ended, 1),
         }
+
+
+def reconstruct_with_a_dead_node(photos: Path, blocks: int, sets: Sequence[str]) -> dict[str, object]:
+    """Real blocks; the node dies when one has learned for a while."""
+    from stages.block_jobs import reconstruct_at_once
+    from stages.pipeline import PIPELINE
+    from stages.request import Request
+
+    workspace = photos.with_name(f"{photos.name}_slurm")
+    asked_for = Request(photos=photos, workspace=workspace, sets=tuple(sets), device="cpu", workers=1)
+    runs, _ = run_with_a_dead_node(
+        lambda: reconstruct_at_once(asked_for, blocks, Capacity(blocks, "slurm", workers=1), PIPELINE),
+        lambda: any(file.stat().st_size > 0 for file in (workspace / "blocks").rglob("metrics.jsonl")),
+    )
+    logs = {path.stem: path.read_text() for path in sorted((workspace / "blocks" / "steps" / "train").glob("*.log"))}
+    return {
+        "blocks": {outcome.name: outcome.state for outcome in runs.outcomes},
+        "trainings gone on with": {
+            name: [line for line in text.splitlines() if "goes on from step" in line] for name, text in logs.items()
+        },
+    }
+
+
+@contextmanager
+def _in_environment(environment: Mapping[str, str]) -> Iterator[None]:
+    before = dict(os.environ)
+    os.environ.update(environment)
+    try:
+        yield
+    finally:
+        os.environ.clear()
+        os.environ.update(before)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seconds", type=int, default=20, help="that each step counts")
+    parser.add_argument("--photos", type=Path, help="folder of photos: real blocks of them")
+    parser.add_argument("--blocks", type=int, default=2)
+    parser.add_argument("--set", action="append", default=[], dest="sets", help="as of hineus run")
     wanted = parser.parse_args()
     if not is_possible():
         sys.exit(
             "It needs root, `apt-get install slurm-wlm munge`, `pip install 'hineus[cluster]'`, and no "
             f"{SYSTEM_CONFIGURATION}."
         )
-    with tempfile.TemporaryDirectory() as folder:
-        for name, value in run_with_a_dead_node(Path(folder), wanted.seconds).items():
-            print(f"{name}: {value}")
+    if wanted.photos:
+        _show(reconstruct_with_a_dead_node(wanted.photos, wanted.blocks, wanted.sets))
+        return
+    for measure in (lambda folder: count_with_a_dead_node(folder, wanted.seconds), left_after_ctrl_c):
+        with tempfile.TemporaryDirectory() as folder:
+            _show(measure(Path(folder)))
+
+
+def _show(found: Mapping[str, object]) -> None:
+    for name, value in found.items():
+        print(f"{name}: {value}", flush=True)
 
 
 if __name__ == "__main__":

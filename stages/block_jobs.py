@@ -49,11 +49,17 @@ ERROR = re.compile(r"^Error: (?P<message>.*)\n(?P<hint>.*)", re.MULTILINE)
 
 @dataclass(frozen=True)
 class Job:
-    """How a step is done: words of a command that takes `--workers N`, and the bytes of memory that it asks for."""
+    """How a step is done.
+
+    Attributes:
+        command: words of a command that takes `--workers N`.
+        memory, gpus: bytes, and how many, that it asks for.
+    """
 
     step: Step
     command: Sequence[str]
     memory: int
+    gpus: int = 0
 
     @property
     def name(self) -> str:
@@ -139,6 +145,7 @@ def _write(jobs: Sequence[Job], folder: Path, capacity: Capacity, failed: Collec
                 "command": shlex.join(job.command),
                 "threads": capacity.threads,
                 "mem_mb": capacity.memory_mb(job.memory),
+                "gpu": job.gpus,
             }
     write_steps(folder, steps)
 
@@ -204,8 +211,9 @@ def _jobs(whole: Workspace, plan: BlockPlan, device: str) -> list[Job]:
     images = artifacts.IMAGE_SET.load(whole.stage_folder(artifacts.IMAGE_SET.stage)).images
     size = {image.name: (image.width, image.height) for image in images}
     memory = {block.name: memory_asked_for([size[name] for name in block.photos], config) for block in plan.blocks}
+    gpus = int(device.startswith("cuda"))  # auto: what the machines that it comes to happen to have
     return [
-        Job(step, [*OURSELVES, *step.command(whole.root)[1:], "--wait", "--device", device], memory[step.block])
+        Job(step, [*OURSELVES, *step.command(whole.root)[1:], "--wait", "--device", device], memory[step.block], gpus)
         for step in steps_of(plan)
     ]
 

@@ -49,8 +49,8 @@ def write_rules(folder: Path, rules: str) -> None:
 def write_steps(folder: Path, steps: Mapping[str, Mapping[str, Any]]) -> None:
     """
     Args:
-        steps: by kind and block: a dict with `needs` (names of markers), `command`, `threads` and `mem_mb` (of each
-            attempt).
+        steps: by kind and block: a dict with `needs` (names of markers), `command`, `threads`, `mem_mb` (of each
+            attempt) and `gpu` (how many).
     """
     write_own(folder / "steps.json", json.dumps({"steps": steps}, indent=1) + "\n")
 
