@@ -225,13 +225,13 @@ def _place_of_plan(place: Place, turn: np.ndarray) -> Place:
 
 def _cut(whole: _Whole, count: int | None, config: Config, made_from: str, settings: str) -> BlockPlan:
     points, observations = _only(whole.near, whole.points, whole.observations)
-    centers = whole.cameras.centers
+    centers, shown_by = whole.cameras.centers, np.bincount(observations[:, 1], minlength=len(points))
     plan = np.stack([points[:, :2].min(0), points[:, :2].max(0)])
     cores = cut_plan(plan, points, observations, len(centers), _enough(whole, count, config))
     fine = _ground_resolution(whole.cameras, points, observations)
-    widest = np.median([_radius(box) for box in on_lattice(cores, points, lattice_cell(fine))])
+    widest = np.median([_radius(box) for box in on_lattice(cores, points, shown_by, lattice_cell(fine))])
     cell = lattice_cell(max(fine, 2 * float(widest) / config.extract.resolution))
-    boxes = on_lattice(cores, points, cell)
+    boxes = on_lattice(cores, points, shown_by, cell)
     seen = photos_of_blocks(boxes, points, observations, centers)
     names = [f"b{number:0{max(2, len(str(len(boxes) - 1)))}d}" for number in range(len(boxes))]
     blocks = [

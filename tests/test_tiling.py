@@ -35,7 +35,12 @@ def survey(seed: int = 0, photos: int = 80) -> tuple[np.ndarray, np.ndarray, np.
 def boxes_of(count: int, seed: int = 0, cell: float = 0.125) -> list[BlockBox]:
     points, observations, centers = survey(seed)
     cores = cut_plan(PLAN, points, observations, len(centers), lambda parts, _: parts >= count)
-    return on_lattice(cores, points, cell)
+    return on_lattice(cores, points, shown_by(observations), cell)
+
+
+def shown_by(observations: np.ndarray) -> np.ndarray:
+    """How many photos show each of the 4000 points."""
+    return np.bincount(observations[:, 1], minlength=4000)
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 5, 8])
@@ -58,13 +63,24 @@ def test_regions_overlap_by_the_share_that_is_stated():
         assert (box.margin[:2] <= 0.15 * side[:2]).all()
 
 
+def test_a_block_is_as_high_as_what_three_photos_show():
+    core, counts = [np.array([[0.0, 0.0], [10.0, 10.0]])], np.full(100, 3)
+    points = np.random.default_rng(0).uniform((0, 0, 0), (10, 10, 2), (100, 3))
+    points[:2, 2], counts[:2] = (-50, 70), 2  # matched wrongly
+    low, high = on_lattice(core, points, counts, 0.125)[0].core[:, 2]
+    assert -1.5 <= low <= 0
+    assert 2 <= high <= 3.5
+    low, high = on_lattice(core, points, np.full(100, 2), 0.125)[0].core[:, 2]
+    assert min(-low - 50, high - 70) > 0, "where no point is surer than others, all count"
+
+
 def test_the_heaviest_part_is_cut_so_that_all_are_as_much_work():
     points, observations, centers = survey()
     crowd = observations[centers[observations[:, 0], 0] < 10] + [len(centers), 0]  # the left quarter, flown twice
     observations = np.concatenate([observations, crowd])
     cores = cut_plan(PLAN, points, observations, 2 * len(centers), lambda parts, _: parts >= 4)
     assert 12 < min(core[1, 0] for core in cores) < 18, "the first cut is in the middle of the plan, not of the work"
-    boxes = on_lattice(cores, points, 0.125)
+    boxes = on_lattice(cores, points, shown_by(observations), 0.125)
     loads = photos_of_blocks(boxes, points, observations, np.tile(centers, (2, 1))).sum(1)
     assert loads.max() < 2 * loads.min()
 
@@ -72,7 +88,8 @@ def test_the_heaviest_part_is_cut_so_that_all_are_as_much_work():
 def test_no_more_photos_than_are_enough():
     points, observations, centers = survey()
     cores = cut_plan(PLAN, points, observations, len(centers), lambda _, heaviest: heaviest <= 25)
-    loads = photos_of_blocks(on_lattice(cores, points, 0.125), points, observations, centers).sum(1)
+    boxes = on_lattice(cores, points, shown_by(observations), 0.125)
+    loads = photos_of_blocks(boxes, points, observations, centers).sum(1)
     assert loads.max() <= 27  # the lattice moves borders by half a cell
     assert len(cores) > 4
 

@@ -23,6 +23,9 @@ OVERLAP = 0.125
 NARROWEST = 0.25
 # A photo sees a block that holds this part of the points it shows, and so many at least.
 SEEN_SHARE, SEEN_POINTS = 0.05, 8
+# How high a block is say points that so many photos show: where two are matched wrongly, they meet somewhere all the
+# same, far under the ground as a rule.
+SURE_PHOTOS = 3
 # Axes across which tiles meet.
 UPRIGHT = (0, 1)
 # Bits of the cell's mantissa: so few that multiples of it are exact, whatever program computes them.
@@ -170,19 +173,27 @@ def lattice_cell(size: float) -> float:
     return math.ldexp(math.ceil(math.ldexp(mantissa, CELL_BITS)), exponent - CELL_BITS)
 
 
-def on_lattice(cores: list[Float[np.ndarray, "2 2"]], points: Float[np.ndarray, "p 3"], cell: float) -> list[BlockBox]:
+def on_lattice(
+    cores: list[Float[np.ndarray, "2 2"]],
+    points: Float[np.ndarray, "p 3"],
+    shown_by: Integer[np.ndarray, " p"],
+    cell: float,
+) -> list[BlockBox]:
     """Boxes whose faces are planes of the lattice: cores that tile the plan as before, as high as their points.
 
     Args:
-        points: those that are to be reconstructed.
+        points: those that are to be reconstructed. shown_by: how many photos show each.
     """
+    sure = shown_by >= SURE_PHOTOS
     lowest, highest = np.min([core[0] for core in cores], 0), np.max([core[1] for core in cores], 0)
     boxes = []
     for core in cores:
         side = core[1] - core[0]
         grown = core + np.array([[-1.0], [1.0]]) * OVERLAP * side
-        held = points[within(points, grown), 2]
-        heights = held if len(held) else points[:, 2]
+        held = within(points, grown)
+        surely_held = held & sure
+        heights = points[surely_held if surely_held.sum() >= SEEN_POINTS else held, 2]
+        heights = heights if len(heights) else points[:, 2]
         margin = np.maximum(np.ceil(OVERLAP * np.append(side, side.max()) / cell), 1) * cell
         low = np.append(np.where(core[0] == lowest, np.floor(core[0] / cell), np.round(core[0] / cell)) * cell,
                         np.floor(heights.min() / cell) * cell - margin[2])  # fmt: skip
