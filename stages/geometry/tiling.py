@@ -23,9 +23,9 @@ OVERLAP = 0.125
 NARROWEST = 0.25
 # A photo sees a block that holds this part of the points it shows, and so many at least.
 SEEN_SHARE, SEEN_POINTS = 0.05, 8
-# How high a block is say points that so many photos show: where two are matched wrongly, they meet somewhere all the
-# same, far under the ground as a rule.
-SURE_PHOTOS = 3
+# How high a block is say points that so many photos show, where this part of its points are such: two photos that are
+# matched wrongly meet somewhere all the same, far under the ground as a rule.
+SURE_PHOTOS, SURE_SHARE = 3, 0.1
 # Axes across which tiles meet.
 UPRIGHT = (0, 1)
 # Bits of the cell's mantissa: so few that multiples of it are exact, whatever program computes them.
@@ -192,7 +192,7 @@ def on_lattice(
         grown = core + np.array([[-1.0], [1.0]]) * OVERLAP * side
         held = within(points, grown)
         surely_held = held & sure
-        heights = points[surely_held if surely_held.sum() >= SEEN_POINTS else held, 2]
+        heights = points[surely_held if surely_held.sum() >= SURE_SHARE * held.sum() else held, 2]
         heights = heights if len(heights) else points[:, 2]
         margin = np.maximum(np.ceil(OVERLAP * np.append(side, side.max()) / cell), 1) * cell
         low = np.append(np.where(core[0] == lowest, np.floor(core[0] / cell), np.round(core[0] / cell)) * cell,
