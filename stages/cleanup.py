@@ -11,6 +11,7 @@ import numpy as np
 
 from configs.params import CleanupParams
 from stages.artifacts import (
+    AROUND_MESH,
     CLEAN_FULL_MESH,
     CLEAN_MESH,
     GIVEN_REGION,
@@ -111,12 +112,14 @@ def run(context: StageContext[CleanupParams]) -> dict[str, Any]:
 
     context.progress(2, 5, "what the cameras see")
     if params.min_views > 0:
+        around = context.read(AROUND_MESH)
         views = selection.count_views(
             vertices,
             faces,
             cameras,
             params.min_views,
             progress=lambda done, total: context.progress(2 + done / total, 5, "what the cameras see"),
+            others=[] if around is None else [around],
         )
         hint = "The poses and the mesh disagree; try `--set cleanup.min_views=0` to look at the raw mesh."
         keep(_seen_faces(vertices, faces, views >= params.min_views, params), "unseen_faces", hint)
@@ -256,10 +259,10 @@ def _seen_faces(vertices: np.ndarray, faces: np.ndarray, seen: np.ndarray, param
 
 CLEANUP: Stage[CleanupParams] = Stage(
     name="cleanup",
-    version=10,
+    version=11,
     settings=lambda config: config.cleanup,
     run=run,
-    reads=(SCENE, PINHOLE_PHOTOS, OUTLINES, SILHOUETTES, GIVEN_REGION, RAW_MESH),
+    reads=(SCENE, PINHOLE_PHOTOS, OUTLINES, SILHOUETTES, GIVEN_REGION, RAW_MESH, AROUND_MESH),
     writes=(CLEAN_MESH, CLEAN_FULL_MESH),
     sources=(NEIGHBOURS,),
     summary="floaters and unseen shells gone, manifold, decimated",

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from configs.params import ExtractParams
-from stages.artifacts import FIELD, POINT_CLOUD, RAW_MESH, SCENE
+from stages.artifacts import AROUND_MESH, FIELD, POINT_CLOUD, RAW_MESH, SCENE
 from stages.artifacts.blocks import NEIGHBOURS, learned_by, read_tile
 from stages.engine.stage import Stage, StageContext
 from stages.errors import ReconstructionError
@@ -54,9 +54,11 @@ def run(context: StageContext[ExtractParams]) -> dict[str, Any]:
         vertices, used = fit.vertices, fit.used
     vertices = denoised(vertices, faces, context.params.denoising)
     if found.sides:
-        from stages.surface.tiles import fading
+        from stages.surface.tiles import fading, surface_around
 
         vertices = start + fading(start, found.sides, found.cell)[:, None].astype(np.float32) * (vertices - start)
+        around = surface_around(field.sdf, found.sides)
+        context.write(AROUND_MESH, around if len(around[1]) else None)
     context.write(RAW_MESH, (vertices, faces))
     return {
         **found.numbers,
@@ -163,11 +165,11 @@ def _in_plan(field: TrainedField, plan_from_scene: Similarity) -> Callable[[np.n
 
 EXTRACT: Stage[ExtractParams] = Stage(
     name="extract",
-    version=4,
+    version=5,
     settings=lambda config: config.extract,
     run=run,
     reads=(SCENE, FIELD, POINT_CLOUD),
-    writes=(RAW_MESH,),
+    writes=(RAW_MESH, AROUND_MESH),
     sources=(NEIGHBOURS,),
     summary="field to mesh, fitted to the dense points",
 )

@@ -53,6 +53,7 @@ def stage(tmp_path):
         region=None,
         kind=artifacts.PINHOLE_PHOTOS,
         neighbours=None,
+        around=None,
         **params,
     ):
         for folder in (undistort, train, extract, place, out):
@@ -61,6 +62,7 @@ def stage(tmp_path):
         artifacts.SCENE.save(train, replace(scene_without_points(cameras), **(scene_extras or {})))
         artifacts.GIVEN_REGION.save(place, region)
         artifacts.RAW_MESH.save(extract, (vertices, faces))
+        artifacts.AROUND_MESH.save(extract, around)
         if masks is not None:
             import cv2
 
@@ -122,6 +124,23 @@ def test_views_of_a_ball_are_those_on_its_near_side():
     horizon = 0.5**2 / 2.5  # the tangent cone touches the ball at x = r^2 / d
     assert seen[vertices[:, 0] > horizon + 0.06].all()
     assert not seen[vertices[:, 0] < horizon - 0.06].any()
+
+
+def test_what_is_in_the_way_hides_though_it_is_no_part_of_the_mesh():
+    vertices, faces = ball()
+    cameras = three_rings(count=1, elevations=(0,))  # at +x
+    wall = np.array([[0.8, 0, -2], [0.8, 2, -2], [0.8, 2, 2], [0.8, 0, 2]]), np.array([[0, 1, 2], [0, 2, 3]])
+    seen = selection.count_views(vertices, faces, cameras, enough=1, others=[wall]) > 0
+    near = vertices[:, 0] > 0.3
+    assert seen[near & (vertices[:, 1] < -0.05)].all()
+    assert not seen[near & (vertices[:, 1] > 0.05)].any()
+
+
+def test_what_lies_around_a_tile_hides_what_is_under_it(stage):
+    dome = triangle_mesh.clip(*ball(0.8), np.array([1.0, 0, 0]), -0.3)
+    _, kept, _ = stage(*ball(), around=dome, rings=0, max_hidden_area=0.0)
+    assert kept[:, 0].min() < -0.49
+    assert kept[:, 0].max() < 0.2
 
 
 def test_views_are_counted_up_to_enough():

@@ -108,6 +108,18 @@ def test_fields_that_disagree_are_blended_over_their_overlap(tiles):
     assert 0.01 < heights[1] < 0.05
 
 
+def test_what_a_block_has_learned_beyond_its_tile_lies_around_it(tiles, tmp_path):
+    tiles({"b00": 0.1}, asked=["b00"])
+    (out,) = tmp_path.glob("b00_*/out")
+    vertices, faces = artifacts.AROUND_MESH.load(out)
+    region = BOXES["b00"].region
+    x, y, z = (vertices * 1.05 * np.linalg.norm(region[1] - region[0]) / 2 + region.mean(0)).T
+    assert len(faces) > 100
+    assert z == pytest.approx(np.full(len(z), 0.1), abs=1e-3)
+    assert ((x > -1e-5) | (x < -4 + 1e-5) | (np.abs(y) > 4 - 1e-5)).all()
+    assert x.max() > 2
+
+
 def test_a_neighbour_that_has_learned_nothing_is_named(tiles, caplog):
     ((numbers, vertices, _),) = tiles({"b00": 0.1}, asked=["b00"])
     assert numbers["missing"] == "b01"

@@ -27,7 +27,7 @@ from stages.artifacts.export import (
 from stages.artifacts.ingest import IMAGE_SET, LEFT_OUT, PHOTOS, ImageRecord, ImageSet, SkippedImage
 from stages.artifacts.json_files import read_json, write_json
 from stages.artifacts.materials import KNOWN, LIGHT, LIGHT_HARMONICS, LIGHT_HDR, MATERIAL_COLOR, ORM
-from stages.artifacts.mesh import CLEAN_FULL_MESH, CLEAN_MESH, RAW_MESH
+from stages.artifacts.mesh import AROUND_MESH, CLEAN_FULL_MESH, CLEAN_MESH, RAW_MESH
 from stages.artifacts.pictures import IMAGES, MASKS, Pictures, read_texture, texture_bytes, write_png
 from stages.artifacts.place import GIVEN_REGION, WORLD_PLACE, PlaceRecord, SimilarityRecord
 from stages.artifacts.report import PAGE

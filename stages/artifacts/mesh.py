@@ -30,6 +30,19 @@ def _mesh(stage: str, name: str) -> Artifact[Mesh]:
     return Artifact(stage, (name,), load, save)
 
 
+def _load_around(folder: Path) -> Mesh | None:
+    return _AROUND.load(folder) if (folder / _AROUND.files[0]).exists() else None
+
+
+def _save_around(folder: Path, mesh: Mesh | None) -> None:
+    if mesh is not None:
+        _AROUND.save(folder, mesh)
+
+
+_AROUND = _mesh("extract", "around.ply")
+
 RAW_MESH = _mesh("extract", "mesh.ply")
+AROUND_MESH: Artifact[Mesh | None] = Artifact("extract", _AROUND.files, _load_around, _save_around, optional=True)
+"""What a block has learned around its tile, coarse; None where there is nothing, or no tile."""
 CLEAN_FULL_MESH = _mesh("cleanup", "full_mesh.ply")
 CLEAN_MESH = _mesh("cleanup", "mesh.ply")

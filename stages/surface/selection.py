@@ -5,7 +5,7 @@ Selections are boolean arrays over faces [F] or vertices [V].
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -57,13 +57,17 @@ def count_views(
     cameras: PinholeCameras,
     enough: int,
     progress: Callable[[int, int], None] | None = None,
+    others: Sequence[tuple[np.ndarray, np.ndarray]] = (),
 ) -> np.ndarray:
     """In how many cameras' images each vertex [V] shows, counted up to `enough`.
 
     A vertex shows if it projects into the image, faces the camera and the way there is free. One ray per vertex and
     camera, so no face is too small to be found; each vertex tries the cameras it faces best first, and stops early.
+
+    Args:
+        others: vertices and faces of other meshes, which may be in the way.
     """
-    scene = raycaster(vertices, faces)
+    scene = raycaster(vertices, faces, *others)
     normals = vertex_normals(vertices, faces)
     starts = _off_the_surface(vertices, faces, normals)
 

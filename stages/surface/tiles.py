@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from stages.geometry.tiling import BlockBox, eased, weights
-from stages.surface.isosurface import Isosurface, extract_box
+from stages.surface.isosurface import Isosurface, SignedDistance, extract_box, extract_isosurface
+from stages.surface.triangle_mesh import compact
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
@@ -26,6 +27,8 @@ PORTION = 64
 FADE_CELLS = 6.0
 # What no block has learned is outside of everything, by so many cells.
 UNKNOWN_CELLS = 10.0
+# Cells along the region in which what lies around a tile is looked at: the ground and the houses hide things there.
+AROUND_CELLS = 96
 
 
 @dataclass(frozen=True)
@@ -78,6 +81,21 @@ def extract_tile(
     low, high = (np.round(corner / cell).astype(np.int64) for corner in core)
     values = TileValues(blended(fields, UNKNOWN_CELLS * cell), low, high, cell)
     return extract_box(values, low, high, cell, block, progress=progress)
+
+
+def surface_around(
+    sdf: SignedDistance, sides: Sequence[tuple[np.ndarray, float]]
+) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:
+    """Vertices and faces of what a block has learned beyond its tile: coarse, and part of no tile.
+
+    A tile is open where others go on. From there one looks under its ground, unless this is in the way.
+
+    Args:
+        sdf: of the block, in its scene frame. sides: planes (normal, offset) with the tile above them.
+    """
+    surface = extract_isosurface(sdf, AROUND_CELLS)
+    beyond = heights_above(surface.vertices, sides) < 0
+    return compact(surface.vertices, surface.faces[beyond[surface.faces].all(1)])
 
 
 class TileValues:

@@ -246,13 +246,14 @@ def clip(vertices: np.ndarray, faces: np.ndarray, normal: np.ndarray, offset: fl
     return compact(np.concatenate([vertices, cut.astype(vertices.dtype)]), np.concatenate([whole, *new]))
 
 
-def raycaster(vertices: np.ndarray, faces: np.ndarray) -> Any:
-    """Open3D's RaycastingScene of one mesh."""
+def raycaster(vertices: np.ndarray, faces: np.ndarray, *others: tuple[np.ndarray, np.ndarray]) -> Any:
+    """Open3D's RaycastingScene of one mesh, or of that and others."""
     import open3d as o3d
 
     scene = o3d.t.geometry.RaycastingScene()
-    scene.add_triangles(
-        o3d.core.Tensor(np.ascontiguousarray(vertices, dtype=np.float32)),
-        o3d.core.Tensor(np.ascontiguousarray(faces, dtype=np.uint32)),
-    )
+    for places, corners in ((vertices, faces), *others):
+        scene.add_triangles(
+            o3d.core.Tensor(np.ascontiguousarray(places, dtype=np.float32)),
+            o3d.core.Tensor(np.ascontiguousarray(corners, dtype=np.uint32)),
+        )
     return scene
