@@ -6,6 +6,7 @@ python -m benchmarks.blocks TRUTH WHOLE ...                      TRUTH is DATA/t
 
 A line of JSON for each workspace. Step: of places along a border, the difference between the errors of the height on
 either side, `APART` of the truth's extent away from it; inside: the same along lines through the middles of the blocks.
+Tint: of each of these lines the median of the colours' ratio on either side, in percent, mean over channels.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +29,7 @@ from stages.surface.triangle_mesh import raycaster
 
 APART = 0.002
 PLACES = 2000  # along a border
+FEWEST_BOTH = 0.3  # part of a line that must have surface on both sides
 Mesh = tuple[np.ndarray, np.ndarray]
 
 
@@ -50,6 +53,7 @@ def measure(root: Path, truth: Path) -> dict[str, Any]:
         "photos": photos,
         **score_surface(*mesh, known).as_dict(),
         **({} if plan is None else steps(plan, truth_from_plan, mesh, known)),
+        **({} if plan is None else tints(plan, parts, APART * known.surface.extent / truth_from_plan.scale)),
         "cpu_s_a_photo": round(sum(made["cpu_s"] for made in spent) / photos, 2),
         "gib": round(max(made["peak_rss"] for made in spent) / 2**30, 2),
         "faces": len(mesh[1]),
@@ -77,16 +81,9 @@ def manifests(workspace: Workspace) -> list[dict[str, Any]]:
 
 def steps(plan: BlockPlan, truth_from_plan: Similarity, mesh: Mesh, known: KnownObject) -> dict[str, float]:
     """Mean steps (the largest 5 % left out) across borders and inside, in percent of the extent, and their ratio."""
-    lines: dict[str, list[Any]] = {"border": [], "inside": []}
-    for block in plan.blocks:
-        (x0, y0, _), (x1, y1, _) = block.core
-        for axis, at in ((0, x1), (1, y1)):
-            along = np.linspace((y0, x0)[axis], (y1, x1)[axis], PLACES)
-            lines["border"].append(line(axis, at, along))
-            lines["inside"].append(line(axis, ((x0 + x1) / 2, (y0 + y1) / 2)[axis], along))
     apart = APART * known.surface.extent / truth_from_plan.scale
     found = {}
-    for name, pieces in lines.items():
+    for name, pieces in lines(plan).items():
         errors = [
             heights(mesh, known, truth_from_plan, np.concatenate([at + side * apart * across for at, across in pieces]))
             for side in (-1, 1)
@@ -98,6 +95,75 @@ def steps(plan: BlockPlan, truth_from_plan: Similarity, mesh: Mesh, known: Known
         **{name: round(value, 4) for name, value in found.items()},
         "ratio": round(found["step_border"] / found["step_inside"], 3),
     }
+
+
+def tints(plan: BlockPlan, parts: list[Workspace], apart: float) -> dict[str, float]:
+    """Mean tints across borders and inside, in percent; `apart`: distance from the line, in the plan's units."""
+    tiles = [_Textured.of(part) for part in parts]
+    found = {}
+    for name, pieces in lines(plan).items():
+        tint = []
+        for at, across in pieces:
+            left, right = (np.log(seen_from_above(tiles, at + side * apart * across)) for side in (-1, 1))
+            both = np.isfinite(left + right).all(1)
+            if both.mean() > FEWEST_BOTH:
+                tint.append(np.abs(np.median((left - right)[both], axis=0)).mean())
+        found[f"tint_{name}"] = round(100 * float(np.mean(tint)), 3)
+    return found
+
+
+@dataclass(frozen=True)
+class _Textured:
+    """A tile in the plan's frame: vertices, faces, texture coordinates of the vertices, texture [S, S, 3]."""
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    uvs: np.ndarray
+    texture: np.ndarray
+
+    @staticmethod
+    def of(workspace: Workspace) -> _Textured:
+        from PIL import Image
+
+        atlas = artifacts.ATLAS_MESH.load(workspace.stage_folder("atlas"))
+        scene = artifacts.SCENE.load(workspace.stage_folder("train"))
+        texture = np.asarray(Image.open(artifacts.BASE_COLOR.load(workspace.stage_folder("bake"))).convert("RGB"))
+        vertices = scene.poses_from_scene.apply(atlas.vertices.astype(np.float64))
+        return _Textured(vertices, atlas.faces, atlas.uvs, texture)
+
+
+def seen_from_above(tiles: list[_Textured], places: np.ndarray) -> np.ndarray:
+    """Colours [P, 3], 1..255, of the highest surface over places in the plan's frame; NaN where there is none."""
+    import open3d as o3d
+
+    above = max(float(tile.vertices[:, 2].max()) for tile in tiles) + 1
+    start = np.column_stack([places[:, :2], np.full(len(places), above)])
+    rays = np.concatenate([start, np.broadcast_to([0.0, 0.0, -1.0], start.shape)], 1).astype(np.float32)
+    nearest, colors = np.full(len(places), np.inf), np.full((len(places), 3), np.nan)
+    for tile in tiles:
+        hit = raycaster(tile.vertices, tile.faces).cast_rays(o3d.core.Tensor(rays))
+        away, corner = hit["t_hit"].numpy(), hit["primitive_uvs"].numpy()
+        closer = away < nearest
+        corners = tile.uvs[tile.faces[hit["primitive_ids"].numpy()[closer].astype(np.int64)]]
+        weights = np.column_stack([1 - corner.sum(1), corner])[closer]
+        size = len(tile.texture)
+        column, row = (np.einsum("pc,pcd->dp", weights, corners) * [[1], [-1]] + [[0], [1]]) * size
+        pixels = [np.clip(axis, 0, size - 1).astype(np.int64) for axis in (row, column)]
+        colors[closer] = np.maximum(tile.texture[tuple(pixels)], 1)
+        nearest[closer] = away[closer]
+    return colors
+
+
+def lines(plan: BlockPlan) -> dict[str, list[Any]]:
+    """Lines along the blocks' upper borders, of which the outermost have nothing beyond, and through their middles."""
+    found: dict[str, list[Any]] = {"border": [], "inside": []}
+    for block in plan.blocks:
+        (x0, y0, _), (x1, y1, _) = block.core
+        for axis, at in ((0, x1), (1, y1)):
+            along = np.linspace((y0, x0)[axis], (y1, x1)[axis], PLACES)
+            found["border"].append(line(axis, at, along))
+            found["inside"].append(line(axis, ((x0 + x1) / 2, (y0 + y1) / 2)[axis], along))
+    return found
 
 
 def line(axis: int, at: float, along: np.ndarray) -> Any:

@@ -1,33 +1,27 @@
-"""`hineus view`: the report of a workspace on a local web server, or a training run as it goes.
+"""`hineus view`: the report of a workspace on a local web server, or a run as it goes; or those of all blocks.
 
-It only reads. Served are the report, the live page, its state and the preview pictures, to this machine alone, and to
-no page of another site that an open browser may show: see `_Handler` and `_Server`.
+It only reads. Served are reports, live pages, their states and preview pictures, to this machine alone, and to no page
+of another site that an open browser may show: see `_Handler` and `_Server`.
 """
 
 from __future__ import annotations
 
-import base64
-import hashlib
-import json
 import logging
-import re
 import socket
 import threading
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
-from functools import cache
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from importlib import resources
-from io import SEEK_END, BytesIO
+from io import SEEK_END
 from pathlib import Path
 from shutil import copyfileobj
 from typing import Any, BinaryIO
 
+from hineus_cli.watching import Answer, Watched
+from hineus_cli.watching_blocks import watched_in_blocks
 from stages import artifacts
-from stages.artifacts.own_files import open_own
 from stages.engine.stage import Stage
 from stages.engine.workspace import Workspace
 from stages.errors import ConfigError, HineusError, WorkspaceError
@@ -35,7 +29,6 @@ from stages.errors import ConfigError, HineusError, WorkspaceError
 log = logging.getLogger(__name__)
 
 HOST = "127.0.0.1"
-LIVE_PAGE = "live.html"
 
 MOST_CONNECTIONS = 32  # a browser opens six
 ASKING_S, ANSWERING_S = 10.0, 300.0  # a report of 100 MB through a slow tunnel takes a while
@@ -46,8 +39,6 @@ POLICY = (
     "default-src 'none'; script-src {scripts}; style-src 'unsafe-inline'; img-src 'self' data: blob:; "
     "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 )
-# A report's splats are unpacked by WebAssembly and sorted in a worker, both of which lie in it, too.
-REPORT_SCRIPTS, NO_SCRIPT = "'unsafe-inline' 'wasm-unsafe-eval' blob:", "'none'"
 HEADERS = {
     "Cache-Control": "no-store",
     "X-Content-Type-Options": "nosniff",
@@ -56,60 +47,6 @@ HEADERS = {
     "Cross-Origin-Opener-Policy": "same-origin",
     "Cross-Origin-Resource-Policy": "same-origin",
 }
-
-
-@dataclass(frozen=True)
-class Watched:
-    """A workspace that is looked at, and its pipeline."""
-
-    workspace: Workspace
-    pipeline: Sequence[Stage]
-
-    @property
-    def report(self) -> Path:
-        return artifacts.PAGE.load(self.workspace.stage_folder("report"))
-
-    @property
-    def training(self) -> Path:
-        """The folder of curves and previews: of the training under way, else of the finished one.
-
-        What a killed run has left is not looked at: the next one may go on from it, or throw it away.
-        """
-        scratch = self.workspace.scratch_folder("train")
-        under_way = self.workspace.is_writing("train") and artifacts.METRICS.load(scratch).is_file()
-        return scratch if under_way else self.workspace.stage_folder("train")
-
-    def shows_report(self) -> bool:
-        """Whether the report is there and no run is making another one."""
-        return self.report.is_file() and not self.workspace.in_use()
-
-    def state(self) -> dict[str, Any]:
-        """What the live page asks for every other second, and the report once."""
-        from stages.reporting.curves import training_charts
-
-        return {
-            "workspace": str(self.workspace.root),
-            "report": self.shows_report(),
-            "running": self.workspace.in_use(),
-            "stages": [
-                {"name": stage.name, "summary": stage.summary, "state": self._stage_state(stage.name)}
-                for stage in self.pipeline
-            ],
-            "charts": training_charts(artifacts.METRICS.load(self.training)),
-            "previews": [path.name for path in self._pictures()],
-        }
-
-    def picture(self, name: str) -> Path | None:
-        """The preview of that name, if there is one."""
-        return next((path for path in self._pictures() if path.name == name), None)
-
-    def _pictures(self) -> list[Path]:
-        return sorted(artifacts.PREVIEWS.load(self.training).glob("*.png"))
-
-    def _stage_state(self, name: str) -> str:
-        if self.workspace.is_writing(name):
-            return "running"
-        return "done" if self.workspace.stage_folder(name).is_dir() else "waiting"
 
 
 def watch(folder: Path, pipeline: Sequence[Stage]) -> Watched:
@@ -122,7 +59,10 @@ def watch(folder: Path, pipeline: Sequence[Stage]) -> Watched:
     for stage in pipeline:
         watched.workspace.stage_folder(stage.name)
     if not (
-        watched.report.is_file() or watched.workspace.in_use() or artifacts.METRICS.load(watched.training).is_file()
+        watched_in_blocks(watched)
+        or watched.report.is_file()
+        or watched.workspace.in_use()
+        or artifacts.METRICS.load(watched.training).is_file()
     ):
         root = watched.workspace.root
         raise WorkspaceError(
@@ -204,7 +144,7 @@ class _Server(ThreadingHTTPServer):
 
 
 class _Handler(BaseHTTPRequestHandler):
-    """Four kinds of address: `/`, `/live`, `/state.json`, `/preview/NAME`; to be read, by this server's own name."""
+    """Addresses of `Watched.answer` and `WatchedInBlocks.answer`; to be read, by this server's own name."""
 
     server: _Server
 
@@ -232,18 +172,12 @@ class _Handler(BaseHTTPRequestHandler):
         names = self.headers.get_all("Host", [])
         return len(names) == 1 and names[0].strip().lower() in self.server.names
 
-    def _answer(self, path: str) -> tuple[str, BinaryIO, str] | None:
-        """Type, contents, and the scripts that may run in them; None where there is no such thing."""
-        watched, page = self.server.watched, "text/html; charset=utf-8"
-        if path == "/" and watched.shows_report():
-            return page, open(watched.report, "rb", opener=open_own), REPORT_SCRIPTS
-        if path in ("/", "/live"):
-            return page, BytesIO(_live_page()), _hash_of_script(_live_page())
-        if path == "/state.json":
-            return "application/json", BytesIO(json.dumps(watched.state()).encode()), NO_SCRIPT
-        if picture := watched.picture(path.removeprefix("/preview/")):
-            return "image/png", open(picture, "rb", opener=open_own), NO_SCRIPT
-        return None
+    def _answer(self, path: str) -> Answer | None:
+        """What is at a path; of a workspace in blocks, which it may become meanwhile, what is there of them."""
+        if not path.startswith("/"):
+            return None
+        watched = self.server.watched
+        return (watched_in_blocks(watched) or watched).answer(path.removeprefix("/"))
 
     def _send(self, kind: str, contents: BinaryIO, scripts: str) -> None:
         with contents:
@@ -266,14 +200,3 @@ class _Handler(BaseHTTPRequestHandler):
 
     def log_message(self, format: str, *arguments: Any) -> None:
         """Requests are nobody's concern."""
-
-
-@cache
-def _live_page() -> bytes:
-    return (resources.files("stages") / "templates" / LIVE_PAGE).read_bytes()
-
-
-def _hash_of_script(page: bytes) -> str:
-    """The one script of a page, as a policy names it: no other one runs there."""
-    [script] = re.findall(rb"<script>(.*?)</script>", page, re.DOTALL)
-    return f"'sha256-{base64.b64encode(hashlib.sha256(script).digest()).decode()}'"

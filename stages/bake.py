@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 from typing import Any
+
+import numpy as np
 
 from configs.params import BakeParams
 from stages.artifacts import (
@@ -21,6 +24,7 @@ from stages.artifacts import (
     QUALITY,
     write_png,
 )
+from stages.artifacts.blocks import ROUGH_GAINS, read_rough_gains
 from stages.engine.stage import Stage, StageContext
 from stages.errors import ReconstructionError
 
@@ -56,6 +60,7 @@ def run(context: StageContext[BakeParams]) -> dict[str, Any]:
             workers=context.workers,
             listener=context.progress,
             visit=witness.look,
+            rough_gains=_rough_gains(context, cameras.names),
         )
     except ValueError as error:
         raise ReconstructionError(
@@ -80,12 +85,21 @@ def run(context: StageContext[BakeParams]) -> dict[str, Any]:
     return numbers
 
 
+def _rough_gains(context: StageContext[BakeParams], names: Sequence[str]) -> np.ndarray | None:
+    """[N, 3] of the photos as the whole of this block has them, NaN where it has none; None where this is no block."""
+    if ROUGH_GAINS not in context.sources:
+        return None
+    given = read_rough_gains(context.sources[ROUGH_GAINS])
+    return np.array([given.get(name, (np.nan, np.nan, np.nan)) for name in names])
+
+
 BAKE: Stage[BakeParams] = Stage(
     name="bake",
-    version=8,
+    version=9,
     settings=lambda config: config.bake,
     run=run,
     reads=(PINHOLE_PHOTOS, CAMERAS, FIELD, HELD_OUT, CLEAN_FULL_MESH, ATLAS_MESH),
     writes=(BASE_COLOR, PROVENANCE, NORMAL_MAP, OCCLUSION, GAINS, QUALITY),
+    sources=(ROUGH_GAINS,),
     summary="charts + photos -> textures",
 )

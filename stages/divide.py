@@ -25,6 +25,7 @@ from stages.artifacts import IMAGE_SET, MODEL, PHOTOS, WORLD_PLACE, SimilarityRe
 from stages.artifacts.blocks import (
     NEIGHBOURS,
     PLAN_VERSION,
+    ROUGH_GAINS,
     Block,
     BlockPlan,
     BoxRecord,
@@ -32,12 +33,14 @@ from stages.artifacts.blocks import (
     Tile,
     block_folder,
     given_folder,
-    has_tile,
+    is_given,
     learned_links,
     plan_path,
     read_plan,
     refuse_links,
+    rough_gains_path,
     write_plan,
+    write_rough_gains,
     write_tile,
 )
 from stages.engine.fingerprint import digest
@@ -55,8 +58,9 @@ from stages.geometry.vectors import unit
 from stages.limits import total_memory
 from stages.place import PLACE
 from stages.posing.parts import rebuilt
-from stages.posing.undistortion import plan_warp, posed_cameras, registered_photos, sparse_points
+from stages.posing.undistortion import plan_warp, png_names, posed_cameras, registered_photos, sparse_points
 from stages.preflight import GIB, photos_held
+from stages.texture.rough_gains import rough_gains
 from stages.train import TRAIN
 
 log = logging.getLogger(__name__)
@@ -104,7 +108,7 @@ def divide(root: Path, count: int | None, anew: bool = False) -> BlockPlan:
             refuse_links(block_folder(workspace.root, block.name))
             if before is None or before.settings != settings:
                 _settle(workspace, block, config)
-            if before is None or not has_tile(given_folder(block_folder(workspace.root, block.name), NEIGHBOURS)):
+            if before is None or not is_given(block_folder(workspace.root, block.name)):
                 whole = whole or _Whole.of(workspace, config)
                 _give(workspace, whole, plan, block)
         write_plan(workspace.root, plan.model_copy(update={"settings": settings}))
@@ -161,6 +165,7 @@ class _Whole:
         names: of the photos in the image set, as the cameras are ordered.
         near: which points are what the photos are about, and not far behind it.
         place: of the plan's frame.
+        rough_gains: [3] of photos, by name in the image set.
     """
 
     model: Any
@@ -171,6 +176,7 @@ class _Whole:
     near: np.ndarray
     plan_from_poses: Similarity
     place: Place
+    rough_gains: Mapping[str, np.ndarray]
 
     @staticmethod
     def of(workspace: Workspace, config: Config) -> _Whole:
@@ -198,7 +204,7 @@ class _Whole:
         points = plan_from_poses.apply(points)
         return _Whole(
             model, names, into_frame(cameras, plan_from_poses.inverse()), points, observations, near, plan_from_poses,
-            _place_of_plan(place, turn),
+            _place_of_plan(place, turn), rough_gains(model, PHOTOS.load(workspace.stage_folder(PHOTOS.stage))),
         )  # fmt: skip
 
 
@@ -314,6 +320,10 @@ def _give(workspace: Workspace, whole: _Whole, plan: BlockPlan, block: Block) ->
         _link_all(around, learned)
         near = [each for each in plan.blocks if each.name in (block.name, *block.neighbours)]
         boxes = {each.name: BoxRecord(core=each.core, margin=each.box().margin) for each in near}
+        # by the names that the block will know them by once they are undistorted
+        named = zip(png_names(list(block.photos)), block.photos, strict=True)
+        gains = {png: whole.rough_gains[name] for png, name in named if name in whole.rough_gains}
+        write_rough_gains(rough_gains_path(folder), gains)
         write_tile(around, Tile(name=block.name, cell=plan.lattice.cell, boxes=boxes))
 
 
@@ -324,7 +334,11 @@ def _settle(workspace: Workspace, block: Block, config: Config) -> None:
     taken = PHOTOS.load(workspace.stage_folder(PHOTOS.stage))
     if not any(taken.mask_path(name).exists() for name in block.photos):
         given.pop("masks")
-    sources: dict[str, Path | None] = {**dict.fromkeys(workspace.record.sources), **given}
+    sources: dict[str, Path | None] = {
+        **dict.fromkeys(workspace.record.sources),
+        **given,
+        ROUGH_GAINS: rough_gains_path(own.root),
+    }
     with own.lock():
         own.remember(sources, workspace.record.preset, settings_of(config, block).model_dump(mode="json"))
 

@@ -15,7 +15,7 @@ from typing import Any
 from configs.load import load_config
 from configs.params import Config
 from stages import artifacts
-from stages.artifacts.blocks import NEIGHBOURS
+from stages.artifacts.blocks import FROM_WHOLE
 from stages.caches import temporary_files
 from stages.capture.listing import is_video
 from stages.engine.fingerprint import SourceDigests
@@ -217,7 +217,7 @@ def choose_photos(request: Request, workspace: Workspace) -> Path:
 def choose_sources(request: Request, workspace: Workspace, digests: SourceDigests) -> dict[str, Path | None]:
     """Photos (those of `digests`), masks, poses, control points and light: those given, else those of the last run.
 
-    Of a block of a large scene its neighbours, too.
+    Of a block of a large scene what the whole has given it, too.
 
     Masks that the poses' format comes with are used, too.
 
@@ -248,17 +248,17 @@ def choose_sources(request: Request, workspace: Workspace, digests: SourceDigest
     poses = locate_poses(request.poses).resolve() if request.poses else None
     control = request.control.resolve() if request.control else None
     light = request.light.resolve() if request.light else None
-    neighbours = None
+    from_whole: dict[str, Path | None] = {}
     if _are_those_of_the_last_run(workspace, photos, since):
         masks = masks or (None if request.no_masks else find_source(workspace, "masks", photos))
         poses = poses or (None if request.no_poses else find_source(workspace, "poses", photos))
         control = control or (None if request.no_control else find_source(workspace, CONTROL, photos))
         light = light or (None if request.no_light else find_source(workspace, GIVEN_LIGHT, photos))
-        neighbours = find_source(workspace, NEIGHBOURS, photos)
+        given = {name: find_source(workspace, name, photos) for name in FROM_WHOLE}
+        from_whole = {name: path for name, path in given.items() if path is not None}
     if masks is None and request.poses:
         masks = _masks_of(poses, request.no_masks)
-    found = {"photos": photos, "masks": masks, "poses": poses, CONTROL: control, GIVEN_LIGHT: light}
-    return found if neighbours is None else {**found, NEIGHBOURS: neighbours}
+    return {"photos": photos, "masks": masks, "poses": poses, CONTROL: control, GIVEN_LIGHT: light, **from_whole}
 
 
 def _are_those_of_the_last_run(workspace: Workspace, photos: Path, since: PhotosSince) -> bool:

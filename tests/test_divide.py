@@ -14,7 +14,18 @@ from small_town import flight, town_workspace
 from configs.load import load_config
 from configs.params import Config
 from stages import artifacts
-from stages.artifacts.blocks import NEIGHBOURS, block_folder, given_folder, plan_path, read_plan, read_tile, whole_of
+from stages.artifacts.blocks import (
+    NEIGHBOURS,
+    ROUGH_GAINS,
+    block_folder,
+    given_folder,
+    plan_path,
+    read_plan,
+    read_rough_gains,
+    read_tile,
+    rough_gains_path,
+    whole_of,
+)
 from stages.block_status import block_statuses, workspace_status
 from stages.divide import divide, in_words
 from stages.engine.fingerprint import SourceDigests
@@ -135,6 +146,31 @@ def test_photos_are_linked_and_masks_come_with_them(tmp_path):
     assert all(record.has_mask for record in records)
     source = artifacts.PHOTOS.load(root / "ingest").path(records[0].name)
     assert artifacts.PHOTOS.load(folder / "ingest").path(records[0].name).read_bytes() == source.read_bytes()
+
+
+def test_each_block_is_told_how_bright_its_photos_are_among_all(whole):
+    plan = divide(whole, 2)
+    for block in plan.blocks:
+        folder = block_folder(whole, block.name)
+        path = rough_gains_path(folder)
+        gains = read_rough_gains(path)
+        assert gains["row_1/012.png"][0] / gains["row_1/010.png"][0] == pytest.approx(10 / 12, rel=1e-3)
+        assert gains["row_1/012.png"][1] == pytest.approx(1, abs=1e-3)
+        assert set(gains) <= set(block.photos)
+        run(folder, "place")
+        assert Workspace.open(folder).record.sources[ROUGH_GAINS] == str(path)
+    before = path.read_bytes()
+    divide(whole, 2, anew=True)
+    assert path.read_bytes() == before, "or textures would be made again"
+
+
+def test_blocks_of_an_earlier_version_are_told_it_now(whole):
+    divide(whole, 2)
+    path = rough_gains_path(block_folder(whole, "b00"))
+    before = path.read_bytes()
+    path.unlink()
+    divide(whole, 2)
+    assert path.read_bytes() == before
 
 
 def test_neighbours_that_learn_make_the_tile_stale(whole):

@@ -5,11 +5,13 @@
 <whole>/blocks/<name>/given/photos      links to the whole's photos that see it; `masks` likewise
 <whole>/blocks/<name>/given/poses       a COLMAP model: the whole's cameras and points; how it lies in the world
 <whole>/blocks/<name>/given/neighbours  tile.json; links to the fields of the blocks around it
+<whole>/blocks/<name>/given/rough_gains.json  how bright its photos are among all of the whole
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import json
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +23,11 @@ from stages.artifacts.train import FIELD, SCENE
 from stages.geometry.tiling import BlockBox
 
 NEIGHBOURS = "neighbours"  # the source of a block's stages that look beyond it
+ROUGH_GAINS = "rough gains"  # the source of its bake: what brings its textures to the brightness of the others'
+FROM_WHOLE = (NEIGHBOURS, ROUGH_GAINS)  # sources that nobody names, the whole gives them
 LEARNED: tuple[Artifact[Any], ...] = (FIELD, SCENE)  # of a block, which those around it read
 PLAN_VERSION = 1
-_BLOCKS, _GIVEN, _PLAN, _TILE = "blocks", "given", "plan.json", "tile.json"
+_BLOCKS, _GIVEN, _PLAN, _TILE, _ROUGH = "blocks", "given", "plan.json", "tile.json", "rough_gains.json"
 
 
 class BoxRecord(Record):
@@ -117,6 +121,11 @@ def given_folder(block: Path, what: str) -> Path:
     return block / _GIVEN / what
 
 
+def rough_gains_path(block: Path) -> Path:
+    """The block's source `ROUGH_GAINS`."""
+    return block / _GIVEN / _ROUGH
+
+
 def whole_of(block: Path) -> Path | None:
     """The workspace that a workspace is a block of; None where it is none."""
     whole = block.parent.parent
@@ -143,13 +152,23 @@ def read_tile(neighbours: Path) -> Tile:
     return read_record(neighbours / _TILE, Tile)
 
 
-def has_tile(neighbours: Path) -> bool:
-    """Whether a block has been given all that it needs: its tile comes last."""
-    return (neighbours / _TILE).is_file()
+def is_given(block: Path) -> bool:
+    """Whether a block has been given all that it needs: its tile comes last, and earlier versions gave no gains."""
+    return (given_folder(block, NEIGHBOURS) / _TILE).is_file() and rough_gains_path(block).is_file()
 
 
 def write_tile(neighbours: Path, tile: Tile) -> None:
     write_own(neighbours / _TILE, tile.model_dump_json(indent=1) + "\n")
+
+
+def read_rough_gains(path: Path) -> Mapping[str, tuple[float, float, float]]:
+    """Factors on the channels of photos, by the names of their pinhole images; of some photos they are not known."""
+    return read_record(path, dict[str, tuple[float, float, float]])
+
+
+def write_rough_gains(path: Path, gains: Mapping[str, Sequence[float]]) -> None:
+    rounded = {name: [round(float(factor), 4) for factor in factors] for name, factors in gains.items()}
+    write_own(path, json.dumps(rounded, indent=1) + "\n")
 
 
 def learned_links(neighbours: Path, name: str) -> dict[str, Path]:

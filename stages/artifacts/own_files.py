@@ -123,6 +123,20 @@ def read_own(path: Path) -> bytes:
         return file.read(size)
 
 
+def read_tail(path: Path, most: int) -> bytes:
+    """The last bytes of a file of ours, however long it has grown; empty where there is none.
+
+    Raises:
+        WorkspaceError: it is a link, or no file.
+    """
+    try:
+        with open(path, "rb", opener=open_own) as file:
+            file.seek(max(0, os.fstat(file.fileno()).st_size - most))
+            return file.read(most)
+    except FileNotFoundError:
+        return b""
+
+
 @contextmanager
 def written_whole(path: Path) -> Iterator[BinaryIO]:
     """A file to write to, beside `path`; at the end it takes its place. A kill leaves one of the two whole."""

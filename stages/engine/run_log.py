@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import re
 import tempfile
 import traceback
 import unicodedata
@@ -11,11 +12,13 @@ from collections.abc import Iterator
 from io import TextIOWrapper
 from pathlib import Path
 
-from stages.artifacts.own_files import open_own
+from stages.artifacts.own_files import open_own, read_tail
 from stages.engine.workspace import storage_errors
 
 TRACEBACKS = "stages.tracebacks"  # the logger whose records go to the log file only
 TRACEBACK_IS = "The full traceback is"
+FAILED = "the run failed"
+LAST_BYTES = 1 << 16  # of a log; a traceback takes some thousand
 
 SHOWN = {"Cc", "Cf", "Cs", "Zl", "Zp"}  # categories of characters that are no text but act on it
 JOINERS = "\u200c\u200d"  # parts of words in some scripts, and of emoji
@@ -52,6 +55,22 @@ def where_traceback_is(error: Exception) -> str:
     return f"{TRACEBACK_IS} in {file.name}."
 
 
+def failure_told(log: Path) -> str | None:
+    """What the error said that ended the last run that is in a log; None where that did not fail, or goes on.
+
+    Raises:
+        WorkspaceError: the log is a link, or no file.
+    """
+    records = re.split(
+        r"^(?=\d{4}-\d\d-\d\d )", read_tail(log, LAST_BYTES).decode(errors="replace"), flags=re.MULTILINE
+    )
+    if f" ERROR {TRACEBACKS}: {FAILED}" not in records[-1].partition("\n")[0]:
+        return None
+    told = re.findall(r"^    ([\w.]+)(?:: (.*))?$", records[-1], re.MULTILINE)
+    name, message = told[-1] if told else ("", "")
+    return message or name or "It failed."
+
+
 class _LogFile(logging.FileHandler):
     """A log that cannot be written (the disk is full) is no reason to hide the error that says so."""
 
@@ -83,7 +102,7 @@ def log_to_file(path: Path) -> Iterator[None]:
         logging.getLogger(TRACEBACKS).warning("stopped, since nobody reads what is printed any more")
         raise
     except Exception as error:
-        logging.getLogger(TRACEBACKS).error("the run failed", exc_info=True)
+        logging.getLogger(TRACEBACKS).error(FAILED, exc_info=True)
         error.add_note(f"{TRACEBACK_IS} at the end of {path}.")
         raise
     except BaseException as stop:  # Ctrl-C, or another signal

@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel
 
-from stages.artifacts.blocks import NEIGHBOURS
+from stages.artifacts.blocks import FROM_WHOLE
 from stages.engine.damage import damage_named
 from stages.engine.fingerprint import Identity, SourceDigests
 from stages.engine.guard import allocations_end_at_the_limit
@@ -128,9 +128,9 @@ def run_pipeline(
 def naming_command(source: str, root: Path) -> str:
     """The command that names the place of an outside path ("photos", "masks") to the workspace at `root`.
 
-    What a block of a large scene knows of its neighbours is not named, but given by the whole.
+    What a block of a large scene knows of the others is not named, but given by the whole.
     """
-    if source == NEIGHBOURS:
+    if source in FROM_WHOLE:
         return f"hineus blocks {shlex.quote(str(root.parent.parent))}"
     named = "PHOTOS" if source == "photos" else f"{source_option(source)} PATH"
     return f"hineus run {named} --workspace {shlex.quote(str(root))}"

@@ -22,7 +22,7 @@ import shlex
 import shutil
 import socket
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path, PurePosixPath, PureWindowsPath
@@ -220,6 +220,17 @@ class Workspace:
         """Whether a process on this machine that took the lock is still there. Takes no lock, so it disturbs none."""
         holder = _lock_holder(self.root)
         return holder is not None and holder.host == socket.gethostname() and bool(psutil.pid_exists(holder.pid))
+
+    def host_at_work(self) -> str | None:
+        """The machine whose process took the lock, if that is still there, which can be asked on this one only."""
+        holder = _lock_holder(self.root)
+        if holder is None:
+            return None
+        return holder.host if holder.host != socket.gethostname() or psutil.pid_exists(holder.pid) else None
+
+    def being_written(self, stages: Sequence[str]) -> str | None:
+        """The stage whose outputs are being written, or were when the last run was killed."""
+        return next((stage for stage in stages if (self.work_folder(stage) / "out").is_dir()), None)
 
     def is_writing(self, stage: str) -> bool:
         """Whether the run that has the lock is writing the stage's outputs; a killed one's are no longer written."""

@@ -134,6 +134,13 @@ def posed_cameras(photos: Sequence[Any], names: Sequence[str], warps: Mapping[in
     )
 
 
+def seen_places(photo: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Ids [K] of the sparse points that an image of a pycolmap model shows, and where: [K, 2] pixels of its camera."""
+    shown = [place for place in photo.points2D if place.has_point3D()]
+    ids = np.array([place.point3D_id for place in shown], dtype=np.int64)
+    return ids, np.array([place.xy for place in shown], dtype=np.float64).reshape(-1, 2)
+
+
 def sparse_points(model: Any, photos: Sequence[Any]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Points [P, 3] in the frame of the poses, errors [P], observations [M, 2] (image index, point index)."""
     index_of = {photo.image_id: i for i, photo in enumerate(photos)}

@@ -24,7 +24,7 @@ from stages.blocks import in_blocks
 from stages.drawing.rasterizing import Texels, surface_points
 from stages.geometry.cameras import PinholeCameras
 from stages.texture.filling import face_neighbors, harmonic_offsets, vertex_means
-from stages.texture.gains import solve_gains
+from stages.texture.gains import in_gauge_of, solve_gains
 from stages.texture.observing import STEPS_UNSIGNED, blend_texels, gather_texels, sample_points
 from stages.texture.padding import pad_charts
 from stages.texture.photo_views import View
@@ -87,6 +87,7 @@ def bake_texture(
     workers: int = 1,
     listener: Listener | None = None,
     visit: Visitor | None = None,
+    rough_gains: np.ndarray | None = None,
 ) -> Baked:
     """Bake photos into the texture of an atlas.
 
@@ -104,6 +105,8 @@ def bake_texture(
         workers: threads.
         listener: told (done, total, note).
         visit: shown each photo once, in order, so that what else is asked of photos need not make them ready again.
+        rough_gains: [N, 3] in a larger scene that this is a part of, NaN where not known: they set the gauge, see
+            `gains.in_gauge_of`.
 
     Raises:
         ValueError: the atlas covers no texel, or a photo is not of its camera's size.
@@ -127,6 +130,8 @@ def bake_texture(
         gains, sharpness = compare_photos(atlas, texels, views_of.in_order(pool, workers), num_views, tell)
         if not gain:
             gains = np.ones((num_views, 3))
+        elif rough_gains is not None:
+            gains = in_gauge_of(gains, rough_gains)
         room = SMALL_BAND_BYTES if len(views_of.kept) == num_views else BAND_BYTES
         blend = partial(blend_texels, detail=detail, robust_sigma=robust_sigma, diffuse=diffuse)
         unvisited = set(range(num_views)) if visit is not None else set()

@@ -12,6 +12,8 @@ ROBUST_SCALE = 0.08
 # nothing.
 REGULARISATION = 1e-3
 LIMIT = 3.0
+# Photos further than this many robust standard deviations from the others say nothing about the gauge.
+GAUGE_SIGMAS = 3.0
 _ITERATIONS = 8
 
 
@@ -62,6 +64,24 @@ def solve_gains(colors: np.ndarray, weights: np.ndarray) -> np.ndarray:
         log_gains[seen] -= log_gains[seen].mean()
         gains[:, channel] = np.exp(np.clip(log_gains, -np.log(LIMIT), np.log(LIMIT)))
     return gains
+
+
+def in_gauge_of(gains: np.ndarray, rough: np.ndarray) -> np.ndarray:
+    """Gains [N, 3] times the factor a channel that photos leave free, as a larger scene's rough gains have it.
+
+    The factor c makes the robust mean over photos of log(c gain) - log(rough gain) zero: what is within `GAUGE_SIGMAS`
+    of the median counts. Photos whose rough gain is not known (NaN) do not; with none that is, c is 1.
+    """
+    if gains.shape != rough.shape:
+        raise ValueError(f"expected rough gains of shape {gains.shape}, got {rough.shape}")
+    factors = np.ones(3)
+    for channel in range(3):
+        known = np.isfinite(rough[:, channel])
+        if known.any():
+            away = np.log(rough[known, channel] / gains[known, channel])
+            off = np.abs(away - np.median(away))
+            factors[channel] = np.exp(away[off <= GAUGE_SIGMAS * 1.4826 * np.median(off)].mean())
+    return gains * factors
 
 
 def trust(log_gains: np.ndarray, spreads: np.ndarray) -> np.ndarray:
