@@ -4,8 +4,8 @@ python -m benchmarks.synthetic DATA --scenes city --photos 24 --size 160x120 --s
 python -m benchmarks.kills DATA/city/images [--blocks 2] [--kills 10] [--jobs 1] [--set train.steps=200 ...]
 
 PHOTOS_undisturbed is run once. PHOTOS_killed is begun `--kills` times, each time killed with all below it (SIGKILL)
-after a part of the undisturbed run's time that is drawn at random, and then run to its end. What is told: at which stage
-each kill struck, and which of the blocks' meshes, textures and models are the same byte for byte. One thread.
+after a part of the undisturbed run's time that is drawn at random, and then run to its end. What is told: at which
+stage each kill struck, and which of the blocks' meshes, textures and models are the same byte for byte. One thread.
 """
 
 from __future__ import annotations
