@@ -41,6 +41,7 @@ from stages.engine.system import requirement_error
 from stages.engine.workspace import DISK_FULL
 from stages.errors import ConfigError, HineusError, WorkspaceError
 from stages.pipeline import PIPELINE
+from stages.together import among_others
 
 USAGE_ERROR: Any = typer.BadParameter.__base__  # click's, which newer versions of typer bring with them
 
@@ -77,7 +78,7 @@ class HineusGroup(TyperGroup):
         set_up_logging()
         try:
             _refuse_no_folder()
-            return super().invoke(ctx)
+            return among_others(lambda: super(HineusGroup, self).invoke(ctx))
         except KeyboardInterrupt:  # where signals are not ours, as in a thread
             raise Stopped(signal.SIGINT) from None
 

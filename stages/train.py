@@ -5,8 +5,10 @@ Where few photos came or went since the last training, it goes on from what that
 
 from __future__ import annotations
 
+import io
 import json
 import logging
+import os
 import shutil
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -78,7 +80,7 @@ def run(context: StageContext[TrainParams]) -> dict[str, Any]:
     from stages.neural.held_out_psnr import held_out_psnr
     from stages.neural.trained_field import field_state
 
-    _use_threads(context)
+    _use_machine(context)
     training = _Training.begun(context)
     if training.steps is None:
         training.advance(SETTLED_AT)
@@ -312,12 +314,15 @@ class _Training:
 
     def advance(self, until: float) -> None:
         """Train to this part of the budget; checkpoints, previews and metric lines on the way."""
-        context, trainer = self.context, self.trainer
+        from stages.neural.ranks import ours
+
+        context, trainer, ranks = self.context, self.trainer, ours()
         saved, every = time.monotonic(), context.params.preview_every
+        told = b"" if ranks.alone else _as_told(self)
         # a line at a time, so that `hineus view` can draw them as they come
-        with self.metrics.open("a", encoding="utf-8", buffering=1) as lines:
+        with ranks.leading(told), self.metrics.open("a", encoding="utf-8", buffering=1) as lines:
             while (progress := self.progress) < until:
-                numbers = trainer.step(progress)
+                numbers = ranks.step(trainer.step, progress)
                 if trainer.step_index % LOG_EVERY == 0:
                     numbers_out = {key: float(value) for key, value in numbers.items()}
                     _write_metrics(lines, trainer, progress, numbers_out)
@@ -331,8 +336,67 @@ class _Training:
                     saved = time.monotonic()
 
 
+# ---------------------------------------------------------------- several processes
+def take_part() -> None:
+    """As one of several processes that torchrun started, not the first: help it train, until it has no more to train.
+
+    It says what to train and when to step; all else, and all that is written, is its own.
+
+    Raises:
+        HineusError: this process cannot go on, or another one has ended.
+    """
+    import torch
+
+    from stages.neural.ranks import ours
+
+    ranks, of = ours(), None
+    trainer: Any = None
+    for training in ranks.trainings():
+        told = torch.load(io.BytesIO(training), map_location="cpu", weights_only=True)
+        if told["of"] != of:
+            of, trainer = told["of"], None  # its photos would be in memory twice
+            context, region = _from_told(of)
+            _use_machine(context)
+            scene = context.read(FIRST_SCENE)
+            trainer = _make_trainer(context, region.of(scene) if region else scene)
+        trainer.load_state(told["trainer"])
+        for progress in ranks.steps():
+            trainer.step(progress)
+
+
+def _as_told(training: _Training) -> bytes:
+    """What another process needs to know to take part in a training: what it is of, and how far it is."""
+    import torch
+
+    context, message = training.context, io.BytesIO()
+    of = {
+        "inputs": {stage: str(folder) for stage, folder in context.inputs.items()},
+        "params": context.params.model_dump(mode="json"),
+        "device": context.device,
+        "workers": context.workers,
+        "region": training.region and tuple(training.region),
+    }
+    torch.save({"of": of, "trainer": training.trainer.state()}, message)
+    return message.getvalue()
+
+
+def _from_told(of: dict[str, Any]) -> tuple[StageContext[TrainParams], _Region | None]:
+    """The context of a training that takes part and has nowhere to write; its region, where that has grown."""
+    context = StageContext(
+        inputs={stage: Path(folder) for stage, folder in of["inputs"].items()},
+        sources={},
+        out=Path(os.devnull),
+        scratch=Path(os.devnull),
+        params=TrainParams.model_validate(of["params"]),
+        device=of["device"],
+        workers=of["workers"],
+    )
+    return context, _Region(*of["region"]) if of["region"] else None
+
+
 def _make_trainer(context: StageContext[TrainParams], scene: PosedScene) -> Any:
     from stages.neural.held_out_psnr import left_out
+    from stages.neural.ranks import ours
     from stages.neural.sightings import Sightings
     from stages.neural.trainer import Trainer
     from stages.neural.training_photos import Photos
@@ -344,7 +408,7 @@ def _make_trainer(context: StageContext[TrainParams], scene: PosedScene) -> Any:
     training = (~held_out).numpy()
     sightings = Sightings.from_scene(scene, context.device, training)
     dense = Sightings.from_cloud(_cloud(context, scene), scene.cameras.centers, context.device, training)
-    return Trainer(photos, sightings, dense, params, context.device, _evidence(context, scene))
+    return Trainer(photos, sightings, dense, params, context.device, _evidence(context, scene), ours())
 
 
 def _evidence(context: StageContext[TrainParams], scene: PosedScene) -> Evidence:
@@ -473,14 +537,17 @@ def _previous_field(context: StageContext[TrainParams]) -> Path:
     return path
 
 
-def _use_threads(context: StageContext[TrainParams]) -> None:
-    """Torch and numba take as many threads as the run was given."""
+def _use_machine(context: StageContext[TrainParams]) -> None:
+    """Torch and numba take as many threads as the run was given, torchrun's processes a part each, and a GPU each."""
     import torch
 
     from stages.compiling import numba
+    from stages.neural.ranks import ours
 
-    torch.set_num_threads(context.workers)
-    numba.set_num_threads(min(context.workers, numba.config.NUMBA_NUM_THREADS))
+    threads = max(1, context.workers // ours().local_size)
+    torch.set_num_threads(threads)
+    numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))
+    ours().use(context.device)
 
 
 def _load_images(

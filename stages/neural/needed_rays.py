@@ -111,6 +111,11 @@ class NeededRays:
         self.weights.copy_(weights)
         torch.cumsum(self.weights.double(), 0, out=self._upto)
 
+    @property
+    def tables(self) -> list[Tensor]:
+        """All that changes from draw to draw, in place."""
+        return [self.errors, self.known, self.weights, self._upto]
+
     def state(self) -> dict[str, Any]:
         """Everything that the next draw depends on."""
         return {"errors": self.errors, "known": self.known, "weights": self.weights}

@@ -8,16 +8,18 @@ nothing that waits for the device. What changes from step to step lies in tensor
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Iterable
 from dataclasses import dataclass
+from typing import Any, TypeVar
 
 import torch
-from torch import Tensor
 
 log = logging.getLogger(__name__)
 
 # Steps of a new kind that go kernel by kernel first: kernels are compiled, and the optimiser makes its state.
 WARM_UP = 3
+
+Result = TypeVar("Result")
 
 
 @dataclass
@@ -25,7 +27,7 @@ class _Recording:
     kind: Hashable
     steps: int = 0
     graph: torch.cuda.CUDAGraph | None = None
-    results: dict[str, Tensor] | None = None
+    results: Any = None
 
 
 class Replay:
@@ -34,13 +36,13 @@ class Replay:
     Results lie where the next call writes its own.
     """
 
-    def __init__(self, device: torch.device, generator: torch.Generator) -> None:
-        """generator: what the step draws from; a graph goes on with it as the step would."""
-        self.generator, self.stream = generator, torch.cuda.Stream(device)
+    def __init__(self, device: torch.device, generators: Iterable[torch.Generator]) -> None:
+        """generators: what the step draws from; a graph goes on with them as the step would."""
+        self.generators, self.stream = tuple(generators), torch.cuda.Stream(device)
         self.recording = _Recording(None)
         self.possible = True
 
-    def __call__(self, step: Callable[[], dict[str, Tensor]], kind: Hashable) -> dict[str, Tensor]:
+    def __call__(self, step: Callable[[], Result], kind: Hashable) -> Result:
         """One step. `kind` names what is fixed in a graph; the rest the step reads from tensors that stay."""
         if kind != self.recording.kind:
             self.recording = _Recording(kind)
@@ -51,11 +53,11 @@ class Replay:
         if recording.graph is None and not self._record(step):
             return self._eagerly(step)
         assert recording.graph is not None
-        assert recording.results is not None
         recording.graph.replay()
-        return recording.results
+        results: Result = recording.results
+        return results
 
-    def _eagerly(self, step: Callable[[], dict[str, Tensor]]) -> dict[str, Tensor]:
+    def _eagerly(self, step: Callable[[], Result]) -> Result:
         """On the stream that records: what backward passes remember of streams must not differ."""
         self.stream.wait_stream(torch.cuda.current_stream())
         with torch.cuda.stream(self.stream):
@@ -63,9 +65,10 @@ class Replay:
         torch.cuda.current_stream().wait_stream(self.stream)
         return results
 
-    def _record(self, step: Callable[[], dict[str, Tensor]]) -> bool:
+    def _record(self, step: Callable[[], Any]) -> bool:
         graph = torch.cuda.CUDAGraph()
-        graph.register_generator_state(self.generator)
+        for generator in self.generators:
+            graph.register_generator_state(generator)
         try:
             with torch.cuda.graph(graph, stream=self.stream, capture_error_mode="thread_local"):
                 results = step()

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -19,6 +19,7 @@ from stages.neural.evidence import Evidence
 from stages.neural.fields import Fields, FieldShape
 from stages.neural.needed_rays import NeededRays
 from stages.neural.proposal import interlevel_loss, sample_edges, updates_now
+from stages.neural.ranks import ALONE, Ranks
 from stages.neural.rendered import Rendered
 from stages.neural.renderer import Renderer
 from stages.neural.replaying import Replay
@@ -31,6 +32,8 @@ from stages.neural.training_photos import Photos, RayBatch
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int, UInt8
+
+Result = TypeVar("Result")
 
 # The regression to a hull before training: long enough for an error of about a cell of its grid.
 HULL_STEPS, HULL_POINTS = 200, 2048
@@ -61,6 +64,23 @@ class _Part(NamedTuple):
         trust: the least of their weights.
     """
 
+    numbers: dict[str, Tensor]
+    ray_error: Float[Tensor, " r"]
+    squared: Float[Tensor, " r"]
+    trust: Float[Tensor, ""]
+
+
+class _Share(NamedTuple):
+    """What a process finds of a step: all of it where it is alone.
+
+    Attributes:
+        cells, masks: of all the step's rays. rows: those that are rendered here.
+        numbers, ray_error, squared, trust: as of a part, of those.
+    """
+
+    cells: Int[Tensor, " all"]
+    masks: Float[Tensor, " all"] | None
+    rows: slice
     numbers: dict[str, Tensor]
     ray_error: Float[Tensor, " r"]
     squared: Float[Tensor, " r"]
@@ -103,8 +123,9 @@ class Trainer:
         params: TrainParams,
         device: torch.device | str,
         evidence: Evidence | None = None,
+        ranks: Ranks = ALONE,
     ) -> None:
-        self.photos, self.params = photos, params
+        self.photos, self.params, self.ranks = photos, params, ranks
         self.evidence = evidence or Evidence.none(device)
         self.sightings, self.dense = (each.but_where(self.evidence.shiny) for each in (sightings, dense))
         self.device = torch.device(device)
@@ -130,11 +151,13 @@ class Trainer:
         self.cache = SdfCache(params.sampling.cache_resolution, device)
         self.needed = NeededRays(photos, params.sampling.needed_share)
         self.generator = torch.Generator(device=device).manual_seed(params.seed)
-        self.terms = Terms(self.fields, self.cache, params, photos, self.generator, self.evidence)
+        # Of several processes each has chance of its own for what it does with its rays.
+        self.chance = self.generator if ranks.alone else torch.Generator(device=device)
+        self.terms = Terms(self.fields, self.cache, params, photos, self.chance, self.evidence)
         self.renderer = Renderer(self.fields, self.cache, params, self.terms)
         self.step_index = 0
         self.cache_step = -(10**9)
-        self.replay = Replay(self.device, self.generator) if self._replays() else None
+        self.replay = Replay(self.device, {self.generator, self.chance}) if self._replays() else None
         # What a graph reads anew at each step: the density's scale, how far outlines count, the sightings' weight.
         self._scale, self._outlined, self._sparse_weight = torch.zeros(3, device=self.device).unbind()
         self._prepare_rates()
@@ -175,48 +198,53 @@ class Trainer:
         """One optimiser step at progress in [0, 1]; returns its terms and checks, batch means as tensors (no sync)."""
         schedule, weights = self.params.schedule, self.params.losses
         moment = self.moment(progress)
-        self._refresh_cache(moment)
+        if self._refresh_cache(moment) and not self.ranks.alone:
+            self.ranks.take_from_first([self.cache.values, *self.needed.tables])
+            self.ranks.check_same(list(self.fields.parameters()))
         decay = schedules.warm_up_then_decay if schedule.lr_decay == "cosine" else schedules.warm_up_then_exponential
         self._set_rates(decay(progress, schedule.lr_warm_up, schedule.lr_final))
         sparse_weight = weights.sparse * schedules.fade_out(progress, weights.sparse_until)
         if self.replay is None:
-            numbers = self._with_rays_that_fit(lambda rays: self._gradients(moment, sparse_weight, rays))
-            self.optimizer.step()
+            own = self._with_rays_that_fit(lambda rays: self._gradients(moment, sparse_weight, rays))
+            numbers = self._update(own)
         else:
             self._scale.fill_(moment.scale)
             self._outlined.fill_(moment.outlined)
             self._sparse_weight.fill_(sparse_weight)
             current = replace(moment, scale=self._scale, outlined=self._outlined)
             kind = moment.levels, moment.samples, moment.deferred, self.terms.begun(moment)
-            replay, weight = self.replay, self._sparse_weight
-            numbers = self._with_rays_that_fit(
-                lambda rays: replay(lambda: self._update(current, weight, rays), (*kind, rays))
-            )
+            numbers = self._replayed(self.replay, current, kind)
         self.step_index += 1
         return numbers
 
-    def _with_rays_that_fit(self, work: Callable[[int], dict[str, Tensor]]) -> dict[str, Tensor]:
+    def _replayed(self, replay: Replay, moment: Moment, kind: Hashable) -> dict[str, Tensor]:
+        """The step as a graph; where there are several processes, up to their exchange."""
+
+        def gradients(rays: int) -> _Share:
+            return self._gradients(moment, self._sparse_weight, rays)
+
+        if self.ranks.alone:
+            return self._with_rays_that_fit(lambda rays: replay(lambda: self._update(gradients(rays)), (kind, rays)))
+        return self._update(self._with_rays_that_fit(lambda rays: replay(lambda: gradients(rays), (kind, rays))))
+
+    def _with_rays_that_fit(self, work: Callable[[int], Result]) -> Result:
         """`work`, told how many rays to render at once: those of the step, or fewer where memory runs out.
 
-        It draws the same rays each time.
+        It draws the same rays each time, and exchanges nothing: other processes may have memory enough.
         """
         drawn_from, most = self.generator.get_state(), self.params.sampling.rays
 
-        def attempt(rays: int) -> dict[str, Tensor]:
+        def attempt(rays: int) -> Result:
             if rays < most:
                 self.generator.set_state(drawn_from)
+            if not self.ranks.alone:
+                self.chance.manual_seed(self.ranks.seed(self.params.seed, self.step_index))
             return work(rays)
 
         return with_less(attempt, most, "rays of a training step", FEWEST_RAYS)
 
-    def _update(self, moment: Moment, sparse_weight: Tensor | float, rays_at_once: int) -> dict[str, Tensor]:
-        """Rays, losses, gradients, and the optimiser's step."""
-        numbers = self._gradients(moment, sparse_weight, rays_at_once)
-        self.optimizer.step()
-        return numbers
-
-    def _gradients(self, moment: Moment, sparse_weight: Tensor | float, rays_at_once: int) -> dict[str, Tensor]:
-        """Rays, losses, and their gradients, which add up over parts of the rays; returns the step's numbers."""
+    def _gradients(self, moment: Moment, sparse_weight: Tensor | float, rays_at_once: int) -> _Share:
+        """Draw the step's rays, and add the gradients of the losses at this process's share of them, part by part."""
         sampling, weights = self.params.sampling, self.params.losses
         batch, cells = self.needed.draw(sampling.rays, self.generator)
         extra = _Extra(
@@ -225,20 +253,40 @@ class Trainer:
             torch.rand(sampling.free_points, 3, generator=self.generator, device=self.device) * 2 - 1,
         )
         self._forget_gradients()
+        rows = self.ranks.share(len(batch))
         parts = [
-            self._part(batch, slice(first, first + rays_at_once), extra, moment, sparse_weight)
-            for first in range(0, max(len(batch), 1), rays_at_once)
+            self._part(batch, slice(first, min(first + rays_at_once, rows.stop)), extra, moment, sparse_weight)
+            for first in range(rows.start, max(rows.stop, 1), rays_at_once)
         ]
-        ray_error, squared = (torch.cat(each) for each in zip(*((p.ray_error, p.squared) for p in parts), strict=True))
-        self.needed.learn(cells, ray_error)
-        masks = batch.masks
-        mse = squared.mean() if masks is None else (masks * squared).sum() / masks.sum().clamp(min=1)
         numbers = {
             name: sum((part.numbers[name] for part in parts[1:]), of_first)
             for name, of_first in parts[0].numbers.items()
         }
-        psnr, trust = -10 * torch.log10(mse.clamp(min=1e-10)), torch.stack([part.trust for part in parts]).min()
-        return {**numbers, "psnr": psnr, "trust": trust}
+        ray_error, squared = (torch.cat(each) for each in zip(*((p.ray_error, p.squared) for p in parts), strict=True))
+        trust = torch.stack([part.trust for part in parts]).min()
+        return _Share(cells, batch.masks, rows, numbers, ray_error, squared, trust)
+
+    def _update(self, own: _Share) -> dict[str, Tensor]:
+        """What all processes have found, the optimiser's step with it, and the step's numbers."""
+        found = own if self.ranks.alone else self._together(own)
+        self.needed.learn(found.cells, found.ray_error)
+        masks, squared = found.masks, found.squared
+        mse = squared.mean() if masks is None else (masks * squared).sum() / masks.sum().clamp(min=1)
+        self.optimizer.step()
+        return {**found.numbers, "psnr": -10 * torch.log10(mse.clamp(min=1e-10)), "trust": found.trust}
+
+    def _together(self, own: _Share) -> _Share:
+        """Sum gradients and numbers over all processes, and put their rays beside each other, in one exchange."""
+        rays = torch.zeros(2, len(own.cells), device=self.device)
+        rays[:, own.rows] = torch.stack([own.ray_error, own.squared])
+        trust = torch.zeros(self.ranks.size, device=self.device)
+        trust[self.ranks.rank] = own.trust
+        parameters = [parameter for group in self.optimizer.param_groups for parameter in group["params"]]
+        numbers, (ray_error, squared), trust = self.ranks.sum_gradients(
+            parameters, [torch.stack(list(own.numbers.values())), rays, trust]
+        )
+        named = dict(zip(own.numbers, numbers, strict=True))
+        return _Share(own.cells, own.masks, slice(None), named, ray_error, squared, trust.min())
 
     def _part(
         self, batch: RayBatch, rows: slice, extra: _Extra, moment: Moment, sparse_weight: Tensor | float
@@ -248,7 +296,7 @@ class Trainer:
         is_first, is_all = rows.start == 0, rows.stop >= len(batch)
         part = batch if is_first and is_all else batch.select(rows)
         places = extra.places if is_first else None
-        rendered = self.renderer.render(part, moment, places, self.generator)
+        rendered = self.renderer.render(part, moment, places, self.chance)
         exposed = rendered.colors * torch.exp(self.fields.log_gains[part.images])
         nothing = torch.zeros((), device=self.device)
         share = len(part) / max(len(batch), 1)
@@ -361,11 +409,14 @@ class Trainer:
         return self.renderer.render(batch, self.moment(progress), extra)
 
     @torch.no_grad()
-    def _refresh_cache(self, moment: Moment) -> None:
-        """Bring the sampler's grid up to date: all of it at first and now and then, else near the surface."""
+    def _refresh_cache(self, moment: Moment) -> bool:
+        """Bring the sampler's grid up to date: all of it at first and now and then, else near the surface.
+
+        Returns whether it was time for that.
+        """
         every = self.params.sampling.cache_every
         if self.step_index - self.cache_step < every:
-            return
+            return False
         refreshes = self.step_index // every
         # at first: of the training, or of a trainer that takes over from another
         full = self.step_index <= 4 * every or refreshes % 8 == 0 or self.cache_step < 0
@@ -374,6 +425,7 @@ class Trainer:
         self.cache_step = self.step_index
         if self.needed.share and moment.progress >= NEEDED_FROM and refreshes % LOOK_EVERY == 0:
             self.needed.look(self.cache)
+        return True
 
     # ------------------------------------------------------------------ the shape so far
     @torch.no_grad()
