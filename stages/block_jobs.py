@@ -219,11 +219,14 @@ def _jobs(whole: Workspace, plan: BlockPlan, device: str) -> list[Job]:
 
 
 def _is_done(root: Path, step: Step, pipeline: Sequence[Stage[Any]]) -> bool:
-    """Whether all stages of the step are up to date."""
+    """Whether all stages of the step are up to date. What is wrong with a workspace, its own run tells."""
     names = [stage.name for stage in pipeline]
     last = len(names) if step.until is None else names.index(step.until) + 1
-    own = Workspace.open(block_folder(root, step.block))
-    return all(status.state == "fresh" for status in workspace_status(own, pipeline)[:last])
+    try:
+        statuses = workspace_status(Workspace.open(block_folder(root, step.block)), pipeline)
+    except HineusError:
+        return False
+    return all(status.state == "fresh" for status in statuses[:last])
 
 
 def _outcome(root: Path, block: Block, jobs: Sequence[Job], failed: Mapping[str, HineusError]) -> BlockOutcome:

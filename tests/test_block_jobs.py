@@ -13,12 +13,17 @@ from types import SimpleNamespace
 
 import psutil
 import pytest
+from small_town import town_workspace
 from test_block_by_block import PLAN
 
 from stages import block_jobs, workflow
+from stages.artifacts.blocks import block_folder
 from stages.block_by_block import steps_of
 from stages.block_jobs import Job, run_jobs
+from stages.divide import divide
+from stages.engine.workspace import Workspace
 from stages.errors import SystemRequirementError
+from stages.pipeline import PIPELINE
 from stages.workflow import Capacity, check_installed
 
 # A step that writes its name and how it fared into a journal. It is bad as long as the file bad/<name> is there.
@@ -137,6 +142,14 @@ def test_what_is_missing_is_named_with_its_command(monkeypatch, missing, executo
     assert hint in caught.value.hint
 
 
+def test_settings_of_a_block_that_cannot_be_read_are_its_own_failure(tmp_path):
+    whole = town_workspace(tmp_path / "whole")
+    plan = divide(whole, 2)
+    broken = Workspace.open(block_folder(whole, "b01")).config_path
+    broken.write_text("train: {stepz: 1}\n")
+    assert [block_jobs._is_done(whole, step, PIPELINE) for step in steps_of(plan)] == [False] * 4
+
+
 # ---------------------------------------------------------------- with Snakemake
 @pytest.mark.slow
 def test_snakemake_tries_again_and_goes_on(tmp_path):
@@ -159,27 +172,56 @@ def test_snakemake_tries_again_and_goes_on(tmp_path):
     assert {line for line in again[2:] if line.startswith("done")} == {f"done finish b0{i}" for i in range(3)}
 
 
+# Stopped by signals, as a command is.
 RUN = """
 import sys
 from pathlib import Path
 sys.path.insert(0, sys.argv[2])
 from test_block_jobs import jobs_in
+from hineus_cli.at_once import Stopped
+from hineus_cli.session import Session
+from hineus_cli.stopping import stopped_by_signals
 from stages.block_jobs import run_jobs
 from stages.workflow import Capacity
 folder = Path(sys.argv[1])
-run_jobs(jobs_in(folder, seconds=2.0), folder, Capacity(2, workers=2), set())
+try:
+    with stopped_by_signals(), Session(()).working():
+        run_jobs(jobs_in(folder, seconds=float(sys.argv[3])), folder, Capacity(2, workers=2), set())
+except Stopped as stop:
+    sys.exit(stop.exit_code)
 """
+
+
+def begun(folder: Path, seconds: float) -> tuple[subprocess.Popen[bytes], list[psutil.Process]]:
+    """A run whose steps take so many seconds each, in the middle of the first two, and the processes below it."""
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    command = [sys.executable, "-c", RUN, str(folder), str(Path(__file__).parent), str(seconds)]
+    run = subprocess.Popen(command, env=environment, start_new_session=True)
+    while sum(line.startswith("begun") for line in journal(folder)) < 2:
+        assert run.poll() is None
+        time.sleep(0.2)
+    return run, psutil.Process(run.pid).children(recursive=True)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("sent_to", ["the run", "its terminal"])
+def test_ctrl_c_ends_the_steps_with_the_run(tmp_path, sent_to):
+    pytest.importorskip("snakemake")
+    run, below = begun(tmp_path, seconds=600)
+    assert len([process for process in below if any("step.py" in word for word in process.cmdline())]) >= 2
+    if sent_to == "the run":
+        run.send_signal(signal.SIGINT)
+    else:
+        os.killpg(run.pid, signal.SIGINT)
+    assert run.wait(60) == 128 + signal.SIGINT
+    _, alive = psutil.wait_procs(below, 30)
+    assert alive == []
 
 
 @pytest.mark.slow
 def test_a_run_that_was_killed_is_gone_on_with(tmp_path):
     pytest.importorskip("snakemake")
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
-    run = subprocess.Popen([sys.executable, "-c", RUN, str(tmp_path), str(Path(__file__).parent)], env=environment)
-    while not any(line.startswith("begun") for line in journal(tmp_path)):
-        assert run.poll() is None
-        time.sleep(0.2)
-    below = psutil.Process(run.pid).children(recursive=True)
+    run, below = begun(tmp_path, seconds=2)
     for process in [psutil.Process(run.pid), *below]:
         process.send_signal(signal.SIGKILL)
     run.wait()

@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
-from small_town import flight, town_workspace
+from small_town import town_workspace
 
+from benchmarks.small_town import flight
 from configs.load import load_config
 from configs.params import Config
 from stages import artifacts
