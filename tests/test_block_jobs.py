@@ -142,6 +142,17 @@ def test_what_is_missing_is_named_with_its_command(monkeypatch, missing, executo
     assert hint in caught.value.hint
 
 
+@pytest.mark.parametrize(("device", "gpus"), [("cuda", 1), ("auto", 0), ("cpu", 0)])
+def test_a_step_asks_for_a_gpu_where_it_is_told_to_use_one(engine, tmp_path, device, gpus):
+    whole = town_workspace(tmp_path / "whole")
+    plan = divide(whole, 2)
+    jobs = block_jobs._jobs(Workspace.open(whole), plan, device)
+    assert all(job.command[job.command.index("--device") + 1] == device for job in jobs)
+    run_jobs(jobs, tmp_path, Capacity(2, "slurm"), set())
+    steps = json.loads((tmp_path / "steps.json").read_text())["steps"]
+    assert {step["gpu"] for blocks in steps.values() for step in blocks.values()} == {gpus}
+
+
 def test_settings_of_a_block_that_cannot_be_read_are_its_own_failure(tmp_path):
     whole = town_workspace(tmp_path / "whole")
     plan = divide(whole, 2)
