@@ -15,7 +15,7 @@ from configs.texts import BALL_FORM, REGION_FORMS, read_ball, read_distance, rea
 from configs.training import MOST_PHOTOS, MOST_SEED, TrainParams
 
 MOST_BALLS = 1000
-INCREMENTAL_MAX = 500  # photos; docs/benchmarks/many-photos.md
+INCREMENTAL_MAX = 1000  # photos; docs/benchmarks/many-photos.md
 MOST_SIDE = 65_536  # pixels: a gigapixel picture is 32,768 high
 
 

@@ -33,10 +33,10 @@ def run_sfm(ingest: Path, root: Path, workers: int = 2, **params: object) -> tup
 
 @pytest.mark.slow
 def test_many_photos_are_mapped_in_clusters():
-    assert choose_mapper("auto", 500, at_once=1) == "incremental"
-    assert choose_mapper("auto", 501, at_once=1) == "hierarchical"
-    assert choose_mapper("auto", 501, at_once=6) == "incremental"
-    assert choose_mapper("global", 501, at_once=1) == "global"
+    assert choose_mapper("auto", 1000, at_once=1) == "incremental"
+    assert choose_mapper("auto", 1001, at_once=1) == "hierarchical"
+    assert choose_mapper("auto", 1001, at_once=6) == "incremental"
+    assert choose_mapper("global", 1001, at_once=1) == "global"
 
 
 def test_rendered_capture_gives_back_its_cameras(tmp_path: Path):
