@@ -73,9 +73,7 @@ def few_colors(colors: np.ndarray, brightness: float = BRIGHTNESS) -> np.ndarray
     Reflectance is sparse over a whole thing (Gehler et al., "Recovering Intrinsic Images with a Global Sparsity Prior
     on Reflectance", 2011), and shading keeps the ratio of the channels.
     """
-    logs = np.log(np.maximum(colors.astype(np.float64), 0.02))
-    mean = logs.mean(1, keepdims=True)
-    features = np.concatenate([logs - mean, brightness * mean], axis=1)
+    features = hues(colors, brightness)
     centers = _crowded(features)
     for _ in range(_ROUNDS_OF_MEANS):
         which = ((features[:, None] - centers) ** 2).sum(2).argmin(1)
@@ -84,6 +82,13 @@ def few_colors(colors: np.ndarray, brightness: float = BRIGHTNESS) -> np.ndarray
     paints = np.stack([np.median(colors[which == k], axis=0) if (which == k).any() else np.zeros(3)
                        for k in range(len(centers))])  # fmt: skip
     return paints[which].astype(np.float32)
+
+
+def hues(colors: np.ndarray, brightness: float = BRIGHTNESS) -> np.ndarray:
+    """Where base colours [S, 3] (linear) lie for `few_colors`: ratios of the channels, and brightness [S, 4]."""
+    logs = np.log(np.maximum(colors.astype(np.float64), 0.02))
+    mean = logs.mean(1, keepdims=True)
+    return np.concatenate([logs - mean, brightness * mean], axis=1)
 
 
 def _crowded(features: np.ndarray) -> np.ndarray:

@@ -13,7 +13,7 @@ from __future__ import annotations
 import numpy as np
 
 from stages.light.harmonics import basis
-from stages.shading.few_materials import few_colors, heard, looks, neighbors
+from stages.shading.few_materials import SAME, few_colors, heard, hues, looks, neighbors
 
 # Differences beyond this (length over the channels) are rather of paint than of shading.
 SPREAD = 0.25
@@ -26,6 +26,8 @@ FINE_OF_METAL = 0.5
 # A difference in brightness counts by this part of one in colour, once shading is out: more than
 # `few_materials.BRIGHTNESS`, for light and dark grey are two paints.
 BRIGHTNESS = 0.7
+# Width of the Gaussian that shares a colour among paints, in parts of `few_materials.SAME`.
+BETWEEN = 0.6
 # Points that a texel hears of its stain from.
 _HEARD = 4
 _DARKEST = 0.02
@@ -73,14 +75,23 @@ def paints(colors: np.ndarray, normals: np.ndarray) -> np.ndarray:
     """The paint [S, 3] of each point: the few of base colours without their shading, both found in turn.
 
     The first turn takes the whole thing to be of one paint, so that one paint in light and shade is not taken for two.
-    What really is of another is an outlier to `shading`.
+    What really is of another is an outlier to `shading`. What lies between two paints in the end is of both, or a slow
+    change would become steps.
     """
     logs = np.log(np.maximum(colors.astype(np.float64), _DARKEST))
     found = np.tile(np.median(colors, axis=0), (len(colors), 1))
     for _ in range(_ROUNDS):
         flat = np.exp(logs - shading(logs - np.log(np.maximum(found, _DARKEST)), normals))
         found = few_colors(flat)
-    return few_colors(flat, BRIGHTNESS)
+    return _blended(flat, np.unique(few_colors(flat, BRIGHTNESS), axis=0))
+
+
+def _blended(colors: np.ndarray, few: np.ndarray) -> np.ndarray:
+    """For colours [S, 3] the mean [S, 3] of logarithms of a few [C, 3], by a Gaussian of how far off each is."""
+    apart = ((hues(colors, BRIGHTNESS)[:, None] - hues(few, BRIGHTNESS)) ** 2).sum(2)
+    shares = np.exp(-(apart - apart.min(1, keepdims=True)) / (2 * (BETWEEN * SAME) ** 2))
+    blended: np.ndarray = np.exp(shares / shares.sum(1, keepdims=True) @ np.log(np.maximum(few, _DARKEST)))
+    return blended
 
 
 def shading(logs: np.ndarray, normals: np.ndarray) -> np.ndarray:
