@@ -87,10 +87,16 @@ def paints(colors: np.ndarray, normals: np.ndarray) -> np.ndarray:
 
 
 def _blended(colors: np.ndarray, few: np.ndarray) -> np.ndarray:
-    """For colours [S, 3] the mean [S, 3] of logarithms of a few [C, 3], by a Gaussian of how far off each is."""
+    """For colours [S, 3] the mean [S, 3] of logarithms of a few [C, 3], by a Gaussian of how far off each is.
+
+    What is far off all of them, a small decal, is a paint of its own.
+    """
     apart = ((hues(colors, BRIGHTNESS)[:, None] - hues(few, BRIGHTNESS)) ** 2).sum(2)
-    shares = np.exp(-(apart - apart.min(1, keepdims=True)) / (2 * (BETWEEN * SAME) ** 2))
-    blended: np.ndarray = np.exp(shares / shares.sum(1, keepdims=True) @ np.log(np.maximum(few, _DARKEST)))
+    nearest = apart.min(1, keepdims=True)
+    shares = np.exp(-(apart - nearest) / (2 * (BETWEEN * SAME) ** 2))
+    logs, of_few = (np.log(np.maximum(each, _DARKEST)) for each in (colors, few))
+    of_them = np.exp(-nearest / (2 * SAME**2))
+    blended: np.ndarray = np.exp(logs + of_them * (shares / shares.sum(1, keepdims=True) @ of_few - logs))
     return blended
 
 
