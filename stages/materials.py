@@ -63,6 +63,7 @@ def run(context: StageContext[MaterialsParams]) -> dict[str, Any]:
     from stages.shading.learning import learn
     from stages.shading.observations import observe
     from stages.shading.reflection import reflection
+    from stages.shading.stains import without_stains
     from stages.shading.surroundings import look_around
     from stages.shading.texels import Points, base_colors
     from stages.texture.padding import pad_charts
@@ -109,9 +110,11 @@ def run(context: StageContext[MaterialsParams]) -> dict[str, Any]:
         )  # fmt: skip
     roughness = np.array([material.roughness for material in learned.materials])[found.which]
     metallic = np.array([material.metallic for material in learned.materials])[found.which]
+    shown = baked.astype(np.float32) / 255
+    color = without_stains(found.color, *everywhere, shown, metallic, chosen, context.workers)
     occlusion = _occlusion(context.read(OCCLUSION), atlas.texture_size).reshape(-1)[texels.index]
     orm = np.stack([occlusion, 255 * roughness + 0.5, 255.0 * metallic], axis=1).astype(np.uint8)
-    write_png(context.to_write(MATERIAL_COLOR), pad_charts(*texels.paint(as_bytes(found.color)))[0])
+    write_png(context.to_write(MATERIAL_COLOR), pad_charts(*texels.paint(as_bytes(color)))[0])
     write_png(context.to_write(ORM), pad_charts(*texels.paint(orm))[0])
     write_png(context.to_write(KNOWN), texels.paint(found.told[:, None])[0][..., 0])
     placed = learned.placed
@@ -221,7 +224,7 @@ def _occlusion(path: Path, size: int) -> np.ndarray:
 
 MATERIALS: Stage[MaterialsParams] = Stage(
     name="materials",
-    version=3,
+    version=4,
     settings=lambda config: config.materials,
     run=run,
     sources=(GIVEN_LIGHT,),

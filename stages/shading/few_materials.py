@@ -13,12 +13,17 @@ WORTH = 0.03
 MOST_MATERIALS = 6
 
 
+def looks(positions: np.ndarray, colors: np.ndarray, extent: float) -> np.ndarray:
+    """Place and look of points [S, 6]: 1 apart is REACH of the extent or COLOR_REACH of a coded colour."""
+    return np.concatenate([positions / (REACH * extent), colors / COLOR_REACH], axis=1)
+
+
 def neighbors(positions: np.ndarray, colors: np.ndarray) -> np.ndarray:
     """The NEIGHBORS points [S, N] that are most like each one in place [S, 3] and colour [S, 3], itself the first."""
     from scipy.spatial import cKDTree
 
     extent = float(np.ptp(positions, axis=0).max())
-    features = np.concatenate([positions / (REACH * extent), colors / COLOR_REACH], axis=1)
+    features = looks(positions, colors, extent)
     return cKDTree(features).query(features, k=min(NEIGHBORS, len(features)))[1].reshape(len(features), -1)
 
 
@@ -62,15 +67,13 @@ MOST_PAINTS = 16
 _ROUNDS_OF_MEANS = 5
 
 
-def few_colors(colors: np.ndarray) -> np.ndarray:
+def few_colors(colors: np.ndarray, brightness: float = BRIGHTNESS) -> np.ndarray:
     """For each base colour [S, 3] (linear) the paint that it may be: the median of those like it.
 
     Reflectance is sparse over a whole thing (Gehler et al., "Recovering Intrinsic Images with a Global Sparsity Prior
     on Reflectance", 2011), and shading keeps the ratio of the channels.
     """
-    logs = np.log(np.maximum(colors.astype(np.float64), 0.02))
-    mean = logs.mean(1, keepdims=True)
-    features = np.concatenate([logs - mean, BRIGHTNESS * mean], axis=1)
+    features = hues(colors, brightness)
     centers = _crowded(features)
     for _ in range(_ROUNDS_OF_MEANS):
         which = ((features[:, None] - centers) ** 2).sum(2).argmin(1)
@@ -79,6 +82,13 @@ def few_colors(colors: np.ndarray) -> np.ndarray:
     paints = np.stack([np.median(colors[which == k], axis=0) if (which == k).any() else np.zeros(3)
                        for k in range(len(centers))])  # fmt: skip
     return paints[which].astype(np.float32)
+
+
+def hues(colors: np.ndarray, brightness: float = BRIGHTNESS) -> np.ndarray:
+    """Where base colours [S, 3] (linear) lie for `few_colors`: ratios of the channels, and brightness [S, 4]."""
+    logs = np.log(np.maximum(colors.astype(np.float64), 0.02))
+    mean = logs.mean(1, keepdims=True)
+    return np.concatenate([logs - mean, brightness * mean], axis=1)
 
 
 def _crowded(features: np.ndarray) -> np.ndarray:

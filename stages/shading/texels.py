@@ -13,7 +13,7 @@ from stages.light import ggx
 from stages.light.environment import look_up
 from stages.light.levels import matte
 from stages.light.srgb import decoded
-from stages.shading.few_materials import COLOR_REACH, REACH
+from stages.shading.few_materials import looks
 from stages.shading.fitting import CLIPPED
 from stages.shading.learning import Learned
 from stages.shading.reflection import matte_weights
@@ -95,10 +95,8 @@ def base_colors(
     coded = baked.astype(np.float32) / 255
     extent = float(np.ptp(points.positions, axis=0).max())
 
-    def features(at: np.ndarray, colors: np.ndarray) -> np.ndarray:
-        return np.concatenate([at / (REACH * extent), colors / COLOR_REACH], axis=1).astype(np.float32)
-
-    alike = cKDTree(features(points.positions, points.colors)).query(features(positions, coded), workers=workers)[1]
+    of_points, of_texels = looks(points.positions, points.colors, extent), looks(positions, coded, extent)
+    alike = cKDTree(of_points).query(of_texels, workers=workers)[1]
     which = learned.which[alike].astype(np.int32)
     distance, near = cKDTree(points.positions).query(positions, k=NEAREST, workers=workers)
     facing = np.clip(np.einsum("tc,tkc->tk", normals, points.normals[near]), 0, 1)
