@@ -116,7 +116,6 @@ def _state_of(whole: Watched, block: Block) -> dict[str, Any]:
         "error": error,
         "stages": stages,
         "host": host,
-        "shows": "report" if own.shows_report() else "run",
     }
 
 

@@ -32,15 +32,9 @@ def opened(folder: Path) -> Workspace:
 
 
 def cut(whole: Workspace) -> None:
-    cores = [np.array([[i, 0.0, 0], [i + 1.0, 2, 1]]) for i in range(3)]
+    cores, margin = [np.array([[i, 0.0, 0], [i + 1.0, 2, 1]]) for i in range(3)], np.array([[-0.1], [0.1]])
     blocks = [
-        Block(
-            name=name,
-            core=core,
-            region=np.stack([core[0] - 0.1, core[1] + 0.1]),
-            photos=("a.jpg", "b.jpg"),
-            neighbours=(),
-        )
+        Block(name=name, core=core, region=core + margin, photos=("a.jpg", "b.jpg"), neighbours=())
         for name, core in zip(NAMES, cores, strict=True)
     ]
     similarity = SimilarityRecord.model_validate(Similarity.identity())
