@@ -11,7 +11,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -166,7 +166,7 @@ def read_rough_gains(path: Path) -> Mapping[str, tuple[float, float, float]]:
     return read_record(path, dict[str, tuple[float, float, float]])
 
 
-def write_rough_gains(path: Path, gains: Mapping[str, Sequence[float]]) -> None:
+def write_rough_gains(path: Path, gains: Mapping[str, Iterable[float]]) -> None:
     rounded = {name: [round(float(factor), 4) for factor in factors] for name, factors in gains.items()}
     write_own(path, json.dumps(rounded, indent=1) + "\n")
 
