@@ -15,7 +15,6 @@ from configs.texts import BALL_FORM, REGION_FORMS, read_ball, read_distance, rea
 from configs.training import MOST_PHOTOS, MOST_SEED, TrainParams
 
 MOST_BALLS = 1000
-INCREMENTAL_MAX = 1000  # photos; docs/benchmarks/many-photos.md
 MOST_SIDE = 65_536  # pixels: a gigapixel picture is 32,768 high
 
 
@@ -75,11 +74,10 @@ class SfmParams(Section):
         description="up to so many photos preemptive compares all pairs; of more, those near in space (GPS), next in "
         "name or alike. More views of 360-degree pictures than this are matched with neighbours only",
     )
-    mapper: Literal["auto", "incremental", "global", "hierarchical"] = Field(
-        "auto",
+    mapper: Literal["incremental", "global", "hierarchical"] = Field(
+        "incremental",
         description="how poses are solved; incremental: one photo after another; global: all at once; hierarchical: "
-        "incremental in overlapping clusters of photos, which are merged; auto: incremental of up to "
-        f"{INCREMENTAL_MAX} photos, hierarchical of more",
+        "incremental in overlapping clusters of photos, which are merged",
     )
     wanted: float = Field(
         0.95,

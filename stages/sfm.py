@@ -104,7 +104,7 @@ def run(context: StageContext[SfmParams]) -> dict[str, Any]:
     others = len(best.others)
     lineage, since = _since(context, last.model, known)
     numbers = _publish(
-        context, last, best.registered, unregistered, bench.mapper, bench.matcher, others, found.steps, relaxed
+        context, last, best.registered, unregistered, context.params.mapper, bench.matcher, others, found.steps, relaxed
     )
     _keep_contents(context, contents, image_set, lineage, bench.stands_still)
     warnings = [

@@ -44,7 +44,7 @@ def test_every_setting_is_described() -> None:
     assert [setting.key for setting in settings if not setting.description or not setting.type] == []
     by_key = {setting.key: setting for setting in settings}
     assert by_key["bake.views"].bounds == ">= 1, <= 32"
-    assert by_key["sfm.mapper"].type == "auto | incremental | global | hierarchical"
+    assert by_key["sfm.mapper"].type == "incremental | global | hierarchical"
     assert by_key["train.minutes"].type == "number | null"
 
 

@@ -19,7 +19,7 @@ from stages.errors import InputError, ReconstructionError
 from stages.posing import pairs
 from stages.posing.evidence import Evidence
 from stages.posing.ladder import Step
-from stages.posing.workbench import Workbench, camera_params, choose_mapper, choose_matcher, count_located
+from stages.posing.workbench import Workbench, camera_params, choose_matcher, count_located
 from stages.sfm import SFM
 
 
@@ -32,13 +32,6 @@ def run_sfm(ingest: Path, root: Path, workers: int = 2, **params: object) -> tup
 
 
 @pytest.mark.slow
-def test_many_photos_are_mapped_in_clusters():
-    assert choose_mapper("auto", 1000, at_once=1) == "incremental"
-    assert choose_mapper("auto", 1001, at_once=1) == "hierarchical"
-    assert choose_mapper("auto", 1001, at_once=6) == "incremental"
-    assert choose_mapper("global", 1001, at_once=1) == "global"
-
-
 def test_rendered_capture_gives_back_its_cameras(tmp_path: Path):
     import pycolmap
 

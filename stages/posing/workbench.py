@@ -22,7 +22,6 @@ from typing import Any
 
 import numpy as np
 
-from configs.params import INCREMENTAL_MAX
 from stages.artifacts import ImageSet
 from stages.errors import InputError
 from stages.extras import package_file
@@ -141,8 +140,7 @@ class Workbench:
         self._first = self._latest = Base(masked=params.masks == "always")
         # the most views that were taken at once, as of a 360-degree picture; 1 where all are photos
         self._at_once = max(Counter(record.frame or record.name for record in image_set.images).values())
-        self.mapper = choose_mapper(params.mapper, len(self.names), self._at_once)
-        self._other = "global" if self.mapper == "incremental" else "incremental"
+        self._other = "global" if params.mapper == "incremental" else "incremental"
         self._known: frozenset[int] = frozenset()  # cameras of rigs, whose intrinsics are known
         self._import(self._latest)
         with pycolmap.Database.open(self.database(self._latest)) as database:
@@ -241,13 +239,13 @@ class Workbench:
         if self.depth.from_one_place and self._match_all(self._first):
             self.depth = judge_depth(self.database())
         refuse_one_place(self.depth)
-        return self._solve(self._first, self.mapper)
+        return self._solve(self._first, self.params.mapper)
 
     def all_pairs(self, best: Solution | None) -> Solution | None:
         """Photos left out against all others."""
         base = self._base_of(best)
         self._match_pairs(base, self._pairs_to_try(base, best))
-        return self._solve(base, self.mapper, best)
+        return self._solve(base, self.params.mapper, best)
 
     def no_focal_priors(self, best: Solution | None) -> Solution | None:
         """The same matches, verified and mapped as if the photos carried no EXIF."""
@@ -256,13 +254,13 @@ class Workbench:
         shutil.copyfile(self.database(source), self.database(base))
         forget_focal_priors(self.database(base), self.params.camera_model, self._known)
         self._verify_again(base)
-        return self._solve(base, self.mapper)
+        return self._solve(base, self.params.mapper)
 
     def other_features(self, best: Solution | None, **changes: bool) -> Solution | None:
         """Features of another `Base`, that of the best solution with these changes."""
         base = replace(self._base_of(best), helped=False, **changes)
         self._features_and_matches(base, best)
-        return self._solve(base, self.mapper)
+        return self._solve(base, self.params.mapper)
 
     def help_left_out(self, best: Solution | None) -> Solution | None:
         """Affine features of the photos left out and of those near them, beside the features all have."""
@@ -277,7 +275,7 @@ class Workbench:
         shutil.copyfile(self.database(best.base), self.database(base))
         append(self.database(affine), self.database(base), pairs)
         self._match_pairs(base, pairs)
-        return self._solve(base, self.mapper)
+        return self._solve(base, self.params.mapper)
 
     def few_are_left_out(self, best: Solution | None) -> bool:
         """Most photos are placed by features that are not affine, so that help for the others is worth while."""
@@ -745,17 +743,6 @@ def choose_matcher(params: Any, located: int, num_images: int, at_once: int = 1)
     if num_images <= params.preemptive_max:
         return EXHAUSTIVE
     return "spatial" if located > 0.9 * num_images else "sequential"
-
-
-def choose_mapper(asked: str, num_images: int, at_once: int) -> str:
-    """auto: clusters of many photos, for the time of one after another grows faster than their number.
-
-    Args:
-        at_once: views that were taken at once from one place, whose clusters were never tried; 1: photos.
-    """
-    if asked != "auto":
-        return asked
-    return "incremental" if num_images <= INCREMENTAL_MAX or at_once > 1 else "hierarchical"
 
 
 def camera_params(model: str, focal: float, width: int, height: int) -> str:
