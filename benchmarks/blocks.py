@@ -114,9 +114,11 @@ def tints(plan: BlockPlan, parts: list[Workspace], apart: float) -> dict[str, fl
 
 @dataclass(frozen=True)
 class _Textured:
-    """A tile in the plan's frame: vertices, faces, texture coordinates of the vertices, texture [S, S, 3]."""
+    """A tile in the plan's frame: what casts rays at it, its highest place, faces, texture coordinates of the vertices,
+    texture [S, S, 3]."""
 
-    vertices: np.ndarray
+    caster: Any
+    top: float
     faces: np.ndarray
     uvs: np.ndarray
     texture: np.ndarray
@@ -129,19 +131,20 @@ class _Textured:
         scene = artifacts.SCENE.load(workspace.stage_folder("train"))
         texture = np.asarray(Image.open(artifacts.BASE_COLOR.load(workspace.stage_folder("bake"))).convert("RGB"))
         vertices = scene.poses_from_scene.apply(atlas.vertices.astype(np.float64))
-        return _Textured(vertices, atlas.faces, atlas.uvs, texture)
+        caster, top = raycaster(vertices, atlas.faces), float(vertices[:, 2].max())
+        return _Textured(caster, top, atlas.faces, atlas.uvs, texture)
 
 
 def seen_from_above(tiles: list[_Textured], places: np.ndarray) -> np.ndarray:
     """Colours [P, 3], 1..255, of the highest surface over places in the plan's frame; NaN where there is none."""
     import open3d as o3d
 
-    above = max(float(tile.vertices[:, 2].max()) for tile in tiles) + 1
+    above = max(tile.top for tile in tiles) + 1
     start = np.column_stack([places[:, :2], np.full(len(places), above)])
     rays = np.concatenate([start, np.broadcast_to([0.0, 0.0, -1.0], start.shape)], 1).astype(np.float32)
     nearest, colors = np.full(len(places), np.inf), np.full((len(places), 3), np.nan)
     for tile in tiles:
-        hit = raycaster(tile.vertices, tile.faces).cast_rays(o3d.core.Tensor(rays))
+        hit = tile.caster.cast_rays(o3d.core.Tensor(rays))
         away, corner = hit["t_hit"].numpy(), hit["primitive_uvs"].numpy()
         closer = away < nearest
         corners = tile.uvs[tile.faces[hit["primitive_ids"].numpy()[closer].astype(np.int64)]]
