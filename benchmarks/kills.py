@@ -1,7 +1,7 @@
 """A run in blocks that is killed again and again, against one that nobody disturbs: are the results the same?
 
 python -m benchmarks.synthetic DATA --scenes city --photos 24 --size 160x120 --spp 4
-python -m benchmarks.kills DATA/city/images [--blocks 2] [--kills 10] [--jobs 1] [--set train.steps=200 ...]
+python -m benchmarks.kills DATA/city/images --poses DATA/city/transforms.json [--blocks 2] [--kills 10] [--set ...]
 
 PHOTOS_undisturbed is run once. PHOTOS_killed is begun `--kills` times, each time killed with all below it (SIGKILL)
 after a part of the undisturbed run's time that is drawn at random, and then run to its end. What is told: at which
@@ -29,8 +29,11 @@ COMPARED = ("cleanup/mesh.ply", "bake/base_color.png", "export/model.glb")
 SHARES = (0.05, 0.2)
 
 
-def command(photos: Path, workspace: Path, blocks: int, jobs: int, sets: Sequence[str]) -> list[str]:
+def command(
+    photos: Path, workspace: Path, poses: Path | None, blocks: int, jobs: int, sets: Sequence[str]
+) -> list[str]:
     words = [sys.executable, "-m", "hineus_cli", "run", str(photos), "--workspace", str(workspace)]
+    words += [] if poses is None else ["--poses", str(poses)]
     words += ["--blocks", str(blocks), "--jobs", str(jobs), "--workers", "1", "--device", "cpu"]
     return [*words, *(word for each in sets for word in ("--set", each))]
 
@@ -78,6 +81,9 @@ def hashes(workspace: Path) -> dict[str, str]:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("photos", type=Path)
+    parser.add_argument(
+        "--poses", type=Path, help="as of hineus run: else most kills strike while poses are searched for"
+    )
     parser.add_argument("--blocks", type=int, default=2)
     parser.add_argument("--kills", type=int, default=10)
     parser.add_argument("--jobs", type=int, default=1)
@@ -88,7 +94,7 @@ def main() -> int:
     places = [wanted.photos.with_name(f"{wanted.photos.name}_{name}") for name in ("undisturbed", "killed")]
     for place in places:
         shutil.rmtree(place, ignore_errors=True)
-    words = [command(wanted.photos, place, wanted.blocks, wanted.jobs, wanted.sets) for place in places]
+    words = [command(wanted.photos, place, wanted.poses, wanted.blocks, wanted.jobs, wanted.sets) for place in places]
     logs = [place.with_name(f"{place.name}.log") for place in places]
     whole = run(words[0], logs[0])
     print(f"undisturbed: {whole:.0f} s", flush=True)

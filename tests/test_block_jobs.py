@@ -185,8 +185,9 @@ def test_snakemake_tries_again_and_goes_on(tmp_path):
 
 # Stopped by signals, as a command is.
 RUN = """
-import sys
+import signal, sys
 from pathlib import Path
+signal.signal(signal.SIGINT, signal.default_int_handler)  # it is ignored below what a shell runs in the background
 sys.path.insert(0, sys.argv[2])
 from test_block_jobs import jobs_in
 from hineus_cli.at_once import Stopped

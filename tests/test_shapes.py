@@ -67,6 +67,8 @@ def annotated() -> list:
         module = importlib.import_module(name)
         members = [one for one in vars(module).values() if getattr(one, "__module__", None) == name]
         for member in members:
+            if isinstance(member, typing.TypeVar) or not callable(member):  # a name for a type, or a value
+                continue
             found.append(member)
             if inspect.isclass(member):
                 found += [f for f in vars(member).values() if inspect.isfunction(f)]

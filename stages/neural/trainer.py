@@ -217,7 +217,9 @@ class Trainer:
         self.step_index += 1
         return numbers
 
-    def _replayed(self, replay: Replay, moment: Moment, kind: Hashable) -> dict[str, Tensor]:
+    def _replayed(
+        self, replay: Callable[[Callable[[], Any], Hashable], Any], moment: Moment, kind: Hashable
+    ) -> dict[str, Tensor]:
         """The step as a graph; where there are several processes, up to their exchange."""
 
         def gradients(rays: int) -> _Share:
