@@ -24,6 +24,7 @@ from stages import artifacts
 from stages.artifacts.blocks import BlockPlan, block_folder, read_plan
 from stages.engine.workspace import Workspace
 from stages.evaluation.protocols.known_object import KnownObject, load_known_object, score_surface, truth_from_model
+from stages.evaluation.suites.scores import Part, joined_mesh
 from stages.geometry.similarity import Similarity
 from stages.surface.triangle_mesh import raycaster
 
@@ -38,13 +39,11 @@ def measure(root: Path, truth: Path) -> dict[str, Any]:
     whole, known = Workspace.open(root), load_known_object(truth)
     truth_from_poses = truth_from_model(known, artifacts.MODEL.load(whole.stage_folder("sfm")), truth)
     plan = read_plan(root)
-    if plan is None:
-        meshes, parts = [tile(whole, truth_from_poses)], [whole]
-    else:
-        truth_from_plan = truth_from_poses.compose(plan.plan_from_poses.similarity().inverse())
-        parts = [Workspace.open(block_folder(root, block.name)) for block in plan.blocks]
-        meshes = [tile(part, truth_from_plan) for part in parts]
-    mesh = together(meshes)
+    parts = [whole] if plan is None else [Workspace.open(block_folder(root, block.name)) for block in plan.blocks]
+    truth_from_parts = truth_from_poses
+    if plan is not None:
+        truth_from_parts = truth_from_poses.compose(plan.plan_from_poses.similarity().inverse())
+    mesh = joined_mesh([Part(part, truth_from_parts) for part in parts])
     spent = [made for part in {whole.root: whole, **{p.root: p for p in parts}}.values() for made in manifests(part)]
     photos = len(artifacts.IMAGE_SET.load(whole.stage_folder("ingest")).images)
     return {
@@ -52,26 +51,12 @@ def measure(root: Path, truth: Path) -> dict[str, Any]:
         "blocks": len(parts) if plan else 0,
         "photos": photos,
         **score_surface(*mesh, known).as_dict(),
-        **({} if plan is None else steps(plan, truth_from_plan, mesh, known)),
-        **({} if plan is None else tints(plan, parts, APART * known.surface.extent / truth_from_plan.scale)),
+        **({} if plan is None else steps(plan, truth_from_parts, mesh, known)),
+        **({} if plan is None else tints(plan, parts, APART * known.surface.extent / truth_from_parts.scale)),
         "cpu_s_a_photo": round(sum(made["cpu_s"] for made in spent) / photos, 2),
         "gib": round(max(made["peak_rss"] for made in spent) / 2**30, 2),
         "faces": len(mesh[1]),
     }
-
-
-def tile(workspace: Workspace, truth_from_poses: Similarity) -> Mesh:
-    """The clean mesh of a workspace, in the truth's frame."""
-    vertices, faces = artifacts.CLEAN_MESH.load(workspace.stage_folder("cleanup"))
-    scene = artifacts.SCENE.load(workspace.stage_folder("train"))
-    return truth_from_poses.apply(scene.poses_from_scene.apply(vertices.astype(np.float64))), faces
-
-
-def together(meshes: list[Mesh]) -> Mesh:
-    """Several meshes as one."""
-    starts = np.cumsum([0, *(len(vertices) for vertices, _ in meshes)])
-    faces = [faces + start for (_, faces), start in zip(meshes, starts, strict=False)]
-    return np.concatenate([vertices for vertices, _ in meshes]), np.concatenate(faces)
 
 
 def manifests(workspace: Workspace) -> list[dict[str, Any]]:

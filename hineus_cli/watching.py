@@ -20,6 +20,7 @@ from stages.engine.stage import Stage
 from stages.engine.workspace import Workspace
 
 LIVE_PAGE = "live.html"
+SHARED = ("watching.css", "watching.js")  # in place of comments that name them
 # A report's splats are unpacked by WebAssembly and sorted in a worker, both of which lie in it.
 REPORT_SCRIPTS, NO_SCRIPT = "'unsafe-inline' 'wasm-unsafe-eval' blob:", "'none'"
 _HTML = "text/html; charset=utf-8"
@@ -118,8 +119,11 @@ def as_json(state: dict[str, Any]) -> Answer:
 
 @cache
 def _page(name: str) -> tuple[bytes, str]:
-    """A page of ours, and its one script as a policy names it: no other one runs there."""
-    page = (resources.files("stages") / "templates" / name).read_bytes()
+    """A page of ours with what all have in common, and its one script as a policy names it: no other one runs there."""
+    templates = resources.files("stages") / "templates"
+    page = (templates / name).read_bytes()
+    for shared in SHARED:
+        page = page.replace(b"/* %s */" % shared.encode(), (templates / shared).read_bytes().strip())
     [script] = re.findall(rb"<script>(.*?)</script>", page, re.DOTALL)
     return page, f"'sha256-{base64.b64encode(hashlib.sha256(script).digest()).decode()}'"
 

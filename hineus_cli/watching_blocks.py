@@ -17,7 +17,6 @@ from stages.engine.workspace import Workspace
 from stages.errors import HineusError
 
 PAGE = "blocks.html"
-LAST_BYTES = 1 << 16  # of a file whose last lines are asked for
 
 BlockState = Literal["waiting", "running", "failed", "done"]
 
@@ -122,7 +121,7 @@ def _state_of(whole: Watched, block: Block) -> dict[str, Any]:
 def _trained(own: Watched) -> float | None:
     """The part of the training under way that is done, as it has last logged it; None before that."""
     metrics: Path = artifacts.METRICS.load(own.workspace.scratch_folder("train"))
-    for line in reversed(read_tail(metrics, LAST_BYTES).splitlines()):
+    for line in reversed(read_tail(metrics).splitlines()):
         with suppress(ValueError, KeyError, TypeError, RecursionError):  # being written, or junk
             progress = float(json.loads(line)["progress"])
             return progress if 0 <= progress <= 1 else None

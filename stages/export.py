@@ -111,7 +111,8 @@ def run(context: StageContext[ExportParams]) -> dict[str, Any]:
     }
     writers = {"glb": _write_glb, "usdz": _write_usdz, "obj": _write_obj, "ply": _write_ply, "stl": _write_stl}
     warnings = [_no_metres()] if params.simulation == "usd" and not place.metric else []
-    geoid = _geoid(place, params.heights)
+    # of a map only the tiles ask for it, and it takes pyproj
+    geoid = _geoid(place, params.heights) if place.origin is not None or params.tiles else None
     warnings += [_no_geoid()] if geoid is None and params.tiles and (place.origin or place.crs) else []
     _write_georeference(asset, place, geoid)
     try:

@@ -73,7 +73,8 @@ def test_an_installed_wheel_works_without_the_clone(built: Path, tmp_path: Path)
         "for name in preset_names(): load_config(name)\n"
         "for name in ('neus2', 'hfneus', 'neuralangelo'): load_config(None, None, [f'train.backbone={name}'])\n"
         "scripts = ('viewer', 'region', 'splats', 'photos', 'vendor/three.min', 'vendor/spark.min')\n"
-        "for name in ('live.html', 'blocks.html', 'report.html.j2', *(f'{script}.js' for script in scripts)):\n"
+        "pages = ('live.html', 'blocks.html', 'watching.css', 'watching.js', 'report.html.j2')\n"
+        "for name in (*pages, *(f'{script}.js' for script in scripts)):\n"
         "    assert resources.files('stages').joinpath('templates', name).read_text(encoding='utf-8')\n"
         "print('all there')"
     )

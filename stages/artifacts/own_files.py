@@ -123,8 +123,8 @@ def read_own(path: Path) -> bytes:
         return file.read(size)
 
 
-def read_tail(path: Path, most: int) -> bytes:
-    """The last bytes of a file of ours, however long it has grown; empty where there is none.
+def read_tail(path: Path, most: int = 1 << 16) -> bytes:
+    """The last bytes of a file of ours, some hundred lines, however long it has grown; empty where there is none.
 
     Raises:
         WorkspaceError: it is a link, or no file.

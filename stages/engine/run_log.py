@@ -18,7 +18,6 @@ from stages.engine.workspace import storage_errors
 TRACEBACKS = "stages.tracebacks"  # the logger whose records go to the log file only
 TRACEBACK_IS = "The full traceback is"
 FAILED = "the run failed"
-LAST_BYTES = 1 << 16  # of a log; a traceback takes some thousand
 
 SHOWN = {"Cc", "Cf", "Cs", "Zl", "Zp"}  # categories of characters that are no text but act on it
 JOINERS = "\u200c\u200d"  # parts of words in some scripts, and of emoji
@@ -61,9 +60,7 @@ def failure_told(log: Path) -> str | None:
     Raises:
         WorkspaceError: the log is a link, or no file.
     """
-    records = re.split(
-        r"^(?=\d{4}-\d\d-\d\d )", read_tail(log, LAST_BYTES).decode(errors="replace"), flags=re.MULTILINE
-    )
+    records = re.split(r"^(?=\d{4}-\d\d-\d\d )", read_tail(log).decode(errors="replace"), flags=re.MULTILINE)
     if f" ERROR {TRACEBACKS}: {FAILED}" not in records[-1].partition("\n")[0]:
         return None
     told = re.findall(r"^    ([\w.]+)(?:: (.*))?$", records[-1], re.MULTILINE)

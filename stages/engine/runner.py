@@ -48,6 +48,11 @@ class StageOutcome:
     cpu_s: float = 0.0
     peak_rss: int = 0
 
+    @staticmethod
+    def of(made: Manifest, action: Literal["ran", "skipped"], reason: str) -> StageOutcome:
+        """Of a stage as its manifest has it."""
+        return StageOutcome(made.identity.stage, action, reason, made.numbers, made.wall_s, made.cpu_s, made.peak_rss)
+
 
 class Listener:
     """Told what the runner does, and ignores it. The console's draws it."""
@@ -108,7 +113,7 @@ def run_pipeline(
                 present.digests.save()
             if status.state == "fresh" and stage.name not in forced:
                 assert status.manifest is not None  # a fresh stage has one
-                outcome = _outcome("skipped", status.reason, status.manifest)
+                outcome = StageOutcome.of(status.manifest, "skipped", status.reason)
             else:
                 reason = forced[stage.name] if status.state == "fresh" else status.reason
                 listener.stage_started(stage, reason)
@@ -116,7 +121,7 @@ def run_pipeline(
                 if stage.name not in forced:
                     previous = previous_to_continue(stage, workspace, config)
                 manifest = _run_stage(stage, present, status, previous, device, workers, listener)
-                outcome = _outcome("ran", reason, manifest)
+                outcome = StageOutcome.of(manifest, "ran", reason)
                 status = StageStatus(stage.name, "fresh", (), manifest, manifest.identity)
             statuses[stage.name] = status
             log.debug("%s %s: %s", stage.name, outcome.action, outcome.reason)
@@ -305,7 +310,3 @@ def _describe(
         versions=current_versions(),
         created=now(),
     )
-
-
-def _outcome(action: Literal["ran", "skipped"], reason: str, made: Manifest) -> StageOutcome:
-    return StageOutcome(made.identity.stage, action, reason, made.numbers, made.wall_s, made.cpu_s, made.peak_rss)

@@ -218,8 +218,7 @@ class Workspace:
 
     def in_use(self) -> bool:
         """Whether a process on this machine that took the lock is still there. Takes no lock, so it disturbs none."""
-        holder = _lock_holder(self.root)
-        return holder is not None and holder.host == socket.gethostname() and bool(psutil.pid_exists(holder.pid))
+        return self.host_at_work() == socket.gethostname()
 
     def host_at_work(self) -> str | None:
         """The machine whose process took the lock, if that is still there, which can be asked on this one only."""

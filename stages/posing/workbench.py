@@ -136,11 +136,11 @@ class Workbench:
         self.threads, self.workers = threads, workers
         self.cuda, self.torch_cuda = cuda and pycolmap.has_cuda, cuda
         self._progress, self._rung = progress, ""
+        self._other = "global" if params.mapper == "incremental" else "incremental"
         self._guided = self._relaxed = self._stationary = False
         self._first = self._latest = Base(masked=params.masks == "always")
         # the most views that were taken at once, as of a 360-degree picture; 1 where all are photos
         self._at_once = max(Counter(record.frame or record.name for record in image_set.images).values())
-        self._other = "global" if params.mapper == "incremental" else "incremental"
         self._known: frozenset[int] = frozenset()  # cameras of rigs, whose intrinsics are known
         self._import(self._latest)
         with pycolmap.Database.open(self.database(self._latest)) as database:

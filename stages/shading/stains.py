@@ -79,11 +79,16 @@ def paints(colors: np.ndarray, normals: np.ndarray) -> np.ndarray:
     change would become steps.
     """
     logs = np.log(np.maximum(colors.astype(np.float64), _DARKEST))
-    found = np.tile(np.median(colors, axis=0), (len(colors), 1))
-    for _ in range(_ROUNDS):
-        flat = np.exp(logs - shading(logs - np.log(np.maximum(found, _DARKEST)), normals))
-        found = few_colors(flat)
+    flat = _flattened(logs, np.tile(np.median(colors, axis=0), (len(colors), 1)), normals)
+    for _ in range(_ROUNDS - 1):
+        flat = _flattened(logs, few_colors(flat), normals)
     return _blended(flat, np.unique(few_colors(flat, BRIGHTNESS), axis=0))
+
+
+def _flattened(logs: np.ndarray, found: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """Base colours [S, 3] of these logarithms without their shading, by the paints [S, 3] found so far."""
+    flat: np.ndarray = np.exp(logs - shading(logs - np.log(np.maximum(found, _DARKEST)), normals))
+    return flat
 
 
 def _blended(colors: np.ndarray, few: np.ndarray) -> np.ndarray:

@@ -23,7 +23,6 @@ from configs.dotted import flatten
 from configs.params import Config
 from stages import artifacts
 from stages.block_by_block import reconstruct_in_blocks
-from stages.engine.manifest import Manifest
 from stages.engine.runner import Listener, StageOutcome
 from stages.engine.stage import Stage
 from stages.engine.workspace import Workspace, storage_errors
@@ -220,14 +219,11 @@ def _reconstruct(request: BenchRequest, asked: Request, pipeline: Sequence[Stage
     for part in parts:
         made = _fingerprints(part.workspace, names)
         made_from |= {f"{part.workspace.root.name} {name}": fingerprint for name, fingerprint in made.items()}
-        outcomes += [_told(manifest) for name in names if (manifest := part.workspace.published(name))]
+        outcomes += [
+            StageOutcome.of(manifest, "skipped", "") for name in names if (manifest := part.workspace.published(name))
+        ]
     photos = len({photo for block in runs.plan.blocks for photo in block.photos})
     return _Done(runs.whole, parts, set(names), tuple(outcomes), photos, made_from)
-
-
-def _told(manifest: Manifest) -> StageOutcome:
-    made = manifest.numbers, manifest.wall_s, manifest.cpu_s, manifest.peak_rss
-    return StageOutcome(manifest.identity.stage, "skipped", "", *made)
 
 
 def _costs(done: _Done) -> dict[str, Any]:

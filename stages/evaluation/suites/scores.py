@@ -116,13 +116,19 @@ def result_mesh(parts: Sequence[Part], fresh: set[str], out: Path) -> Path | Non
         return None
     import trimesh
 
-    meshes = []
-    for part in parts:
-        vertices, faces = artifacts.CLEAN_MESH.load(part.workspace.stage_folder("cleanup"))
-        in_poses = part.poses_from_scene.apply(vertices.astype(np.float64))
-        meshes.append(trimesh.Trimesh(in_poses, faces, process=False))
-    trimesh.util.concatenate(meshes).export(out)
+    trimesh.Trimesh(*joined_mesh(parts), process=False).export(out)
     return out
+
+
+def joined_mesh(parts: Sequence[Part]) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices [V, 3] and faces [F, 3] of the clean meshes of all parts, in the frame of the whole's poses."""
+    vertices, faces, count = [], [], 0
+    for part in parts:
+        own, corners = artifacts.CLEAN_MESH.load(part.workspace.stage_folder("cleanup"))
+        vertices.append(part.poses_from_scene.apply(own.astype(np.float64)))
+        faces.append(corners + count)
+        count += len(own)
+    return np.concatenate(vertices), np.concatenate(faces)
 
 
 def posed_mesh(workspace: Workspace, mesh: Path, out: Path) -> Path:
