@@ -547,7 +547,7 @@ def save_run(run: Run) -> None:
 def load_runs() -> list[Run]:
     """All there are: by set, then in the order of VARIANTS (those no longer in it last), then by seed."""
     runs = []
-    for path in RUNS.glob("*.json"):
+    for path in sorted(RUNS.glob("*.json")):
         data = json.loads(path.read_text(encoding="utf-8"))
         runs.append(Run(plan=_plan(data.pop("plan")), **data))
     order = {name: place for place, name in enumerate(VARIANTS)}

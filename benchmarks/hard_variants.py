@@ -436,7 +436,7 @@ def save_row(row: Row) -> None:
 def load_rows() -> list[Row]:
     """All there are: the sets, then the variants in the order of `VARIANTS`."""
     rows = []
-    for path in ROWS.glob("*.json"):
+    for path in sorted(ROWS.glob("*.json")):
         data = artifacts.read_json(path)
         lists = {key: tuple(data[key]) for key in ("attempts", "mesh_settings") if key in data}
         rows.append(Row(**{**data, **lists}))

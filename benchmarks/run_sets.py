@@ -242,7 +242,7 @@ def save_result(result: Result, path: Path) -> None:
 def load_results(folder: Path) -> list[Result]:
     """All results there are, the demo first, then by name and seed."""
     results = []
-    for path in folder.glob("*.json"):
+    for path in sorted(folder.glob("*.json")):
         data = artifacts.read_json(path)
         data["stages"] = tuple(StageCost(**stage) for stage in data["stages"])
         results.append(Result(**data))

@@ -107,6 +107,13 @@ def test_the_tables_on_the_pages_are_those_of_the_result_files():
     assert marked - {"rooms", "wheels"} == set(made)
 
 
+def test_tables_are_the_same_in_whatever_order_a_folder_lists_its_files(monkeypatch):
+    listed = Path.glob
+    made = all_tables()
+    monkeypatch.setattr(Path, "glob", lambda folder, pattern: reversed(list(listed(folder, pattern))))
+    assert all_tables() == made
+
+
 def test_what_to_expect_says_the_same_as_the_pages_behind_it():
     """A row of each of its tables, worked out from the other pages' cells."""
 
