@@ -224,7 +224,7 @@ def _occlusion(path: Path, size: int) -> np.ndarray:
 
 MATERIALS: Stage[MaterialsParams] = Stage(
     name="materials",
-    version=4,
+    version=5,
     settings=lambda config: config.materials,
     run=run,
     sources=(GIVEN_LIGHT,),

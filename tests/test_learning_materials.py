@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from lit_sphere import METAL, PLASTIC, ROWS, lit_sphere, use_small_maps
 
 from stages.light.environment import solid_angles
 from stages.light.ggx import ROUGHNESSES
+from stages.shading import learning
 from stages.shading.learning import METAL as METAL_BRIGHTNESS
 from stages.shading.learning import TOLD_MARGIN, _material, learn
 
@@ -44,6 +47,21 @@ def test_where_all_is_metal_its_brightness_is_a_convention():
     learned = learn(sphere.observations, sphere.reflection, sphere.normals, 16)
     assert {material.metallic for material in learned.materials} == {1}
     assert float(np.median(learned.color.max(1))) == pytest.approx(METAL_BRIGHTNESS, abs=0.02)
+
+
+@pytest.mark.parametrize(("cost_of_both", "metals"), [(0.96, {1}), (0.8, {0, 1})])
+def test_metal_beside_what_is_none_must_be_worth_it(monkeypatch, cost_of_both, metals):
+    """Plastic that a metal explains 4 % or 20 % worse, as the loop has it."""
+    sphere = lit_sphere((METAL, PLASTIC), count=300, views=16)
+    costs = {(0, 1): cost_of_both, (0,): 2.0, (1,): 1.0}
+    turn = learning._Turns.turn
+    monkeypatch.setattr(learning, "FIRST_TURNS", 1)
+    monkeypatch.setattr(learning, "MORE_TURNS", 3)
+    monkeypatch.setattr(
+        learning._Turns, "turn", lambda self, *state: replace(found := turn(self, *state), cost=costs[found.kinds])
+    )
+    learned = learn(sphere.observations, sphere.reflection, sphere.normals, 16)
+    assert {material.metallic for material in learned.materials} == metals
 
 
 def test_roughness_is_refined_between_the_candidates():

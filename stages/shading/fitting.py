@@ -16,6 +16,7 @@ that is brighter.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -136,19 +137,21 @@ def slopes(scale: Tensor, bias: Tensor, mirrored: Tensor, diffuse: Tensor, metal
 
 
 # ---------------------------------------------------------------- materials from light
-def try_out(reflection: Reflection, observed: Tensor, weights: Tensor, light: Tensor) -> tuple[Tensor, Tensor]:
-    """How well each roughness fits, as no metal and as metal.
+def try_out(
+    reflection: Reflection, observed: Tensor, weights: Tensor, light: Tensor, kinds: Sequence[int] = (0, 1)
+) -> tuple[Tensor, Tensor]:
+    """How well each roughness fits, as no metal (0) and as metal (1).
 
     Returns:
-        costs [S, 2, R] in [0, 1] and the best base colours [S, 2, R, 3].
+        costs [S, 2, R], infinite for a kind that is not asked for, and the best base colours [S, 2, R, 3].
     """
     count = len(observed)
-    costs, colors = torch.empty(count, 2, LEVELS), torch.empty(count, 2, LEVELS, 3)
+    costs, colors = torch.full((count, 2, LEVELS), torch.inf), torch.zeros(count, 2, LEVELS, 3)
     total = weights.sum(1).clamp_min(1e-9)
     for part in torch.arange(count).split(1024):
         here = reflection.select(part)
         diffuse, mirrored = here.diffuse(light)[:, None], here.mirrored(light)
-        for metallic in (0, 1):
+        for metallic in kinds:
             for level in range(LEVELS):
                 slope, offset = slopes(
                     here.scale[..., level, None], here.bias[..., level, None], mirrored[:, :, level], diffuse, metallic
