@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from stages.shading.few_materials import MOST_MATERIALS, choose_few, few_colors, heard, neighbors
+from stages.shading.few_materials import MOST_MATERIALS, choose_few, few_colors, heard, neighbors, of_one_kind
 
 
 def costs_of(which: np.ndarray, noise: float = 0.0) -> np.ndarray:
@@ -16,27 +16,38 @@ def costs_of(which: np.ndarray, noise: float = 0.0) -> np.ndarray:
 
 def test_the_planted_ones_are_chosen():
     which = np.repeat([3, 12, 17], [50, 30, 20])
-    chosen, served = choose_few(costs_of(which))
+    chosen = choose_few(costs_of(which))
     assert set(chosen) == {3, 12, 17}
     assert chosen[0] == 3  # what fits most comes first
-    assert (np.array(chosen)[served] == which).all()
 
 
 def test_noise_adds_no_material():
     costs = heard(costs_of(np.full(400, 5), noise=0.05), np.random.default_rng(1).integers(0, 400, (400, 16)))
-    chosen, served = choose_few(costs)
-    assert chosen == [5]
-    assert (served == 0).all()
+    assert choose_few(costs) == [5]
 
 
 def test_two_points_of_a_thousand_are_no_material():
     which = np.full(1000, 5)
     which[:2] = 9
-    assert choose_few(costs_of(which))[0] == [5]
+    assert choose_few(costs_of(which)) == [5]
 
 
 def test_there_are_no_more_than_so_many():
-    assert len(choose_few(costs_of(np.arange(2000) % (MOST_MATERIALS + 2)))[0]) == MOST_MATERIALS
+    assert len(choose_few(costs_of(np.arange(2000) % (MOST_MATERIALS + 2)))) == MOST_MATERIALS
+
+
+def test_a_paint_is_of_one_kind_unless_both_serve_it_clearly_better():
+    """The first paint looks a little more like the other kind at some points, the second is half of each."""
+    costs = np.array([[0.5, 0.52]] * 7 + [[0.52, 0.5]] * 3 + [[0.2, 0.9]] * 5 + [[0.9, 0.2]] * 5)
+    paint = np.repeat([4, 7], 10)
+    allowed = of_one_kind(costs, np.array([0, 1]), paint, worth=0.1)
+    assert (allowed[paint == 4].argmin(1) == 0).all()
+    assert (allowed[paint == 7] == costs[paint == 7]).all()
+
+
+def test_roughnesses_of_one_kind_stay_free():
+    costs = np.random.default_rng(0).random((20, 3))
+    np.testing.assert_array_equal(of_one_kind(costs, np.zeros(3, int), np.zeros(20, int), worth=0.1), costs)
 
 
 def test_each_point_is_its_own_first_neighbour_and_others_look_alike():

@@ -34,16 +34,13 @@ def heard(values: np.ndarray, near: np.ndarray) -> np.ndarray:
     return values
 
 
-def choose_few(costs: np.ndarray) -> tuple[list[int], np.ndarray]:
-    """The few candidates that serve all points, and which one serves each.
+def choose_few(costs: np.ndarray) -> list[int]:
+    """The few candidates that serve all points.
 
     Greedy: the one that fits all points best, then each time the one that helps most, as long as it is worth it.
 
     Args:
         costs: [S, C] of each candidate at each point.
-
-    Returns:
-        Their numbers, and for each point [S] a place in that list.
     """
     chosen = [int(costs.mean(0).argmin())]
     served = costs[:, chosen[0]]
@@ -54,7 +51,22 @@ def choose_few(costs: np.ndarray) -> tuple[list[int], np.ndarray]:
             break
         chosen.append(best)
         served = np.minimum(served, costs[:, best])
-    return chosen, costs[:, chosen].argmin(1)
+    return chosen
+
+
+def of_one_kind(costs: np.ndarray, kinds: np.ndarray, paint: np.ndarray, worth: float) -> np.ndarray:
+    """Costs [S, C], infinite where a point's paint [S] is not of the candidate's kind [C] (ints both).
+
+    A paint is of the kind that serves its points best; of all kinds, where that lowers their cost by the part `worth`.
+    """
+    allowed = costs.copy()
+    for each in np.unique(paint):
+        rows = np.flatnonzero(paint == each)
+        alone = {kind: costs[np.ix_(rows, kinds == kind)].min(1).mean() for kind in np.unique(kinds)}
+        best = min(alone, key=lambda kind: alone[kind])
+        if costs[rows].min(1).mean() >= (1 - worth) * alone[best]:
+            allowed[np.ix_(rows, kinds != best)] = np.inf
+    return allowed
 
 
 # ---------------------------------------------------------------- base colours

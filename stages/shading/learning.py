@@ -12,7 +12,7 @@ from torch import Tensor
 from stages.light.environment import solid_angles
 from stages.light.ggx import ROUGHNESSES
 from stages.shading.exposures import balanced, exposures
-from stages.shading.few_materials import choose_few, few_colors, heard, neighbors
+from stages.shading.few_materials import choose_few, few_colors, heard, neighbors, of_one_kind
 from stages.shading.fitting import (
     BRIGHTEST,
     LEVELS,
@@ -30,9 +30,10 @@ from stages.shading.reflection import LIGHT_ROWS, Reflection
 
 # From each start so many turns; the better one goes on for so many more.
 FIRST_TURNS, MORE_TURNS = 4, 5
-# Metal beside what is none must lower the cost by this part: what is in shade, mirrors the thing itself or has a normal
-# a little off fits the other kind a little better, and the light follows (4 % on rough copper, 35 % where it is so).
-BOTH_WORTH = 0.08
+# Metal beside what is none must lower the cost by this part, of the whole thing and of each of its paints: what is in
+# shade, mirrors the thing itself or has a normal a little off fits the other kind a little better, and the light
+# follows (4 % on rough copper, 35 % on a thing of paint and metals).
+BOTH_WORTH = 0.1
 # Points that take part in the turns, and in finding the light.
 MOST_POINTS, LIGHT_POINTS = 3000, 2000
 # Where all is metal nothing tells how bright light and surface are; a metal's brightest channel is then about this.
@@ -172,15 +173,17 @@ class _Turns:
         self.raw, self.weights = torch.from_numpy(observations.colors), torch.from_numpy(observations.weights)
         self.photos, self.num_photos = torch.from_numpy(observations.photos), num_photos
         shown = (self.raw * self.weights[..., None]).sum(1) / self.weights.sum(1, keepdim=True).clamp_min(1e-9)
-        self.shown, self.near = shown, neighbors(positions, shown.numpy())
+        self.near = neighbors(positions, shown.numpy())
+        self.paints = few_colors(decoded(shown).numpy())
+        self.paint = np.unique(self.paints, axis=0, return_inverse=True)[1].reshape(-1)
 
     def start(self, metallic: float) -> _State:
         """The light that was given, where it fits best; else one that is the same from all sides."""
         count = len(self.raw)
         mean = decoded(self.raw[self.weights > 0]).mean()
         light = torch.full((2 * LIGHT_ROWS**2, 3), 2 * float(mean))
-        paints = torch.from_numpy(few_colors(decoded(self.shown).numpy())) / (2 * mean)
-        materials = Materials(paints.clamp(0, BRIGHTEST), torch.full((count,), 0.3), torch.full((count,), metallic))
+        paints = (torch.from_numpy(self.paints) / (2 * mean)).clamp(0, BRIGHTEST)
+        materials = Materials(paints, torch.full((count,), 0.3), torch.full((count,), metallic))
         placed = None
         if self.given is not None:
             placed = self.given.find(self.reflection, self.raw, self.weights, materials)
@@ -240,10 +243,12 @@ class _Turns:
         costs, colors = try_out(self.reflection, observed, self.weights, light, kinds)
         costs = costs.flatten(1)
         shared = heard(costs.numpy(), self.near)
-        chosen, which = choose_few(shared)
-        best = torch.tensor(chosen)[torch.from_numpy(which)]
-        rows = torch.arange(len(best))
-        return _Choice(chosen, which, best, colors.flatten(1, 2)[rows, best], shared, float(costs[rows, best].mean()))
+        chosen = np.array(choose_few(shared))
+        best = chosen[of_one_kind(shared[:, chosen], chosen // LEVELS, self.paint, BOTH_WORTH).argmin(1)]
+        used, which = np.unique(best, return_inverse=True)
+        rows, best = torch.arange(len(best)), torch.from_numpy(best)
+        color, cost = colors.flatten(1, 2)[rows, best], float(costs[rows, best].mean())
+        return _Choice(used.tolist(), which, best, color, shared, cost)
 
 
 def _material(candidate: int, costs: np.ndarray) -> Material:
