@@ -10,6 +10,8 @@ from benchmarks.materials.glb_model import linear, read_finished, z_up_light
 from benchmarks.materials.held_out import Y_UP, Views, write_held_out, y_up_map, z_up_map
 from benchmarks.materials.true_model import write_true_model
 from benchmarks.synthetic.model import Part, Principled, Scene, plain
+from stages.artifacts import write_json
+from stages.errors import InputError
 from stages.light import environment
 from stages.light.srgb import coded
 from stages.scenes.room import sphere_directions
@@ -191,3 +193,57 @@ def test_the_truth_is_judged_nearly_perfect_and_its_mirror_image_is_not(tmp_path
     assert relit(model, light) > 33
     assert relit(model, light[:, ::-1]) < 25
     assert relit(replace(model, metallic=0 * model.metallic), light) < 25
+
+
+@pytest.fixture(scope="module")
+def published(tmp_path_factory):
+    """A scene in the layout of Synthetic4Relight, and the truth as a run would have left it."""
+    pytest.importorskip("mitsuba")
+    from PIL import Image
+
+    from benchmarks.synthetic.mitsuba_camera import EVERYWHERE
+    from stages.light.srgb import as_bytes
+
+    folder, data = tmp_path_factory.mktemp("made"), tmp_path_factory.mktemp("published")
+    scene, views = _scene(), Views(_scene().cam_from_world, 110.0, (80, 60))
+    write_true_model("mixed", scene, folder)
+    write_held_out(scene, views, folder, 64, EVERYWHERE)
+    pose = np.linalg.inv(views.cam_from_world[0]) @ np.diag([1.0, -1, -1, 1])
+    frames = [{"file_path": "./test/000", "transform_matrix": pose.tolist()}]
+    write_json(data / "transforms_test.json", {"camera_angle_x": 2 * np.arctan(40 / 110), "frames": frames})
+    truth = held_out.read_truth(folder, 0)
+    alpha = (255 * truth["coverage"] + 0.5).astype(np.uint8)[..., None]
+
+    def write(name: str, codes: np.ndarray) -> None:
+        (data / name).parent.mkdir(exist_ok=True)
+        Image.fromarray(np.concatenate([codes, alpha], axis=2)).save(data / name)
+
+    write("test/000_rgba.png", as_bytes(np.clip(truth["radiance_studio"], 0, 1)))
+    write("test/000_albedo.png", as_bytes(truth["base_color"]))
+    write("test/000_rough.png", np.repeat((255 * truth["roughness"] + 0.5).astype(np.uint8)[..., None], 3, axis=2))
+    write("test_rli/envmap6_000.png", as_bytes(np.clip(truth["radiance_sky"], 0, 1)))
+    return data, folder
+
+
+@pytest.mark.slow
+def test_a_true_model_is_judged_nearly_perfect_in_the_layout_of_synthetic4relight(published):
+    from benchmarks.materials.synthetic4relight import read_light, score_scene
+    from benchmarks.synthetic.mitsuba_camera import EVERYWHERE
+
+    data, folder = published
+    light = read_light(folder / "lights" / "sky.exr")
+    scores = score_scene(data, folder, {"envmap6": light}, EVERYWHERE)
+    assert scores["albedo_psnr"] > 30
+    assert scores["relit_envmap6_psnr"] > 30
+    assert scores["novel_psnr"] > 30
+    assert scores["roughness_mse"] < 1e-3
+    turned = score_scene(data, folder, {"envmap6": np.roll(light, light.shape[1] // 3, axis=1)}, EVERYWHERE)
+    assert turned["relit_envmap6_psnr"] < scores["relit_envmap6_psnr"] - 3
+
+
+def test_a_scene_of_synthetic4relight_that_lacks_a_picture_is_told_which(tmp_path):
+    from benchmarks.materials.synthetic4relight import read_tests
+
+    write_json(tmp_path / "transforms_test.json", {"camera_angle_x": 0.7, "frames": [{"file_path": "./test/007"}]})
+    with pytest.raises(InputError, match=r"no 007.png or 007_rgba.png in .*test"):
+        read_tests(tmp_path)
