@@ -139,7 +139,7 @@ def learn(
     turns = _Turns(
         observations.select(some), reflection.select(torch.from_numpy(some)), positions[some], num_photos, given
     )
-    total = 4 * FIRST_TURNS + MORE_TURNS
+    total = 3 * FIRST_TURNS + MORE_TURNS + 2
     done = iter(range(total))
 
     def turned(state: _State, times: int, expose: bool = True) -> _State:
@@ -151,8 +151,8 @@ def learn(
     starts = [turned(turns.start(metallic), FIRST_TURNS, expose=False) for metallic in (0.0, 1.0)]
     state = turned(min(starts, key=lambda each: each.cost), MORE_TURNS)
     if len(state.materials.metallic.unique()) > 1:
-        ones = [turned(replace(state, kinds=(kind,)), FIRST_TURNS) for kind in (0, 1)]
-        one = min(ones, key=lambda each: each.cost)
+        ones = [turned(replace(state, kinds=(kind,)), 1) for kind in (0, 1)]
+        one = turned(min(ones, key=lambda each: each.cost), FIRST_TURNS)
         state = state if state.cost < (1 - BOTH_WORTH) * one.cost else one
     everything = _Turns(observations, reflection, positions, num_photos, given)
     return everything.end(state)
