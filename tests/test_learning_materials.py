@@ -11,6 +11,7 @@ from lit_sphere import METAL, PLASTIC, ROWS, lit_sphere, use_small_maps
 from stages.light.environment import solid_angles
 from stages.light.ggx import ROUGHNESSES
 from stages.shading import learning
+from stages.shading.fitting import BRIGHTEST
 from stages.shading.learning import METAL as METAL_BRIGHTNESS
 from stages.shading.learning import TOLD_MARGIN, _material, learn
 
@@ -62,6 +63,20 @@ def test_metal_beside_what_is_none_must_be_worth_it(monkeypatch, cost_of_both, m
     )
     learned = learn(sphere.observations, sphere.reflection, sphere.normals, 16)
     assert {material.metallic for material in learned.materials} == metals
+
+
+def test_a_light_that_came_out_too_dark_does_not_bleach_base_colours():
+    """The first kind would be 2.3 times as bright as it can be; the ratio of the two stays."""
+    dark = ((0.2, 0.1, 0.05), 0.9, 0.0)
+    sphere = lit_sphere((((0.9, 0.8, 0.7), 0.9, 0.0), dark), count=200, views=16)
+    turns = learning._Turns(sphere.observations, sphere.reflection, sphere.normals, 16, None)
+    state = replace(turns.start(0.0), light=0.4 * sphere.light, kinds=(0,))
+    learned = turns.end(state)
+    first = sphere.color.numpy()[:, 0] > 0.5
+    bright, less = (np.median(learned.color[rows], axis=0) for rows in (first, ~first))
+    assert bright.max() == pytest.approx(learning.WHITE, abs=0.05)
+    np.testing.assert_allclose(bright / less, [4.5, 8, 14], rtol=0.15)
+    assert learned.color.max() <= BRIGHTEST
 
 
 def test_roughness_is_refined_between_the_candidates():

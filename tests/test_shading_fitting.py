@@ -207,7 +207,6 @@ def test_a_light_of_a_tint_is_white_on_average_and_pictures_stay():
     mean = (white * angles[:, None]).sum(0) / angles.sum()
     torch.testing.assert_close(mean, mean.mean().expand(3))
     torch.testing.assert_close(white * tinted, light * color)
-    assert grey_world(light, torch.ones(1, 3), angles)[1].max() <= BRIGHTEST
 
 
 def test_points_of_no_material_do_not_break_the_light():

@@ -91,7 +91,13 @@ def robust_weight(off: Tensor) -> Tensor:
 
 
 def best_color(
-    slope: Tensor, offset: Tensor, observed: Tensor, weights: Tensor, rounds: int = 3, paint: Tensor | None = None
+    slope: Tensor,
+    offset: Tensor,
+    observed: Tensor,
+    weights: Tensor,
+    rounds: int = 3,
+    paint: Tensor | None = None,
+    brightest: float = BRIGHTEST,
 ) -> Tensor:
     """Base colours [S, 3] that make slope · ρ + offset [S, K, 3] fit coded colours best.
 
@@ -110,7 +116,7 @@ def best_color(
         if paint is not None:
             own = color.mean(1, keepdim=True).clamp_min(1e-6)
             color = color * (own + PULL * paint.mean(1, keepdim=True)) / ((1 + PULL) * own)
-        color = color.clamp(0, BRIGHTEST)
+        color = color.clamp(0, brightest)
         predicted = slope * color[:, None] + offset
         off = residuals(predicted, observed)
         agrees = clipped & (off == 0)
@@ -138,9 +144,14 @@ def slopes(scale: Tensor, bias: Tensor, mirrored: Tensor, diffuse: Tensor, metal
 
 # ---------------------------------------------------------------- materials from light
 def try_out(
-    reflection: Reflection, observed: Tensor, weights: Tensor, light: Tensor, kinds: Sequence[int] = (0, 1)
+    reflection: Reflection,
+    observed: Tensor,
+    weights: Tensor,
+    light: Tensor,
+    kinds: Sequence[int] = (0, 1),
+    brightest: float = BRIGHTEST,
 ) -> tuple[Tensor, Tensor]:
-    """How well each roughness fits, as no metal (0) and as metal (1).
+    """How well each roughness fits, as no metal (0) and as metal (1), with base colours up to `brightest`.
 
     Returns:
         costs [S, 2, R], infinite for a kind that is not asked for, and the best base colours [S, 2, R, 3].
@@ -156,7 +167,7 @@ def try_out(
                 slope, offset = slopes(
                     here.scale[..., level, None], here.bias[..., level, None], mirrored[:, :, level], diffuse, metallic
                 )
-                color = best_color(slope, offset, observed[part], weights[part])
+                color = best_color(slope, offset, observed[part], weights[part], brightest=brightest)
                 off = residuals(slope * color[:, None] + offset, observed[part])
                 colors[part, metallic, level] = color
                 costs[part, metallic, level] = (weights[part] * robust(off).mean(2)).sum(1) / total[part]
@@ -299,4 +310,4 @@ def grey_world(light: Tensor, color: Tensor, solid_angles: Tensor) -> tuple[Tens
     """The same pictures with a light that is white on average: what light and base colours share is a convention."""
     mean = (light * solid_angles[:, None]).sum(0) / solid_angles.sum()
     tint = mean / mean.mean()
-    return light / tint, (color * tint).clamp(0, BRIGHTEST)
+    return light / tint, color * tint

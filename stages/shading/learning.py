@@ -213,7 +213,9 @@ class _Turns:
 
     def end(self, state: _State) -> Learned:
         """The materials of all points under the light that was found, and the conventions for what nothing tells."""
-        choice = self._choose(balanced(self.raw, state.gains, self.photos), state.light, state.kinds)
+        # Where the light came out too dark, base colours say by how much.
+        observed = balanced(self.raw, state.gains, self.photos)
+        choice = self._choose(observed, state.light, state.kinds, brightest=np.inf)
         light, placed, color = state.light, state.placed, choice.color
         if placed is None:
             light, color = grey_world(light, color, torch.from_numpy(solid_angles(LIGHT_ROWS).reshape(-1)))
@@ -223,7 +225,7 @@ class _Turns:
         elif placed is None:
             brightness = min(WHITE / max(float(color.amax(1).quantile(0.95)), 1e-3), 1.0)
         if brightness != 1.0:
-            light, color = light / brightness, (color * brightness).clamp(max=1.0)
+            light, color = light / brightness, color * brightness
             placed = None if placed is None else replace(placed, scale=placed.scale / brightness)
         found = tuple(
             _material(candidate, choice.shared[choice.which == k]) for k, candidate in enumerate(choice.chosen)
@@ -232,15 +234,15 @@ class _Turns:
             light=light.reshape(LIGHT_ROWS, 2 * LIGHT_ROWS, 3).numpy(),
             materials=found,
             which=choice.which,
-            color=color.numpy(),
+            color=color.clamp(max=BRIGHTEST).numpy(),
             gains=state.gains.numpy(),
             cost=choice.cost,
             placed=placed,
         )
 
-    def _choose(self, observed: Tensor, light: Tensor, kinds: Sequence[int]) -> _Choice:
+    def _choose(self, observed: Tensor, light: Tensor, kinds: Sequence[int], brightest: float = BRIGHTEST) -> _Choice:
         """The few candidates of these kinds that explain all points best."""
-        costs, colors = try_out(self.reflection, observed, self.weights, light, kinds)
+        costs, colors = try_out(self.reflection, observed, self.weights, light, kinds, brightest)
         costs = costs.flatten(1)
         shared = heard(costs.numpy(), self.near)
         chosen = np.array(choose_few(shared))
