@@ -151,7 +151,10 @@ def try_out(
     kinds: Sequence[int] = (0, 1),
     brightest: float = BRIGHTEST,
 ) -> tuple[Tensor, Tensor]:
-    """How well each roughness fits, as no metal (0) and as metal (1), with base colours up to `brightest`.
+    """How well each roughness fits, as no metal (0) and as metal (1).
+
+    Args:
+        brightest: base colour of no metal.
 
     Returns:
         costs [S, 2, R], infinite for a kind that is not asked for, and the best base colours [S, 2, R, 3].
@@ -167,7 +170,8 @@ def try_out(
                 slope, offset = slopes(
                     here.scale[..., level, None], here.bias[..., level, None], mirrored[:, :, level], diffuse, metallic
                 )
-                color = best_color(slope, offset, observed[part], weights[part], brightest=brightest)
+                most = BRIGHTEST if metallic else brightest
+                color = best_color(slope, offset, observed[part], weights[part], brightest=most)
                 off = residuals(slope * color[:, None] + offset, observed[part])
                 colors[part, metallic, level] = color
                 costs[part, metallic, level] = (weights[part] * robust(off).mean(2)).sum(1) / total[part]
