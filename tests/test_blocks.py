@@ -108,11 +108,12 @@ def test_which_errors_are_of_memory(error: Exception, answer: bool):
 
 # ---------------------------------------------------------------- training
 def one_step(
-    monkeypatch: pytest.MonkeyPatch, most: int, masks: bool
+    monkeypatch: pytest.MonkeyPatch, most: int, masks: bool, settings: dict[str, str] | None = None
 ) -> tuple[dict[str, float], list[torch.Tensor], list]:
     """Numbers, gradients, and the sizes that were rendered, where no more rays than `most` fit."""
     # Without the term that picks some of the rays at hand, and samples in the middle of their strata.
-    trainer = make_trainer(changed(TINY, {"terms.planar.form": "off", "sampling.rays": 64}), masks)
+    of_all = {"terms.planar.form": "off", "sampling.rays": 64}
+    trainer = make_trainer(changed(TINY, of_all | (settings or {})), masks)
     stratified, render, rendered = renderer_module.stratified, trainer.renderer.render, []
     monkeypatch.setattr(
         renderer_module, "stratified", lambda rows, strata, _, device: stratified(rows, strata, None, device)
@@ -142,6 +143,14 @@ def test_a_step_in_parts_is_the_same_step(monkeypatch: pytest.MonkeyPatch, masks
     assert len(of_parts) == len(gradients) > 5
     for part, whole in zip(of_parts, gradients, strict=True):
         torch.testing.assert_close(part, whole, rtol=1e-3, atol=1e-6 * float(whole.abs().max() + 1))
+
+
+def test_a_learned_scale_gets_the_same_gradient_in_parts(monkeypatch: pytest.MonkeyPatch):
+    whole, parts = (one_step(monkeypatch, most, False, {"density.scale": "learned"})[1] for most in (64, 20))
+    scalars = [(w, p) for w, p in zip(whole, parts, strict=True) if w.ndim == 0]
+    assert len(scalars) == 1
+    assert float(scalars[0][0]) != 0
+    torch.testing.assert_close(*scalars[0], rtol=1e-3, atol=1e-6)
 
 
 def test_training_goes_on_with_fewer_rays_at_once(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture):
