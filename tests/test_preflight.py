@@ -230,6 +230,33 @@ def test_needs_grow_with_photos_as_measured():
     assert of(47, 554, **{"train.minutes": 20}).minutes == pytest.approx(21.0, abs=0.5)
 
 
+def test_poses_alone_need_nothing_of_learning(photos: Path):
+    sizes = tuple((1600, 1200) for _ in range(400))
+    seen = Inspection((), (Video("clip.mp4", 400, 1600, 1200),), (), 0)
+    config = load_config("cpu")
+    poses, all_of_it = (estimate(seen, config, "cpu", 1, only_poses=only) for only in (True, False))
+    assert poses.memory_gib == pytest.approx(0.25 + 0.25 * 1.92, abs=0.01)  # one photo at a time
+    assert all_of_it.memory_gib > module.photos_held(sizes, config, all_of_it.memory_gib) / 400 * 3 > 0
+    assert poses.minutes < all_of_it.minutes
+    assert poses.disk_gb < all_of_it.disk_gb
+
+
+def test_more_photos_than_a_process_holds_are_sent_to_blocks(photos: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(module, "MEMORY_BASE_GIB", 0.001)  # so that these small photos matter
+    sets = ("--set", "densify.method=off", "--set", "sfm.max_image_size=100")
+    many = 24 * 2 * 3 * 320 * 240 / GIB
+
+    def said(gib: float) -> str:
+        room(monkeypatch, memory_gib=gib, disk_gb=500)
+        monkeypatch.setattr(module, "SFM_BASE_GIB", 0.001)
+        return " ".join(check(str(photos), *sets).output.split())
+
+    assert "`--blocks auto` makes them in parts" in said(0.9 * many)
+    assert "It may take" in said(0.1 * many)
+    assert "--blocks" not in said(0.1 * many)  # no block would have photos enough
+    assert "no-go" not in said(2 * many)
+
+
 def test_nothing_is_said_of_the_time_on_a_gpu(photos: Path):
     done = preflight({"photos": photos}, photos.parent, load_config("gpu"), "cuda", 2, decode=False)
     assert done.needs.minutes is None
