@@ -43,7 +43,8 @@ CONTROL_NAME = re.compile(r"(gcp|ground.?control)[^/]*\.(txt|csv)$", re.IGNORECA
 # All measured with `benchmarks/run_sets.py` on two cores, see docs/benchmarks/results.md.
 GIB = 1 << 30
 MEMORY_BASE_GIB = 1.5  # baking, the peak of all sets: 1.45 to 1.66 GiB
-MEMORY_OF_PHOTOS = 2.0  # training holds the photos' bytes twice while it puts them in a row
+# Training holds all photos' bytes, once: 1.06 GiB beside them with 640 photos, 0.76 with the preset tiny.
+TRAIN_BASE_GIB = 1.1
 SFM_BASE_GIB, SFM_GIB_PER_THREAD_MP = 0.25, 0.25  # finding features: 0.32 GiB at 0.3 megapixels, 1.0 at 1.5
 MEMORY_MARGIN = 1.3  # an estimate this near to what is there gets a warning
 SFM_CPU_S_PER_MP = 2.8  # 2.3 to 3.3 CPU seconds a megapixel looked at
@@ -254,7 +255,7 @@ def _pixels(sizes: Sequence[tuple[int, int]], most: int) -> list[float]:
 def _learning_gib(trained_on: float, compared: float, config: Config) -> float:
     """Peak of all that follows the poses, for so many pixels."""
     stereo_gib = 0.0 if config.densify.method == "off" else STEREO_BASE_GIB + STEREO_GIB_PER_MP * compared / 1e6
-    return max(stereo_gib, MEMORY_BASE_GIB + MEMORY_OF_PHOTOS * 3 * trained_on / GIB)
+    return max(stereo_gib, MEMORY_BASE_GIB, TRAIN_BASE_GIB + 3 * trained_on / GIB)
 
 
 def memory_asked_for(sizes: Sequence[tuple[int, int]], config: Config) -> int:
@@ -277,7 +278,9 @@ def photos_held(sizes: Sequence[tuple[int, int]], config: Config, memory_gib: fl
     side = min(config.ingest.max_side, config.undistort.max_side)
     trained_on, compared = (float(np.median(_pixels(sizes, most))) for most in (side, min(side, config.densify.side)))
     free = memory_gib / MEMORY_MARGIN
-    held = (free - MEMORY_BASE_GIB) / (MEMORY_OF_PHOTOS * 3 * trained_on / GIB)
+    if free < MEMORY_BASE_GIB:
+        return 0
+    held = (free - TRAIN_BASE_GIB) / (3 * trained_on / GIB)
     if config.densify.method != "off":
         held = min(held, (free - STEREO_BASE_GIB) / (STEREO_GIB_PER_MP * compared / 1e6))
     return max(0, int(held))
