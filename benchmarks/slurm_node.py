@@ -1,7 +1,7 @@
 """Blocks on a cluster of one node: a Slurm of our own, a run through it, and what becomes of it when the node dies.
 
 python -m benchmarks.slurm_node [--seconds 20]
-python -m benchmarks.slurm_node --photos PHOTOS [--blocks 2] [--set ...]     real blocks, in PHOTOS_slurm
+python -m benchmarks.slurm_node --photos PHOTOS [--poses POSES] [--blocks 2] [--set ...]     real, in PHOTOS_slurm
 
 Needs Debian's slurm-wlm and munge (`apt-get install slurm-wlm munge`), hineus[cluster], and root. Everything lies in
 a temporary folder, but for a link at /etc/slurm/slurm.conf, where jobs look; nothing is left. The run is a plan of
@@ -11,14 +11,16 @@ What is told at the end: how often each step was begun, whether the run finished
 for how many GPUs the steps that learn had asked (the node says that it has two). Then the same is begun anew and
 stopped as by Ctrl-C, and it is told how many of its jobs are left in the queue.
 
-With photos the steps are those of `hineus run PHOTOS --blocks N --executor slurm`; the node dies in the middle of a
-training.
+With photos the steps are those of `hineus run PHOTOS --blocks N --executor slurm`. The node dies when as many
+trainings as it has cores for have learned a while and kept that in a checkpoint, as they do each minute. What is told:
+which blocks are done and have a tile, the steps from which each training went on, and how long all of it took.
 """
 
 from __future__ import annotations
 
 import argparse
 import os
+import re
 import shutil
 import signal
 import socket
@@ -47,6 +49,8 @@ CONTROLLER_PORT, NODE_PORT = 26817, 26818
 SYSTEM_CONFIGURATION = Path("/etc/slurm/slurm.conf")  # Snakemake's executor passes none on to jobs
 LOST_AFTER_S = 10  # a node that says nothing for so long is down
 PATIENCE_S = 60.0
+STEPS_OF_A_WHILE = 100
+WENT_ON = re.compile(r"training goes on from step (\d+)")
 CONFIGURATION = """\
 ClusterName=benchmark
 SlurmctldHost={host}(127.0.0.1)
@@ -246,12 +250,19 @@ def journal(folder: Path) -> Counter[str]:
 
 
 def run_with_a_dead_node(run: Callable[[], T], is_in_the_middle: Callable[[], bool]) -> tuple[T, str]:
-    """What the run gives through a Slurm whose node dies in its middle; and what its jobs had asked for then."""
+    """What the run gives through a Slurm whose node dies in its middle; and what its jobs had asked for then.
+
+    Raises:
+        RuntimeError: it ended before.
+    """
     with slurm_node() as node, _in_environment(node.environment):
         asked: list[str] = []
+        ended = threading.Event()
 
         def strike() -> None:
-            _await(is_in_the_middle, "step in its middle", 20 * PATIENCE_S)
+            _await(lambda: ended.is_set() or is_in_the_middle(), "step in its middle", 60 * PATIENCE_S)
+            if ended.is_set():
+                return
             asked.append(node.told("squeue", "--noheader", "--Format=tres-per-job:40"))
             node.kill_node()
             node.await_state("down")
@@ -262,7 +273,10 @@ def run_with_a_dead_node(run: Callable[[], T], is_in_the_middle: Callable[[], bo
         try:
             given = run()
         finally:
+            ended.set()
             striking.join()
+        if not asked:
+            raise RuntimeError("the run ended before its steps were in their middle: give them more to do")
         return given, " ".join(asked[0].split())
 
 
@@ -309,25 +323,50 @@ def left_after_ctrl_c(folder: Path) -> dict[str, object]:
         }
 
 
-def reconstruct_with_a_dead_node(photos: Path, blocks: int, sets: Sequence[str]) -> dict[str, object]:
-    """Real blocks; the node dies when one has learned for a while."""
+def reconstruct_with_a_dead_node(
+    photos: Path, poses: Path | None, blocks: int, sets: Sequence[str]
+) -> dict[str, object]:
+    """Real blocks; the node dies when those that learn have kept a checkpoint."""
+    from stages.artifacts import checkpoint_path
     from stages.block_jobs import reconstruct_at_once
     from stages.pipeline import PIPELINE
     from stages.request import Request
 
     workspace = photos.with_name(f"{photos.name}_slurm")
-    asked_for = Request(photos=photos, workspace=workspace, sets=tuple(sets), device="cpu", workers=1)
+    asked_for = Request(
+        photos=photos, workspace=workspace, poses=poses, sets=tuple(sets), device="cpu", workers=1
+    )  # fmt: skip
+    checkpoint, at_once = checkpoint_path(Path()).name, min(blocks, os.cpu_count() or 1)
+
+    def is_in_the_middle() -> bool:
+        kept = [learned_steps(path) for path in (workspace / "blocks").rglob(checkpoint)]
+        return sum(steps >= STEPS_OF_A_WHILE for steps in kept) >= at_once
+
+    start = time.monotonic()
     runs, _ = run_with_a_dead_node(
         lambda: reconstruct_at_once(asked_for, blocks, Capacity(blocks, "slurm", workers=1), PIPELINE),
-        lambda: any(file.stat().st_size > 0 for file in (workspace / "blocks").rglob("metrics.jsonl")),
+        is_in_the_middle,
     )
-    logs = {path.stem: path.read_text() for path in sorted((workspace / "blocks" / "steps" / "train").glob("*.log"))}
     return {
         "blocks": {outcome.name: outcome.state for outcome in runs.outcomes},
-        "trainings gone on with": {
-            name: [line for line in text.splitlines() if "goes on from step" in line] for name, text in logs.items()
+        "errors": [outcome.error for outcome in runs.outcomes if outcome.error],
+        "tiles": [str(outcome.glb.relative_to(workspace)) for outcome in runs.outcomes if outcome.glb],
+        "trainings went on from step": {
+            outcome.name: WENT_ON.findall((outcome.workspace / "hineus.log").read_text()) for outcome in runs.outcomes
         },
+        "wall_s": round(time.monotonic() - start),
     }
+
+
+def learned_steps(checkpoint: Path) -> int:
+    """Of the training that keeps this file; 0 where it is written anew just now."""
+    from stages.engine.checkpoint import CheckpointDamaged, read_checkpoint
+
+    try:
+        kept = read_checkpoint(checkpoint)
+    except CheckpointDamaged:
+        return 0
+    return 0 if kept is None else int(kept["trainer"]["step_index"])
 
 
 @contextmanager
@@ -345,6 +384,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seconds", type=int, default=20, help="that each step counts")
     parser.add_argument("--photos", type=Path, help="folder of photos: real blocks of them")
+    parser.add_argument("--poses", type=Path, help="as of hineus run")
     parser.add_argument("--blocks", type=int, default=2)
     parser.add_argument("--set", action="append", default=[], dest="sets", help="as of hineus run")
     wanted = parser.parse_args()
@@ -354,7 +394,7 @@ def main() -> None:
             f"{SYSTEM_CONFIGURATION}."
         )
     if wanted.photos:
-        _show(reconstruct_with_a_dead_node(wanted.photos, wanted.blocks, wanted.sets))
+        _show(reconstruct_with_a_dead_node(wanted.photos, wanted.poses, wanted.blocks, wanted.sets))
         return
     for measure in (lambda folder: count_with_a_dead_node(folder, wanted.seconds), left_after_ctrl_c):
         with tempfile.TemporaryDirectory() as folder:

@@ -87,7 +87,7 @@ def _tell_of_crash(number: int, peak: int) -> int:
     message = f"The command {how}: it had taken {show_bytes(peak)}, and {show_bytes(total_memory())} are there."
     hint = (
         "What was finished is kept: run the same command to go on from there, with more memory, or with less to do by "
-        "`--workers 1` or `--preset tiny`."
+        "`--workers 1`, `--preset tiny` or, of many photos, `--blocks auto`."
     )
     with suppress(OSError):
         os.write(2, f"Error: {message}\n{hint}\n".encode())

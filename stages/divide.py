@@ -59,14 +59,13 @@ from stages.limits import total_memory
 from stages.place import PLACE
 from stages.posing.parts import rebuilt
 from stages.posing.undistortion import plan_warp, png_names, posed_cameras, registered_photos, sparse_points
-from stages.preflight import GIB, photos_held
+from stages.preflight import FEWEST_IN_A_BLOCK, GIB, photos_held
 from stages.texture.rough_gains import rough_gains
 from stages.train import TRAIN
 
 log = logging.getLogger(__name__)
 
 FEWEST_POINTS = 100  # with fewer there is nothing to cut by
-FEWEST_PHOTOS = 12  # a block that is given fewer learns little: cuts end there, whatever the memory
 # The points of a large scene spread no more across its ground than this part of their narrower spread along it.
 MOST_RELIEF = 0.5
 MOST_BLOCKS = 100_000
@@ -273,7 +272,7 @@ def _enough(whole: _Whole, count: int | None, config: Config) -> Callable[[int, 
         return lambda parts, _: parts >= count
     memory = total_memory() / GIB
     held = photos_held([(w, h) for w, h in whole.cameras.sizes.tolist()], config, memory)
-    most = max(held, FEWEST_PHOTOS)
+    most = max(held, FEWEST_IN_A_BLOCK)  # cuts end there, whatever the memory
     log.info("a process can hold %d photos in %.1f GiB of memory", held, memory)
     return lambda parts, heaviest: heaviest <= most or parts >= MOST_BLOCKS
 

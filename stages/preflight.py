@@ -35,6 +35,7 @@ from stages.shading.named_balls import named_balls
 
 Verdict = Literal["go", "go with warnings", "no-go"]
 
+FEWEST_IN_A_BLOCK = 12  # photos; a block that is given fewer learns little
 MOSTLY_PLAIN = 0.5  # so many plain backgrounds are meant; too few for masks from the background's colour alone
 FEW_PHOTOS = 20  # a full turn in steps of less than 20 degrees; sets below it lose photos
 CONTROL_NAME = re.compile(r"(gcp|ground.?control)[^/]*\.(txt|csv)$", re.IGNORECASE)
@@ -42,7 +43,8 @@ CONTROL_NAME = re.compile(r"(gcp|ground.?control)[^/]*\.(txt|csv)$", re.IGNORECA
 # All measured with `benchmarks/run_sets.py` on two cores, see docs/benchmarks/results.md.
 GIB = 1 << 30
 MEMORY_BASE_GIB = 1.5  # baking, the peak of all sets: 1.45 to 1.66 GiB
-MEMORY_OF_PHOTOS = 2.0  # training holds the photos' bytes twice while it puts them in a row
+# Training holds all photos' bytes, once: 1.06 GiB beside them with 640 photos, 0.76 with the preset tiny.
+TRAIN_BASE_GIB = 1.1
 SFM_BASE_GIB, SFM_GIB_PER_THREAD_MP = 0.25, 0.25  # finding features: 0.32 GiB at 0.3 megapixels, 1.0 at 1.5
 MEMORY_MARGIN = 1.3  # an estimate this near to what is there gets a warning
 SFM_CPU_S_PER_MP = 2.8  # 2.3 to 3.3 CPU seconds a megapixel looked at
@@ -143,12 +145,13 @@ def preflight(
     workers: int,
     decode: bool,
     digests: Mapping[str, str] | None = None,
+    only_poses: bool = False,
 ) -> Preflight:
     """Look at the photos, and at the memory and the disk of `folder`, where the workspace will lie.
 
     `decode`: whether to judge the photos' pixels, too; before a run that is left to ingest, which decodes them anyway.
     `sources`: by name the photos, masks, known poses, control points and light that are given. `digests`: of photos
-    whose sha256 is known.
+    whose sha256 is known. `only_poses`: nothing is learned of them in this workspace, as where blocks do that.
 
     Raises:
         InputError: there is no such folder or video, or the poses, control points, light or balls cannot be used.
@@ -169,7 +172,7 @@ def preflight(
             raise
         known = None  # the run that follows reads them, too, and says what is wrong
     seen = inspect(Sources(source, masks, digest, known), config.ingest, workers, decode)
-    needs = estimate(seen, config, device, workers)
+    needs = estimate(seen, config, device, workers, only_poses)
     folder = nearest_existing(folder)
     memory, disk = available_memory() / GIB, shutil.disk_usage(folder).free / 1e9
     refusals, shortages = [], []
@@ -188,9 +191,10 @@ def preflight(
     if (light := sources.get(GIVEN_LIGHT)) is not None:
         read_light(light)
     if needs.memory_gib > memory:
+        in_blocks = "" if only_poses else _in_blocks(seen, config, workers, memory)
         shortages.append(
-            f"It may take {needs.memory_gib:.1f} GiB of memory, {memory:.1f} are free: close other programs, or try "
-            "`--set undistort.max_side=800`, `--set densify.side=600`, `--workers 1`."
+            f"It may take {needs.memory_gib:.1f} GiB of memory, {memory:.1f} are free: {in_blocks}close other "
+            "programs, or try `--set undistort.max_side=800`, `--set densify.side=600`, `--workers 1`."
         )
     if not os.access(folder, os.W_OK):
         shortages.append(f"{folder} cannot be written: try `--workspace DIR`.")
@@ -212,21 +216,35 @@ def preflight(
     return Preflight(seen, config.ingest.max_side, needs, tuple(warnings), tuple(refusals), tuple(shortages))
 
 
-def estimate(seen: Inspection, config: Config, device: str, workers: int) -> Needs:
+def estimate(seen: Inspection, config: Config, device: str, workers: int, only_poses: bool = False) -> Needs:
     """From simple models of what was measured; see the constants."""
     looked_at = _pixels(seen.sizes, min(config.ingest.max_side, config.sfm.max_image_size))
-    side = min(config.ingest.max_side, config.undistort.max_side)
-    trained_on = sum(_pixels(seen.sizes, side))
-    compared = 0.0 if config.densify.method == "off" else sum(_pixels(seen.sizes, min(side, config.densify.side)))
-    sfm_gib = SFM_BASE_GIB + workers * SFM_GIB_PER_THREAD_MP * max(looked_at, default=0) / 1e6
+    memory_gib, minutes = _poses_gib(seen, looked_at, workers), _poses_minutes(looked_at, config, workers)
+    disk_bytes = seen.num_bytes + FEATURE_BYTES_PER_PIXEL * sum(looked_at)
+    if not only_poses:
+        side = min(config.ingest.max_side, config.undistort.max_side)
+        trained_on = sum(_pixels(seen.sizes, side))
+        compared = 0.0 if config.densify.method == "off" else sum(_pixels(seen.sizes, min(side, config.densify.side)))
+        memory_gib = max(memory_gib, _learning_gib(trained_on, compared, config))
+        minutes += _learning_minutes(compared, config, workers)
+        disk_bytes += DISK_BYTES_PER_PIXEL * trained_on + STEREO_BYTES_PER_PIXEL * compared
+    return Needs(memory_gib, DISK_BASE_GB + disk_bytes / 1e9, minutes if device == "cpu" else None)
+
+
+def _poses_gib(seen: Inspection, looked_at: list[float], workers: int) -> float:
+    """Peak of reading the photos, and finding features in so many pixels of each."""
     masks_bytes = bytes_to_read_masks(seen.masks.files.values())
     read_gib = max([masks_bytes, *(photo.bytes_to_read for photo in seen.photos)]) / GIB
-    made_bytes = DISK_BYTES_PER_PIXEL * trained_on + STEREO_BYTES_PER_PIXEL * compared
-    return Needs(
-        memory_gib=max(read_gib, sfm_gib, _learning_gib(trained_on, compared, config)),
-        disk_gb=DISK_BASE_GB + (seen.num_bytes + made_bytes + FEATURE_BYTES_PER_PIXEL * sum(looked_at)) / 1e9,
-        minutes=_minutes(looked_at, compared, config, workers) if device == "cpu" else None,
-    )
+    return max(read_gib, SFM_BASE_GIB + workers * SFM_GIB_PER_THREAD_MP * max(looked_at, default=0) / 1e6)
+
+
+def _in_blocks(seen: Inspection, config: Config, workers: int, memory_gib: float) -> str:
+    """What to do where it is the number of photos that is too much for one process; else nothing."""
+    held = photos_held(seen.sizes, config, memory_gib)
+    poses_gib = estimate(seen, config, "cpu", workers, only_poses=True).memory_gib
+    if not FEWEST_IN_A_BLOCK <= held < len(seen.sizes) or poses_gib > memory_gib:
+        return ""
+    return f"one process holds {held} of these {len(seen.sizes)} photos, `--blocks auto` makes them in parts; or "
 
 
 def _pixels(sizes: Sequence[tuple[int, int]], most: int) -> list[float]:
@@ -237,7 +255,7 @@ def _pixels(sizes: Sequence[tuple[int, int]], most: int) -> list[float]:
 def _learning_gib(trained_on: float, compared: float, config: Config) -> float:
     """Peak of all that follows the poses, for so many pixels."""
     stereo_gib = 0.0 if config.densify.method == "off" else STEREO_BASE_GIB + STEREO_GIB_PER_MP * compared / 1e6
-    return max(stereo_gib, MEMORY_BASE_GIB + MEMORY_OF_PHOTOS * 3 * trained_on / GIB)
+    return max(stereo_gib, MEMORY_BASE_GIB, TRAIN_BASE_GIB + 3 * trained_on / GIB)
 
 
 def memory_asked_for(sizes: Sequence[tuple[int, int]], config: Config) -> int:
@@ -255,33 +273,44 @@ def photos_held(sizes: Sequence[tuple[int, int]], config: Config, memory_gib: fl
     """How many photos one process can be given with so much memory, by the models of `estimate`.
 
     Args:
-        sizes: width and height of photos as ingest takes them; the median of these is every photo's.
+        sizes: width and height of photos; the median of these is every photo's.
     """
-    side = config.undistort.max_side
-    trained_on, compared = (float(np.median(_pixels(sizes, most))) for most in (side, config.densify.side))
+    side = min(config.ingest.max_side, config.undistort.max_side)
+    trained_on, compared = (float(np.median(_pixels(sizes, most))) for most in (side, min(side, config.densify.side)))
     free = memory_gib / MEMORY_MARGIN
-    held = (free - MEMORY_BASE_GIB) / (MEMORY_OF_PHOTOS * 3 * trained_on / GIB)
+    if free < MEMORY_BASE_GIB:
+        return 0
+    held = (free - TRAIN_BASE_GIB) / (3 * trained_on / GIB)
     if config.densify.method != "off":
         held = min(held, (free - STEREO_BASE_GIB) / (STEREO_GIB_PER_MP * compared / 1e6))
     return max(0, int(held))
 
 
-def _minutes(looked_at: list[float], compared: float, config: Config, workers: int) -> float:
-    count, train = len(looked_at), config.train
+def _poses_minutes(looked_at: list[float], config: Config, workers: int) -> float:
+    count = len(looked_at)
     pairs = count * (count - 1) / 2
     if config.sfm.matcher != "exhaustive":
         pairs = min(pairs, PAIRS_PER_PHOTO * count)
-    wall_per_cpu = 1 - PARALLEL_SHARE + PARALLEL_SHARE / workers
+    cpu_s = SFM_CPU_S_PER_MP * sum(looked_at) / 1e6 + SFM_CPU_S_PER_PAIR * pairs
+    return cpu_s * _wall_per_cpu(workers) / 60
+
+
+def _learning_minutes(compared: float, config: Config, workers: int) -> float:
+    """Of all that follows the poses."""
+    train = config.train
     part = 1 + COVERED * (train.steps_if_covered - 1) if compared else 1.0
     ray_samples = part * train.steps * train.sampling.rays * train.sampling.samples
-    training_s = ray_samples * TRAIN_CPU_S_PER_RAY_SAMPLE * wall_per_cpu
+    training_s = ray_samples * TRAIN_CPU_S_PER_RAY_SAMPLE * _wall_per_cpu(workers)
     if train.minutes is not None:
         training_s = 60 * train.minutes
-    sfm_s = SFM_CPU_S_PER_MP * sum(looked_at) / 1e6 + SFM_CPU_S_PER_PAIR * pairs
     stereo_s = STEREO_CPU_S_PER_MP_AND_NEIGHBOR * config.densify.neighbors * compared / 1e6
     later_s = OTHER_CPU_S + MATERIALS_CPU_S * config.materials.enabled
     later_s += (SPLATS_CPU_S + SPLATS_CPU_S_PER_STEP * config.splats.steps) * config.splats.enabled
-    return (training_s + (sfm_s + stereo_s + later_s) * wall_per_cpu) / 60
+    return (training_s + (stereo_s + later_s) * _wall_per_cpu(workers)) / 60
+
+
+def _wall_per_cpu(workers: int) -> float:
+    return 1 - PARALLEL_SHARE + PARALLEL_SHARE / workers
 
 
 def _warnings(seen: Inspection, config: Config) -> list[str]:

@@ -93,7 +93,10 @@ def reconstruct(request: Request, pipeline: Sequence[Stage], listener: Listener 
         photos = sources["photos"]
         now = (digests.files("photos") if digests.available("photos") else None) or {}
         if photos is not None and not workspace.stage_folder("ingest").exists():
-            _tell_preflight(preflight(sources, workspace.root, config, device, workers, decode=False, digests=now))
+            looked = preflight(
+                sources, workspace.root, config, device, workers, False, now, only_poses=_only_poses(request, pipeline)
+            )
+            _tell_preflight(looked)
         if kept := what_is_kept(workspace, config, photos, sources["masks"], now, _forced(request, pipeline)):
             log.info("%s", kept)
         log.debug("preset %s, device %s, %d workers, %s", preset, device, workers, sources)
@@ -142,6 +145,13 @@ def _tell_preflight(done: Preflight) -> None:
         log.info("masks: %s", masks_in_words(done.inspection))
     for line in (*done.refusals, *done.shortages, *done.warnings):
         log.warning("%s", line)
+
+
+def _only_poses(request: Request, pipeline: Sequence[Stage]) -> bool:
+    """Whether the run ends before photos are made ready for learning."""
+    names = [stage.name for stage in pipeline]
+    placed = artifacts.WORLD_PLACE.stage
+    return placed in names and request.until in names[: names.index(placed) + 1]
 
 
 def _forced(request: Request, pipeline: Sequence[Stage]) -> set[str]:

@@ -210,7 +210,7 @@ def test_needs_grow_with_photos_as_measured():
     # past undistort.max_side a photo takes no more memory; 200 photos of 1600 x 1600 are 1.43 GiB
     plain = {"densify.method": "off"}
     most = of(200, 4000, **plain).memory_gib
-    assert most == of(200, 1600, **plain).memory_gib == pytest.approx(1.5 + 2 * 1.43, abs=0.01)
+    assert most == pytest.approx(of(200, 1600, **plain).memory_gib) == pytest.approx(1.1 + 1.43, abs=0.01)
     # past densify.side stereo takes no more: 200 megapixels and their maps
     for side in (1200, 4000):
         assert of(200, side).memory_gib == pytest.approx(0.5 + 200 * 0.021, abs=0.01)
@@ -228,6 +228,33 @@ def test_needs_grow_with_photos_as_measured():
     assert all_twelve - twelve > 3 * (all_six - six) > 0
     assert of(8, 300, **fixed).minutes == of(8, 300, **fixed, **{"sfm.matcher": "exhaustive"}).minutes
     assert of(47, 554, **{"train.minutes": 20}).minutes == pytest.approx(21.0, abs=0.5)
+
+
+def test_poses_alone_need_nothing_of_learning(photos: Path):
+    sizes = tuple((1600, 1200) for _ in range(400))
+    seen = Inspection((), (Video("clip.mp4", 400, 1600, 1200),), (), 0)
+    config = load_config("cpu")
+    poses, all_of_it = (estimate(seen, config, "cpu", 1, only_poses=only) for only in (True, False))
+    assert poses.memory_gib == pytest.approx(0.25 + 0.25 * 1.92, abs=0.01)  # one photo at a time
+    assert all_of_it.memory_gib > module.photos_held(sizes, config, all_of_it.memory_gib) / 400 * 3 > 0
+    assert poses.minutes < all_of_it.minutes
+    assert poses.disk_gb < all_of_it.disk_gb
+
+
+def test_more_photos_than_a_process_holds_are_sent_to_blocks(photos: Path, monkeypatch: pytest.MonkeyPatch):
+    for base in ("MEMORY_BASE_GIB", "TRAIN_BASE_GIB", "SFM_BASE_GIB"):
+        monkeypatch.setattr(module, base, 0.001)  # so that these small photos matter
+    sets = ("--set", "densify.method=off", "--set", "sfm.max_image_size=100")
+    many = 24 * 3 * 320 * 240 / GIB
+
+    def said(gib: float) -> str:
+        room(monkeypatch, memory_gib=gib, disk_gb=500)
+        return " ".join(check(str(photos), *sets).output.split())
+
+    assert "`--blocks auto` makes them in parts" in said(many)
+    assert "It may take" in said(0.3 * many)
+    assert "--blocks" not in said(0.3 * many)  # no block would have photos enough
+    assert "no-go" not in said(2 * many)
 
 
 def test_nothing_is_said_of_the_time_on_a_gpu(photos: Path):

@@ -57,7 +57,7 @@ def _out_of_memory(who: str, text: str) -> ShortageError:
     return ShortageError(
         f"{who} ran out of memory: {least}, and {show_bytes(tightest.left)} of the {show_bytes(tightest.limit)} of "
         f"{tightest.name} are left.",
-        f"To go on, {raise_it}or take less with `--workers 1` or `--preset tiny`.",
+        f"To go on, {raise_it}or take less with `--workers 1`, `--preset tiny` or, of many photos, `--blocks auto`.",
     )
 
 
