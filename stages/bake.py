@@ -10,6 +10,7 @@ import numpy as np
 
 from configs.params import BakeParams
 from stages.artifacts import (
+    AROUND_MESH,
     ATLAS_MESH,
     BASE_COLOR,
     CAMERAS,
@@ -61,6 +62,7 @@ def run(context: StageContext[BakeParams]) -> dict[str, Any]:
             listener=context.progress,
             visit=witness.look,
             rough_gains=_rough_gains(context, cameras.names),
+            others=context.read(AROUND_MESH),
         )
     except ValueError as error:
         raise ReconstructionError(
@@ -98,7 +100,7 @@ BAKE: Stage[BakeParams] = Stage(
     version=9,
     settings=lambda config: config.bake,
     run=run,
-    reads=(PINHOLE_PHOTOS, CAMERAS, FIELD, HELD_OUT, CLEAN_FULL_MESH, ATLAS_MESH),
+    reads=(PINHOLE_PHOTOS, CAMERAS, FIELD, HELD_OUT, AROUND_MESH, CLEAN_FULL_MESH, ATLAS_MESH),
     writes=(BASE_COLOR, PROVENANCE, NORMAL_MAP, OCCLUSION, GAINS, QUALITY),
     sources=(ROUGH_GAINS,),
     summary="charts + photos -> textures",

@@ -165,7 +165,7 @@ def _in_plan(field: TrainedField, plan_from_scene: Similarity) -> Callable[[np.n
 
 EXTRACT: Stage[ExtractParams] = Stage(
     name="extract",
-    version=5,
+    version=6,
     settings=lambda config: config.extract,
     run=run,
     reads=(SCENE, FIELD, POINT_CLOUD),

@@ -15,6 +15,7 @@ import numpy as np
 
 from configs.params import MaterialsParams
 from stages.artifacts import (
+    AROUND_MESH,
     ATLAS_MESH,
     BASE_COLOR,
     HELD_OUT,
@@ -78,7 +79,8 @@ def run(context: StageContext[MaterialsParams]) -> dict[str, Any]:
     texture = read_texture(context.read(BASE_COLOR))
     texels = rasterize_atlas(atlas.uvs, atlas.faces, atlas.texture_size)
     baked = texture.reshape(-1, 3)[texels.index]
-    views = PreparedViews(atlas, len(texels), cameras, lambda index: photos.masked(cameras.names[index]))
+    load, others = (lambda index: photos.masked(cameras.names[index])), context.read(AROUND_MESH)
+    views = PreparedViews(atlas, len(texels), cameras, load, others)
     chosen = np.sort(np.random.default_rng(0).permutation(len(texels))[:POINTS])
     positions, normals = surface_points(atlas, texels.face_ids[chosen], texels.corner[chosen])
     tell = context.progress
@@ -228,7 +230,19 @@ MATERIALS: Stage[MaterialsParams] = Stage(
     settings=lambda config: config.materials,
     run=run,
     sources=(GIVEN_LIGHT,),
-    reads=(PHOTOS, IMAGE_SET, MODEL, PINHOLE_PHOTOS, HELD_OUT, SCENE, WORLD_PLACE, ATLAS_MESH, BASE_COLOR, OCCLUSION),
+    reads=(
+        PHOTOS,
+        IMAGE_SET,
+        MODEL,
+        PINHOLE_PHOTOS,
+        HELD_OUT,
+        SCENE,
+        WORLD_PLACE,
+        AROUND_MESH,
+        ATLAS_MESH,
+        BASE_COLOR,
+        OCCLUSION,
+    ),
     writes=(MATERIAL_COLOR, ORM, KNOWN, LIGHT, LIGHT_HDR, LIGHT_HARMONICS),
     summary="texture + photos -> base colour, roughness, metalness, light",
 )

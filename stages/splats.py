@@ -11,6 +11,7 @@ import numpy as np
 
 from configs.params import SplatsParams
 from stages.artifacts import (
+    AROUND_MESH,
     ATLAS_MESH,
     BASE_COLOR,
     GAINS,
@@ -63,12 +64,12 @@ def run(context: StageContext[SplatsParams]) -> dict[str, Any]:
     cameras = cameras.select([i for i, name in enumerate(cameras.names) if name not in held_out])
     atlas, texture = context.read(ATLAS_MESH), read_texture(context.read(BASE_COLOR))
     tell = context.progress
-    of_photo = context.read(GAINS)
+    others, of_photo = context.read(AROUND_MESH), context.read(GAINS)
     gains = np.array([of_photo[name] for name in cameras.names])
     count = count_for(atlas, cameras) if params.count is None else params.count
     tell(0, 1, "Gaussians on the surface")
     gaussians, normals = place(atlas, texture, count, degree_for(len(cameras)))
-    views = PreparedViews(atlas, len(gaussians), cameras, lambda index: photos.masked(cameras.names[index]))
+    views = PreparedViews(atlas, len(gaussians), cameras, lambda index: photos.masked(cameras.names[index]), others)
     with ThreadPoolExecutor(max_workers=max(1, context.workers)) as pool:
         tell(_PLACED, 1, "colours of each Gaussian")
         in_order = partial(views.in_order, pool, context.workers)
@@ -78,7 +79,9 @@ def run(context: StageContext[SplatsParams]) -> dict[str, Any]:
     targets = [
         found
         for index, name in enumerate(cameras.names)
-        if (found := target(atlas, cameras, index, *photos.masked(name), gains[index], apart, params.background))
+        if (
+            found := target(atlas, cameras, index, *photos.masked(name), gains[index], apart, params.background, others)
+        )
     ]
     if not targets:
         raise ReconstructionError(
@@ -137,7 +140,7 @@ SPLATTING: Stage[SplatsParams] = Stage(
     version=1,
     settings=lambda config: config.splats,
     run=run,
-    reads=(PINHOLE_PHOTOS, POINT_CLOUD, HELD_OUT, SCENE, ATLAS_MESH, BASE_COLOR, GAINS),
+    reads=(PINHOLE_PHOTOS, POINT_CLOUD, HELD_OUT, SCENE, AROUND_MESH, ATLAS_MESH, BASE_COLOR, GAINS),
     writes=(SPLATS,),
     summary="photos + textured mesh -> Gaussians on the surface",
 )

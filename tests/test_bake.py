@@ -469,6 +469,34 @@ def test_pixels_outside_the_mask_are_not_used(capture):
     assert result.numbers["mean_views"] == 1
 
 
+def test_what_a_wall_beyond_the_mesh_hides_takes_nothing_from_that_photo():
+    """A wall 0.6 high at x = 1.2 hides the ground from x = 0.6 on from a camera at x = 3 and z = 2.4."""
+    ground = join([quad((0, 0, 0), X, Y, 1.0, 8, (0, 0), 1)])
+    wall = quad((1.2, 0, 0.3), Y, Z, 1.0, 2, (0, 0), 1)
+    wall = (wall[0] * [1, 3, 0.3] + [0, 0, 0.21]).astype(np.float32), wall[3].astype(np.int32)
+    cameras = look_at(np.array([3.0, 0, 2.4]), np.zeros(3), Z, 160, 160, 50)
+
+    def paint(points):
+        return np.where(points[:, :1] > 1.1, (250.0, 0, 0), true_color(points))
+
+    together = replace(
+        ground,
+        vertices=np.concatenate([ground.vertices, wall[0]]),
+        faces=np.concatenate([ground.faces, wall[1] + len(ground.vertices)]),
+    )
+    photo = photograph(together, cameras, 0, paint)
+    texels, points, truth = texel_truth(ground)
+    hidden, clear = points[:, 0] > 0.62, np.abs(points).max(1) < 0.55
+    for others, taken in ((None, True), (wall, False)):
+        found = bake(ground, cameras, [photo], others=others)
+        seen = found.provenance.ravel()[texels] == Provenance.PHOTO
+        error = np.abs(found.base_color.reshape(-1, 3)[texels].astype(float) - truth).max(1)
+        assert seen[clear].all()
+        assert np.percentile(error[clear], 95) < 12
+        assert seen[hidden].any() == taken
+        assert found.base_color.shape == (SIZE, SIZE, 3)
+
+
 def test_photos_of_the_wrong_size_are_refused(capture):
     mesh, cameras, photos = capture
     with pytest.raises(ValueError, match=r"expected shape \(160, 160, 3\), got \(80, 160, 3\)"):

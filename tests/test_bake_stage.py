@@ -126,13 +126,19 @@ def test_each_photo_is_read_and_its_depths_drawn_once(context, monkeypatch):
     from stages.texture import photo_views
 
     loaded, drawn = [], []
-    draw = photo_views.rasterize
+    draw = photo_views.depth_map
     load = Pictures.masked
     monkeypatch.setattr(Pictures, "masked", lambda photos, name: loaded.append(name) or load(photos, name))
-    monkeypatch.setattr(photo_views, "rasterize", lambda *what: drawn.append(what[0]) or draw(*what))
+    monkeypatch.setattr(photo_views, "depth_map", lambda *what: drawn.append(what[1]) or draw(*what))
     BAKE.run(context)
     assert sorted(loaded) == ["one.png", "sub/two.png"]
-    assert len(drawn) == 2
+    assert sorted(drawn) == [0, 1]
+
+
+def test_what_lies_around_a_tile_hides_it(context):
+    wall = np.array([[0, -1, -1], [0, -1, 1], [1, -1, 1], [1, -1, -1]], np.float32)
+    artifacts.AROUND_MESH.save(context.inputs["extract"], (wall, np.array([[0, 1, 2], [0, 2, 3]], np.int32)))
+    assert BAKE.run(context)["seen_share"] < 0.4  # 0.5 without
 
 
 def test_a_mask_hides_what_lies_outside_it(context):

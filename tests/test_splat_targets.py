@@ -54,6 +54,18 @@ def test_a_mask_says_where_the_object_ends() -> None:
     assert target(square(), camera(), 0, some_photo(), np.zeros((HEIGHT, WIDTH), bool), np.ones(3)) is None
 
 
+def test_what_something_else_hides_is_neither_inside_nor_outside() -> None:
+    before = square().vertices * [0.5, 0.5, 1] - [0, 0, 0.5]
+    alone = target(square(), camera(), 0, some_photo(), None, np.ones(3))
+    found = target(square(), camera(), 0, some_photo(), None, np.ones(3), others=(before, square().faces))
+    assert alone is not None
+    assert found is not None
+    lost = alone.inside & ~found.inside
+    assert 0.1 < lost.sum() / alone.inside.sum() < 0.6
+    assert not found.inside[lost.shape[0] // 2, lost.shape[1] // 2]
+    np.testing.assert_array_equal(found.outside, alone.outside)
+
+
 def test_with_the_background_all_of_the_photo_counts() -> None:
     mask = np.zeros((HEIGHT, WIDTH), bool)
     mask[:, :41] = True

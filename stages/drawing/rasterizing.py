@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from stages.artifacts import AtlasMesh
+from stages.artifacts.mesh import Mesh
 from stages.blocks import in_blocks
 from stages.compiling import njit
 from stages.geometry.cameras import PinholeCameras
@@ -124,13 +125,32 @@ def projected(cameras: PinholeCameras, index: int, vertices: np.ndarray) -> tupl
 
 
 def depth_map(
-    cameras: PinholeCameras, index: int, vertices: np.ndarray, faces: np.ndarray
+    cameras: PinholeCameras,
+    index: int,
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    others: Mesh | None = None,
+    window: tuple[int, int, int, int] | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Face [H, W] int32 (`NO_FACE`: none) and inverse depth [H, W] float32 (0: none) at one camera's pixel
-    centres."""
+    """What one camera sees of a mesh.
+
+    Args:
+        others: vertices and faces that may be in the way.
+        window: left, top, right and bottom of the pixels that are asked for; None: all of them.
+
+    Returns:
+        Face [H, W] int32 and inverse depth [H, W] float32 at pixel centres; `NO_FACE` and 0 where there is none, or
+        another one is nearer.
+    """
+    own = len(faces)
+    if others is not None:
+        vertices, faces = np.concatenate([vertices, others[0]]), np.concatenate([faces, others[1] + len(vertices)])
     xy, inverse_depth = projected(cameras, index, vertices)
-    width, height = (int(side) for side in cameras.sizes[index])
-    return rasterize(xy, inverse_depth, faces, width, height)
+    left, top, right, bottom = window or (0, 0, *(int(side) for side in cameras.sizes[index]))
+    face_map, inverse_depth = rasterize(xy - (left, top), inverse_depth, faces, right - left, bottom - top)
+    hidden = face_map >= own
+    face_map[hidden], inverse_depth[hidden] = NO_FACE, 0
+    return face_map, inverse_depth
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from stages.artifacts import AtlasMesh
+from stages.artifacts.mesh import Mesh
+from stages.drawing.rasterizing import NO_FACE, depth_map
 from stages.drawing.view_scores import silhouette
 from stages.gaussians.drawing import Camera, camera_of, render
 from stages.gaussians.gaussians import Gaussians
@@ -61,6 +63,7 @@ def target(
     gains: np.ndarray,
     spacing: float = 0.0,
     background: bool = False,
+    others: Mesh | None = None,
 ) -> Target | None:
     """Of photo `index`, [H, W, 3] uint8 with its mask [H, W] bool, or None; None where it does not show the mesh.
 
@@ -68,6 +71,7 @@ def target(
         gains: [3] factors that bring the photo to the others' exposure.
         spacing: of neighbouring Gaussians, scene units.
         background: all of the photo should be seen, whatever the mask says.
+        others: what else may be in the way, vertices and faces. What it hides the photo does not tell.
     """
     import cv2
 
@@ -76,6 +80,8 @@ def target(
     around = cv2.dilate(covered.astype(np.uint8), cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))) > 0
     inside = covered if mask is None else mask & around
     outside = ~around if mask is None else ~(covered | mask)
+    if others is not None:
+        inside = inside & ~(covered & (depth_map(cameras, index, atlas.vertices, atlas.faces, others)[0] == NO_FACE))
     if not inside.any():
         return None
     if background:

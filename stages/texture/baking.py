@@ -20,6 +20,7 @@ from functools import partial
 import numpy as np
 
 from stages.artifacts import AtlasMesh
+from stages.artifacts.mesh import Mesh
 from stages.blocks import in_blocks
 from stages.drawing.rasterizing import Texels, surface_points
 from stages.geometry.cameras import PinholeCameras
@@ -88,6 +89,7 @@ def bake_texture(
     listener: Listener | None = None,
     visit: Visitor | None = None,
     rough_gains: np.ndarray | None = None,
+    others: Mesh | None = None,
 ) -> Baked:
     """Bake photos into the texture of an atlas.
 
@@ -107,6 +109,7 @@ def bake_texture(
         visit: shown each photo once, in order, so that what else is asked of photos need not make them ready again.
         rough_gains: [N, 3] in a larger scene that this is a part of, NaN where not known: they set the gauge, see
             `gains.in_gauge_of`.
+        others: in the scene frame, what else may be in the way of photos. It gets no texture.
 
     Raises:
         ValueError: the atlas covers no texel, or a photo is not of its camera's size.
@@ -126,7 +129,7 @@ def bake_texture(
             listener(done, 2 * num_views + 1, note)
 
     with ThreadPoolExecutor(max_workers=max(1, workers)) as pool:
-        views_of = PreparedViews(atlas, num_texels, cameras, load_photo)
+        views_of = PreparedViews(atlas, num_texels, cameras, load_photo, others)
         gains, sharpness = compare_photos(atlas, texels, views_of.in_order(pool, workers), num_views, tell)
         if not gain:
             gains = np.ones((num_views, 3))

@@ -11,8 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from stages.artifacts.mesh import Mesh
 from stages.compiling import njit
-from stages.drawing.rasterizing import projected, rasterize
+from stages.drawing.rasterizing import depth_map, projected
 from stages.geometry.cameras import PinholeCameras
 from stages.texture.observing import STEPS_UNSIGNED
 
@@ -38,7 +39,7 @@ class View:
         matrix: [3, 4] its pixels (homogeneous) from scene points.
         center: [3] projection centre in the scene frame.
         focal: mean focal length in pixels.
-        inverse_depth: [H, W] float32 of the mesh, 0 where the photo sees past it.
+        inverse_depth: [H, W] float32 of the mesh, 0 where the photo sees past it or something else before it.
         confidence: [H, W] uint8, 255 for full trust; 0 outside the mask.
         low: [H, W, 3] uint16, the photo low-passed along surfaces only, in `STEPS_UNSIGNED` a level.
         photo: [H, W, 3] uint8.
@@ -69,6 +70,7 @@ def prepare_view(
     vertices: np.ndarray,
     faces: np.ndarray,
     texel_side: float = 0.0,
+    others: Mesh | None = None,
 ) -> View:
     """Depth, trust and bands of photo `index`.
 
@@ -77,6 +79,7 @@ def prepare_view(
         mask: [H, W] bool, true on the object; None: all of it.
         vertices, faces: the mesh in the scene frame.
         texel_side: of the texture, in scene units; photos that are finer lose what it cannot hold.
+        others: what else may be in the way.
 
     Raises:
         ValueError: the photo or mask is not of the camera's size.
@@ -91,8 +94,8 @@ def prepare_view(
     K = cameras.intrinsics[index]
     focal = float(np.sqrt(K[0, 0] * K[1, 1]))
     xy, inverse_depths = projected(cameras, index, vertices)
-    left, top, right, bottom = _box(xy[inverse_depths > 0], width, height)
-    _, inverse_depth = rasterize(xy - (left, top), inverse_depths, faces, right - left, bottom - top)
+    left, top, right, bottom = window = _box(xy[inverse_depths > 0], width, height)
+    _, inverse_depth = depth_map(cameras, index, vertices, faces, others, window)
     photo = photo[top:bottom, left:right].copy()  # a view would keep all of the photo in memory
     on_object = inverse_depth > 0
     if mask is not None:

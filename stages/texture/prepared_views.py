@@ -8,6 +8,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 import numpy as np
 
 from stages.artifacts import AtlasMesh
+from stages.artifacts.mesh import Mesh
 from stages.geometry.cameras import PinholeCameras
 from stages.limits import available_memory
 from stages.surface.triangle_mesh import face_areas
@@ -26,8 +27,19 @@ MOST_AHEAD = 8
 class PreparedViews:
     """Makes photos ready for sampling, and keeps the first ones for the next pass."""
 
-    def __init__(self, atlas: AtlasMesh, num_texels: int, cameras: PinholeCameras, load_photo: LoadPhoto) -> None:
-        self.atlas, self.cameras, self.load_photo = atlas, cameras, load_photo
+    def __init__(
+        self,
+        atlas: AtlasMesh,
+        num_texels: int,
+        cameras: PinholeCameras,
+        load_photo: LoadPhoto,
+        others: Mesh | None = None,
+    ) -> None:
+        """
+        Args:
+            others: what else may be in the way of photos.
+        """
+        self.atlas, self.cameras, self.load_photo, self.others = atlas, cameras, load_photo, others
         # mean, scene units
         self.texel_side = float(np.sqrt(face_areas(atlas.vertices, atlas.faces).sum() / num_texels))
         self.kept: dict[int, View] = {}
@@ -53,7 +65,8 @@ class PreparedViews:
         if index in self.kept:
             return self.kept[index]
         photo, mask = self.load_photo(index)
-        return prepare_view(self.cameras, index, photo, mask, self.atlas.vertices, self.atlas.faces, self.texel_side)
+        vertices, faces = self.atlas.vertices, self.atlas.faces
+        return prepare_view(self.cameras, index, photo, mask, vertices, faces, self.texel_side, self.others)
 
     def _keep(self, index: int, view: View) -> None:
         """Keep a photo where there is room. Not for threads: they would take one another's."""
