@@ -37,7 +37,7 @@ from stages.engine.stage import StageContext
 from stages.errors import ReconstructionError, SystemRequirementError
 from stages.export import EXPORT
 from stages.files.contents import Textures
-from stages.files.glb import glb_bytes, shapes_glb_bytes
+from stages.files.glb import glb_bytes, read_glb, shapes_glb_bytes
 from stages.files.obj import obj_text
 from stages.files.ply_stl import ply_bytes
 from stages.geometry.place import Place
@@ -401,6 +401,36 @@ def test_normals_without_length_are_mended():
     broken[7] = np.nan
     mended = unit_normals(atlas.vertices, broken, atlas.faces)
     np.testing.assert_allclose(mended, atlas.normals, atol=1e-6)
+
+
+@pytest.mark.parametrize("image", [b"\x89PNG of some length", b"\xff\xd8\xff\xe0 JPEG"])
+def test_a_glb_is_read_as_it_was_written(image):
+    atlas, _ = tetrahedron()
+    data = glb_bytes(atlas, Textures(image, normal=b"\x89PNG"), extras={"photos": 3})
+    mesh, found = read_glb(data)
+    assert found == image
+    for name in ("vertices", "normals", "faces"):
+        np.testing.assert_array_equal(getattr(mesh, name), getattr(atlas, name))
+    np.testing.assert_allclose(mesh.uvs, atlas.uvs, atol=1e-7)
+    kind = b"image/jpeg" if image.startswith(b"\xff") else b"image/png"
+    assert kind in data
+
+
+def test_what_is_no_glb_of_ours_is_refused():
+    atlas, _ = tetrahedron()
+    data = glb_bytes(atlas, Textures(b"\x89PNG"))
+    bare = shapes_glb_bytes({"shape": (atlas.vertices, atlas.faces)})
+    for wrong in (
+        b"",
+        b"glTF",
+        data[:200],
+        data[:1500],
+        b"x" + data[1:],
+        bare,
+        data.replace(b"TEXCOORD_0", b"TEXCOORD_9"),
+    ):
+        with pytest.raises(ValueError, match="no GLB of one textured mesh"):
+            read_glb(wrong)
 
 
 def test_wrong_arrays_are_refused():

@@ -54,3 +54,15 @@ def light_path(folder: Path, kind: str) -> Path:
 def splats_path(folder: Path, kind: str, level: int = 0) -> Path:
     """The Gaussian splats: ply, spz or glb; level 0 is all of them, 1 or more a level of detail."""
     return folder / f"model{f'_lod{level}' if level else ''}.splats.{kind}"
+
+
+def overview_path(tileset: Path, number: int) -> Path:
+    """A coarse model of several tilesets, beside the tileset that joins them."""
+    return tileset.with_name(f"{tileset.stem}_overviews") / f"{number}.glb"
+
+
+def forget_overviews(tileset: Path, count: int) -> None:
+    """Remove what an earlier tileset of more parts left: all but the first `count`."""
+    for path in overview_path(tileset, 0).parent.glob("*.glb"):
+        if path.stem.isdecimal() and int(path.stem) >= count:
+            path.unlink()

@@ -13,7 +13,7 @@ ROUGHNESS = 0.9
 
 @dataclass(frozen=True)
 class Textures:
-    """The images of one material, each as the bytes of a PNG, row 0 at v = 1.
+    """The images of one material, each as the bytes of a PNG (a GLB takes JPEG, too), row 0 at v = 1.
 
     Attributes:
         base_color: sRGB.

@@ -1,4 +1,4 @@
-"""GLB, binary glTF 2.0: a textured mesh, or bare shapes. Arrays in, bytes out."""
+"""GLB, binary glTF 2.0: a textured mesh, or bare shapes. Arrays in, bytes out; and a textured mesh back."""
 
 from __future__ import annotations
 
@@ -10,10 +10,12 @@ import numpy as np
 
 from stages.artifacts import AtlasMesh
 from stages.files.contents import ROUGHNESS, Textures, checked_mesh
+from stages.inputs.texts import parse_json
 from stages.texture.tangents import vertex_tangents
 
 NAME = "model"
 _FLOAT, _UINT = 5126, 5125
+_JPEG = b"\xff\xd8\xff"
 _ARRAY_BUFFER, _ELEMENT_ARRAY_BUFFER = 34962, 34963
 # Linear, with mip-maps where it shrinks, clamped at the edges.
 _SAMPLER = {"magFilter": 9729, "minFilter": 9987, "wrapS": 33071, "wrapT": 33071}
@@ -63,6 +65,41 @@ def glb_bytes(
         samplers=[_SAMPLER],
         images=buffer.images,
     )
+
+
+def read_glb(data: bytes) -> tuple[AtlasMesh, bytes]:
+    """Mesh with Y up and image of the base colour of a file that `glb_bytes` wrote.
+
+    Raises:
+        ValueError: it is no such file.
+    """
+    try:
+        magic, version, _, length = struct.unpack_from("<4s3I", data)
+        if magic != b"glTF" or version != 2:
+            raise ValueError
+        tree, binary = parse_json(data[20 : 20 + length].decode()), data[28 + length :]
+
+        def blob(view: int) -> bytes:
+            start, size = tree["bufferViews"][view]["byteOffset"], tree["bufferViews"][view]["byteLength"]
+            if start + size > len(binary):
+                raise ValueError
+            return binary[start : start + size]
+
+        def numbers(accessor: int, kind: type, width: int) -> np.ndarray:
+            return np.frombuffer(blob(tree["accessors"][accessor]["bufferView"]), kind).reshape(-1, width)
+
+        (part,) = tree["meshes"][0]["primitives"]
+        places, normals, uvs = (
+            numbers(part["attributes"][name], np.float32, width)
+            for name, width in (("POSITION", 3), ("NORMAL", 3), ("TEXCOORD_0", 2))
+        )
+        faces = numbers(part["indices"], np.uint32, 3).astype(np.int32)
+        texture = tree["materials"][part["material"]]["pbrMetallicRoughness"]["baseColorTexture"]["index"]
+        image = blob(tree["images"][tree["textures"][texture]["source"]]["bufferView"])
+    except (ValueError, KeyError, IndexError, TypeError, struct.error) as error:
+        raise ValueError("it is no GLB of one textured mesh that this program wrote") from error
+    mesh = AtlasMesh(places, normals, np.stack([uvs[:, 0], 1 - uvs[:, 1]], axis=1), faces, 0)
+    return checked_mesh(mesh), image
 
 
 def _material(buffer: GlbBuffer, textures: Textures) -> dict[str, Any]:
@@ -123,10 +160,11 @@ class GlbBuffer:
         self.accessors.append({**accessor, **bounds})
         return len(self.accessors) - 1
 
-    def add_image(self, png: bytes, name: str) -> int:
-        """Index of the new image, which is also its texture's."""
-        self._add(png, {})
-        self.images.append({"bufferView": len(self.views) - 1, "mimeType": "image/png", "name": name})
+    def add_image(self, image: bytes, name: str) -> int:
+        """Index of the new image, a PNG or a JPEG, which is also its texture's."""
+        self._add(image, {})
+        kind = "image/jpeg" if image.startswith(_JPEG) else "image/png"
+        self.images.append({"bufferView": len(self.views) - 1, "mimeType": kind, "name": name})
         return len(self.images) - 1
 
     def _add(self, blob: bytes, how: dict[str, int]) -> None:

@@ -76,8 +76,44 @@ def tileset(
     return _file(whole, tile, extras)
 
 
-def joined(tilesets: Mapping[str, dict[str, Any]]) -> dict[str, Any]:
-    """A tileset over others that share one frame: the Earth's, or their own where none says where it lies.
+# ---------------------------------------------------------------- over several
+@dataclass(frozen=True)
+class Root:
+    """What one asks of a tileset that others are joined with.
+
+    Attributes:
+        box: [12] of its root.
+        transform: of its root, to the frame that all share.
+        on_earth: whether it has one.
+        coarsest: URI, relative to the tileset, and error of what its root shows.
+    """
+
+    box: Float[np.ndarray, " 12"]
+    transform: Float[np.ndarray, "4 4"]
+    on_earth: bool
+    coarsest: tuple[str, float]
+
+    @property
+    def placed_box(self) -> Float[np.ndarray, " 12"]:
+        """Its box in the frame that all share."""
+        return _moved(self.box, self.transform)
+
+
+@dataclass(frozen=True)
+class Overview:
+    """A coarse model that is drawn in place of several tilesets, seen from far.
+
+    Attributes:
+        level: in the frame of the first tileset's root; its error against the finest levels of all.
+        parts: what it stands for: URIs of tilesets, or overviews over some.
+    """
+
+    level: Level
+    parts: tuple[str | Overview, ...]
+
+
+def roots(tilesets: Mapping[str, dict[str, Any]]) -> dict[str, Root]:
+    """Of tilesets that share one frame: the Earth's, or their own where none says where it lies.
 
     Args:
         tilesets: what the files hold, by their URIs relative to the new one.
@@ -87,29 +123,54 @@ def joined(tilesets: Mapping[str, dict[str, Any]]) -> dict[str, Any]:
     """
     if not tilesets:
         raise ValueError("expected one tileset or more, got none")
-    roots = {uri: _root(each, uri) for uri, each in tilesets.items()}
-    elsewhere = [uri for uri, each in roots.items() if not each.on_earth]
-    if 0 < len(elsewhere) < len(roots):
-        there = len(roots) - len(elsewhere)
-        raise ValueError(f"{there} of {len(roots)} tilesets say where on Earth they lie, {elsewhere[0]} does not")
-    boxes = {uri: _moved(each.box, each.transform) for uri, each in roots.items()}
-    # axes of the first box: those of the Earth's centre would be askew
-    axes = boxes[next(iter(boxes))].reshape(4, 3)[1:]
-    axes = axes / np.linalg.norm(axes, axis=1, keepdims=True)
-    corners = np.concatenate([_corners(box) for box in boxes.values()]) @ axes.T
-    whole = np.array(_box(corners.min(0), corners.max(0))).reshape(4, 3) @ axes
-    error = max(each.error for each in roots.values())
-    children = [
-        {"boundingVolume": {"box": box.tolist()}, "geometricError": roots[uri].error, "content": {"uri": uri}}
-        for uri, box in boxes.items()
-    ]
-    root = {
-        "boundingVolume": {"box": whole.ravel().tolist()},
-        "geometricError": error,
+    found = {uri: _root(each, uri) for uri, each in tilesets.items()}
+    elsewhere = [uri for uri, each in found.items() if not each.on_earth]
+    if 0 < len(elsewhere) < len(found):
+        there = len(found) - len(elsewhere)
+        raise ValueError(f"{there} of {len(found)} tilesets say where on Earth they lie, {elsewhere[0]} does not")
+    return found
+
+
+def joined(overview: Overview, found: Mapping[str, Root]) -> dict[str, Any]:
+    """A tileset whose root is a coarse model, which what it stands for replaces.
+
+    Overviews lie in the frame of the first tileset, so that numbers in their files are small; what leads from there to
+    the Earth's centre is taken back before each tileset, which has a transform of its own.
+
+    Args:
+        found: of all tilesets, see `roots`.
+
+    Returns:
+        What its file holds.
+    """
+    first = next(iter(found.values()))
+    root, corners = _overview_tile(overview, found, np.linalg.inv(first.transform))
+    if first.on_earth:
+        root["transform"] = first.transform.T.ravel().tolist()
+    return _file(max(root["geometricError"], float(np.linalg.norm(np.ptp(corners, axis=0)))), root, None)
+
+
+def _overview_tile(
+    part: Overview | str, found: Mapping[str, Root], frame_from_shared: Float[np.ndarray, "4 4"]
+) -> tuple[dict[str, Any], Float[np.ndarray, "8 3"]]:
+    """A tile and the corners of its box in the frame of the first tileset."""
+    if isinstance(part, str):
+        box, (_, error) = found[part].placed_box, found[part].coarsest
+        tile = {"boundingVolume": {"box": box.tolist()}, "geometricError": error, "content": {"uri": part}}
+        back = {"transform": frame_from_shared.T.ravel().tolist()} if found[part].on_earth else {}
+        return {**back, **tile}, _corners(_moved(box, frame_from_shared))
+    tiles, boxes = zip(*(_overview_tile(each, found, frame_from_shared) for each in part.parts), strict=True)
+    corners = np.concatenate([*boxes, part.level.bounds])
+    whole = _box(corners.min(0), corners.max(0))
+    tile = {
+        "boundingVolume": {"box": whole},
+        # a coarser tile never claims to be the better one
+        "geometricError": max(part.level.error, *(each["geometricError"] for each in tiles)),
         "refine": "REPLACE",
-        "children": children,
+        "content": {"uri": part.level.uri},
+        "children": list(tiles),
     }
-    return _file(max(error, float(np.linalg.norm(np.ptp(corners, axis=0)))), root, None)
+    return tile, _corners(np.array(whole))
 
 
 def _file(error: float, root: dict[str, Any], extras: dict[str, Any] | None) -> dict[str, Any]:
@@ -140,24 +201,14 @@ def _corners(box: Float[np.ndarray, " 12"]) -> Float[np.ndarray, "8 3"]:
     return middle + signs @ np.stack(halves)
 
 
-@dataclass(frozen=True)
-class _Root:
-    """What `joined` asks of a tileset: its root's box [12] and transform [4, 4], and the error of drawing nothing."""
-
-    box: Float[np.ndarray, " 12"]
-    transform: Float[np.ndarray, "4 4"]
-    on_earth: bool
-    error: float
-
-
-def _root(tiles: dict[str, Any], uri: str) -> _Root:
+def _root(tiles: dict[str, Any], uri: str) -> Root:
     try:
-        root, error = tiles["root"], float(tiles["geometricError"])
+        root = tiles["root"]
         box = np.reshape(root["boundingVolume"]["box"], 12).astype(np.float64)
         transform = np.reshape(root.get("transform", np.eye(4).ravel()), (4, 4)).astype(np.float64).T
-    except (AttributeError, KeyError, TypeError, ValueError):
-        box = transform = np.array(np.nan)
-        root, error = {}, -1.0
+        content, error = str(root["content"]["uri"]), float(root["geometricError"])
+    except (AttributeError, KeyError, TypeError, ValueError) as problem:
+        raise ValueError(f"{uri} is no tileset with a model and a box about its root") from problem
     if error < 0 or not np.isfinite([error, *box.ravel(), *transform.ravel()]).all():
-        raise ValueError(f"{uri} is no tileset with a box about its root")
-    return _Root(box, transform, "transform" in root, error)
+        raise ValueError(f"{uri} is no tileset with a model and a box about its root")
+    return Root(box, transform, "transform" in root, (content, error))
