@@ -7,14 +7,16 @@ import json
 import numpy as np
 import pytest
 
-from benchmarks.synthetic import capture, city, objects, scenes, shapes
+from benchmarks.synthetic import capture, city, drone_gps, objects, scenes, shapes
 from benchmarks.synthetic.capture import Order, develop, make
 from benchmarks.synthetic.check import check
 from benchmarks.synthetic.model import Ground, Part, Scene, plain
+from stages.capture.exif import NO_GPS, read_gps
 from stages.evaluation.protocols.known_object import has_truth, load_known_object
+from stages.geometry.earth import earth_centred, east_north_up
 from stages.scenes import implicit
 from stages.scenes.noise import ValueNoise
-from stages.scenes.photo_files import write_truth
+from stages.scenes.photo_files import photo_exif, write_truth
 from stages.scenes.viewpoints import camera_ring
 
 SIZE = (96, 72)
@@ -117,13 +119,49 @@ def test_noise_grows_with_the_light_and_ends_where_the_sensor_is_full():
 
 def test_another_order_starts_anew_and_the_same_goes_on(tmp_path):
     order = Order("plain", 6, SIZE, 4, 0)
-    capture._begin(order, tmp_path)
+    capture._begin(order.as_dict(), tmp_path)
     photo = tmp_path / "images" / "000.jpg"
     photo.write_bytes(b"x")
-    capture._begin(order, tmp_path)
+    capture._begin(order.as_dict(), tmp_path)
     assert photo.exists()
-    capture._begin(Order("plain", 6, SIZE, 5, 0), tmp_path)
+    capture._begin(Order("plain", 6, SIZE, 5, 0).as_dict(), tmp_path)
     assert not photo.exists()
+
+
+# ---------------------------------------------------------------- GPS
+@pytest.mark.parametrize(
+    "position", [(47.37, 8.54, 589.123), (-33.9999999, -18.5, -2.5), (0.25, 179.99999, 0.0)], ids=str
+)
+def test_exif_says_where_the_camera_was_to_millimetres(tmp_path, position):
+    from PIL import Image
+
+    for i, place in enumerate((position, None)):
+        picture = Image.new("RGB", SIZE)
+        picture.save(tmp_path / f"{i}.jpg", exif=photo_exif(picture, i, "Drone", 40, place))
+    with Image.open(tmp_path / "0.jpg") as photo, Image.open(tmp_path / "1.jpg") as other:
+        read, none = read_gps(photo.getexif()), read_gps(other.getexif())
+    assert none == NO_GPS
+    off = earth_centred(np.array([read.position])) - earth_centred(np.array([position]))
+    assert np.linalg.norm(off) < 0.004
+
+
+def test_a_drones_gps_is_off_by_metres_and_lies_east_north_up_of_the_origin():
+    poses = scenes.flight(400, np.random.default_rng(0), 2)
+    told = drone_gps.drone_positions(poses, city.METRES, np.random.default_rng(1))
+    off = east_north_up(told, drone_gps.ORIGIN) - 200 * np.linalg.inv(poses)[:, :3, 3]
+    np.testing.assert_allclose(off.mean(0), 0.0, atol=0.8)
+    np.testing.assert_allclose(off.std(0), [2, 2, 4], rtol=0.15)
+
+
+def test_towns_have_gps_and_blocks_of_two_hundred_metres():
+    poses = scenes.flight(4, np.random.default_rng(0))
+    scene = Scene(tuple(_step()), None, scenes.sunny_sky(32), poses)
+    assert all(recipe.metres == city.METRES for recipe in scenes.TOWNS.values())
+    first, again, other = (capture._positions(scene, scenes.TOWNS["town4"], seed) for seed in (0, 0, 1))
+    assert len(first) == 4
+    assert first == again
+    assert first != other
+    assert capture._positions(scene, scenes.RECIPES["city"], 0) == [None] * 4
 
 
 # ---------------------------------------------------------------- the check

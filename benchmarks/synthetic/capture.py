@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.synthetic import MADE_WITH
+from benchmarks.synthetic import MADE_WITH, drone_gps
 from benchmarks.synthetic.mitsuba_camera import Photographer
 from benchmarks.synthetic.model import Scene
 from benchmarks.synthetic.scenes import RECIPES, Recipe
@@ -37,6 +37,7 @@ DRIFT = 0.06  # standard deviation of the exposure over the photos, relative
 READ_NOISE = 0.002  # of full scale
 SHOT_NOISE = 0.006  # of full scale at full scale; grows with the root of the light
 JPEG_QUALITY = 95
+GPS_STREAM = 0x475053  # sets the random numbers of its noise apart from those of photo 0, 1, ...
 
 
 @dataclass(frozen=True)
@@ -74,11 +75,14 @@ def make(
     recipes: Mapping[str, Recipe] = RECIPES,
 ) -> bool:
     """Make what is not there yet; whether there was anything to do."""
-    if is_complete(folder, order.as_dict()):
+    recipe = recipes[order.scene]
+    made_with = order.as_dict() | ({} if recipe.metres is None else {"gps": drone_gps.stated(recipe.metres)})
+    if is_complete(folder, made_with):
         return False
-    _begin(order, folder)
+    _begin(made_with, folder)
     rng = np.random.default_rng(order.seed)
-    scene = recipes[order.scene].make(rng, order.num_photos)
+    scene = recipe.make(rng, order.num_photos)
+    positions = _positions(scene, recipe, order.seed)
     exposures = 1 + DRIFT * _drift(order.num_photos, rng)
     _write_mesh(scene, folder / TRUTH_MESH)
     camera = Photographer(scene, order.focal, order.size, variant)
@@ -92,11 +96,12 @@ def make(
             # rarely, a path is no number
             developed = develop(np.nan_to_num(radiance) * exposures[i], np.random.default_rng([order.seed, i]))
             picture = _picture(developed)
-            _save(photo, picture, quality=JPEG_QUALITY, exif=photo_exif(picture, i, "Synthetic camera", FOCAL_35MM))
+            exif = photo_exif(picture, i, "Synthetic camera", FOCAL_35MM, positions[i])
+            _save(photo, picture, quality=JPEG_QUALITY, exif=exif)
         progress(i + 1)
     names = [f"{IMAGES}/{i:03d}.jpg" for i in range(order.num_photos)]
     notes = [{"exposure": round(float(exposure), 5)} for exposure in exposures]
-    write_truth(folder, names, scene.cam_from_world, order.size, order.focal, order.as_dict(), notes)
+    write_truth(folder, names, scene.cam_from_world, order.size, order.focal, made_with, notes)
     return True
 
 
@@ -124,21 +129,29 @@ def _meter(scene: Scene, order: Order, variant: str) -> float:
     return float(WHITE_POINT / np.percentile(first, 90))
 
 
+def _positions(scene: Scene, recipe: Recipe, seed: int) -> list[Any]:
+    """What the camera's GPS says, photo by photo; None where it has none."""
+    if recipe.metres is None:
+        return [None] * len(scene.cam_from_world)
+    rng = np.random.default_rng([seed, GPS_STREAM])  # its own: pictures are the same without GPS
+    return drone_gps.drone_positions(scene.cam_from_world, recipe.metres, rng).tolist()
+
+
 def _noise_seed(order: Order, index: int, purpose: int) -> int:
     return int(np.random.default_rng([order.seed, index, purpose]).integers(1 << 31))
 
 
 # ---------------------------------------------------------------- files
-def _begin(order: Order, folder: Path) -> None:
-    """Empty folders, or those of the same order."""
+def _begin(made_with: Mapping[str, Any], folder: Path) -> None:
+    """Empty folders, or those of the same recipe."""
     note = folder / MADE_WITH
-    if not note.is_file() or json.loads(note.read_text(encoding="utf-8")) != order.as_dict():
+    if not note.is_file() or json.loads(note.read_text(encoding="utf-8")) != made_with:
         for name in (IMAGES, MASKS):
             shutil.rmtree(folder / name, ignore_errors=True)
     (folder / TRUTH_CAMERAS).unlink(missing_ok=True)
     for name in (IMAGES, MASKS):
         (folder / name).mkdir(parents=True, exist_ok=True)
-    note.write_text(json.dumps(order.as_dict(), indent=1) + "\n", encoding="utf-8")
+    note.write_text(json.dumps(made_with, indent=1) + "\n", encoding="utf-8")
 
 
 def _save(path: Path, picture: Any, **options: Any) -> None:

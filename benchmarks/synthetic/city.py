@@ -1,4 +1,4 @@
-"""A made-up city block: houses, towers, courtyards, a church, trees and cars on a street grid. 1 unit is 200 m.
+"""A made-up city block: houses, towers, courtyards, a church, trees and cars on a street grid. 1 unit is `METRES`.
 
 Boxes are split into small faces before they are painted, so that windows can be painted at their vertices.
 """
@@ -12,6 +12,7 @@ import numpy as np
 from benchmarks.synthetic.model import Paint, Part, plain
 from stages.scenes.noise import ValueNoise
 
+METRES = 200.0
 STREET = 0.05  # wide
 LOTS = (4, 3)
 FLOOR = 0.017  # height of a storey

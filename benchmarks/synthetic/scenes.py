@@ -28,10 +28,12 @@ class Recipe:
     Attributes:
         shows: what it asks of a method.
         make: (random numbers, number of photos) -> scene.
+        metres: of a unit, where the camera has GPS; its world is then x east, y north, z up.
     """
 
     shows: str
     make: Callable[[np.random.Generator, int], Scene]
+    metres: float | None = None
 
 
 def _on_table(make_object: Callable[[np.random.Generator], list[Part]]) -> Callable[[np.random.Generator, int], Scene]:
@@ -145,8 +147,8 @@ RECIPES = {
     "mirror": Recipe("a dog of balloons, a perfect mirror", _on_table(objects.balloon_dog)),
     "city": Recipe("a city block from the air, straight down and oblique", _city),
 }
-# Larger, and made only when they are named.
+# Larger, and made only when they are named. One block looks like another: their photos carry GPS, as a drone's do.
 TOWNS = {
-    "town4": Recipe("four city blocks, for `--blocks`: four times as many photos", _town(2)),
-    "town16": Recipe("sixteen city blocks, for `--blocks`: sixteen times as many photos", _town(4)),
+    "town4": Recipe("four city blocks, for `--blocks`: four times as many photos", _town(2), city.METRES),
+    "town16": Recipe("sixteen city blocks, for `--blocks`: sixteen times as many photos", _town(4), city.METRES),
 }

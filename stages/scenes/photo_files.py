@@ -14,10 +14,15 @@ from stages import artifacts
 from stages.evaluation.protocols.known_object import TRUTH_CAMERAS
 
 OPENGL_FROM_OPENCV = np.diag([1.0, -1, -1, 1])
+SECONDS_DIGITS = 4  # of latitude and longitude: 3 mm
 
 
-def photo_exif(picture: Any, index: int, model: str, focal_35mm: int) -> Any:
-    """What a camera would note: maker, model, time, and the focal length SfM starts from (35 mm equivalent)."""
+def photo_exif(picture: Any, index: int, model: str, focal_35mm: int, position: Sequence[float] | None = None) -> Any:
+    """What a camera would note: maker, model, time, and the focal length SfM starts from (35 mm equivalent).
+
+    Args:
+        position: latitude and longitude in degrees (WGS 84) and altitude in metres, of a camera with GPS.
+    """
     from PIL import ExifTags
 
     exif = picture.getexif()
@@ -28,7 +33,28 @@ def photo_exif(picture: Any, index: int, model: str, focal_35mm: int) -> Any:
     details = exif.get_ifd(ExifTags.IFD.Exif)
     details[ExifTags.Base.FocalLength] = float(focal_35mm)
     details[ExifTags.Base.FocalLengthIn35mmFilm] = focal_35mm
+    if position is not None:
+        exif.get_ifd(ExifTags.IFD.GPSInfo).update(_gps_tags(*position))
     return exif
+
+
+def _gps_tags(latitude: float, longitude: float, altitude: float) -> dict[int, Any]:
+    from PIL.ExifTags import GPS
+
+    return {
+        GPS.GPSLatitudeRef: "S" if latitude < 0 else "N",
+        GPS.GPSLatitude: _sexagesimal(abs(latitude)),
+        GPS.GPSLongitudeRef: "W" if longitude < 0 else "E",
+        GPS.GPSLongitude: _sexagesimal(abs(longitude)),
+        GPS.GPSAltitudeRef: b"\1" if altitude < 0 else b"\0",
+        GPS.GPSAltitude: round(abs(altitude), 3),
+    }
+
+
+def _sexagesimal(degrees: float) -> tuple[float, float, float]:
+    """Degrees, minutes and seconds to `SECONDS_DIGITS`."""
+    seconds = round(3600 * degrees, SECONDS_DIGITS)
+    return seconds // 3600, seconds // 60 % 60, round(seconds % 60, SECONDS_DIGITS)
 
 
 def write_truth(
