@@ -3,7 +3,7 @@
 # make test   all tests, shapes checked
 # make trust  wrong input, kills, a full disk and attacks on the server: all of it, an hour on a core (docs/trust.md)
 # make lowest the quick tests with the oldest versions that pyproject.toml admits
-# make bench-smoke   a small scene through the whole pipeline, its figures against committed ones
+# make bench-smoke   two small scenes through the whole pipeline, their figures against committed ones
 # make lint   formatting, lint, types, who-may-import-whom
 # make image  the container of the Dockerfile, built and tried out
 # make vendor the report's copies of three.js and Spark, from npm

@@ -80,7 +80,7 @@ def photograph(folder: Path, columns: int = 8, rows: int = 3) -> Path:
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     poses = flight(columns, rows)
     names = [f"photos/{i:03d}.png" for i in range(len(poses))]
-    (folder / "photos").mkdir(parents=True)
+    (folder / "photos").mkdir(parents=True, exist_ok=True)
     for name, pose in zip(names, poses, strict=True):
         u, v = np.meshgrid(np.arange(SIZE[0]) + 0.5, np.arange(SIZE[1]) + 0.5)
         rays = np.stack([(u - SIZE[0] / 2) / FOCAL, (v - SIZE[1] / 2) / FOCAL, np.ones_like(u)], -1) @ pose[:3, :3]
