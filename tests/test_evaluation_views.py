@@ -206,6 +206,7 @@ def workspace(tmp_path: Path) -> Workspace:
         artifacts.SCENE.save(out, sphere_scene(cameras))
 
     publish(opened, "train", train, PARAMS.model_dump(mode="json"))
+    publish(opened, "extract", lambda out: None)  # nothing lies around the mesh
     publish(opened, "atlas", lambda out: artifacts.ATLAS_MESH.save(out, patch_of_the_ball()))
     gray = np.full((8, 8, 3), 128, np.uint8)
     publish(opened, "bake", lambda out: artifacts.write_png(artifacts.BASE_COLOR.load(out), gray))

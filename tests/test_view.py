@@ -314,12 +314,13 @@ def test_what_is_no_request_to_read_is_refused(url, request_):
 
 def test_many_connections_and_half_requests_end_in_time(url, monkeypatch, capfd):
     monkeypatch.setattr(viewing, "ASKING_S", 0.5)
+    monkeypatch.setattr(viewing, "STALLED_S", 60.0)  # what would end them else
     started, before = time.monotonic(), threading.active_count()
     open_ones = [connect(url) for _ in range(3 * viewing.MOST_CONNECTIONS)]
     for connection in open_ones[: viewing.MOST_CONNECTIONS]:
         connection.sendall(b"GET / HTTP/1.1\r\nHost")
     answers = [rest(connection) for connection in reversed(open_ones)]
-    assert time.monotonic() - started < 9  # a busy machine needs some of it; without the patch it is over 10
+    assert time.monotonic() - started < 30  # a busy machine needs some of it
     assert sum(b" 503 " in answer for answer in answers) >= viewing.MOST_CONNECTIONS
     assert not any(b" 200 " in answer for answer in answers)
     for connection in open_ones:

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-Group = tuple["int | Group", ...]
-"""Rows, or groups of them in place of some."""
+Group = tuple[Any, ...]
+"""Rows (int), or groups of them in place of some."""
 
 
 def quartered(places: Float[np.ndarray, "n 3"], most: int) -> Group:

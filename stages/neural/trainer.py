@@ -256,17 +256,17 @@ class Trainer:
         )
         self._forget_gradients()
         # Each part goes back to the scale, and all of them together from there to what it is learned as.
-        scale = torch.as_tensor(moment.scale)
-        own = scale.detach().requires_grad_(scale.requires_grad)
-        if scale.requires_grad:
-            moment = replace(moment, scale=own)
+        learned = [moment.scale] if isinstance(moment.scale, Tensor) and moment.scale.requires_grad else []
+        of_parts = [scale.detach().requires_grad_() for scale in learned]
+        for scale in of_parts:
+            moment = replace(moment, scale=scale)
         rows = self.ranks.share(len(batch))
         parts = [
             self._part(batch, slice(first, min(first + rays_at_once, rows.stop)), extra, moment, sparse_weight)
             for first in range(rows.start, max(rows.stop, 1), rays_at_once)
         ]
-        if own.grad is not None:
-            scale.backward(own.grad)
+        for scale, of_part in zip(learned, of_parts, strict=True):
+            scale.backward(of_part.grad)
         numbers = {
             name: sum((part.numbers[name] for part in parts[1:]), of_first)
             for name, of_first in parts[0].numbers.items()
