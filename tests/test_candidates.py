@@ -8,14 +8,7 @@ import numpy as np
 
 from stages.artifacts import ImageRecord
 from stages.posing import candidates, looks
-from stages.posing.candidates import (
-    alike_and_apart,
-    candidate_pairs,
-    near_in_space,
-    next_in_order,
-    out_of_reach,
-    positions_of,
-)
+from stages.posing.candidates import alike_and_apart, candidate_pairs, near_in_space, next_in_order, positions_of
 from stages.posing.looks import aggregate, learn_words, nearest_words, signatures
 from stages.posing.pairs import NOT_COMPARED, common_features, likely_pairs, partners_of_partners
 
@@ -49,21 +42,6 @@ def test_nearest_places_count_height():
     assert near_in_space(places[:1], 1) == set()
     assert near_in_space(np.zeros((0, 3)), 1) == set()
     assert len(near_in_space(places, 60)) == 10
-    places[0] = np.nan
-    assert near_in_space(places, 1) == {(1, 2), (3, 4)}
-
-
-def test_photos_that_look_alike_are_within_reach_if_their_places_are_known():
-    line = np.arange(12.0)[:, None] * [1, 0, 0]
-    every = {(i, j) for i in range(12) for j in range(i + 1, 12)}
-    # the middle ones' third neighbour is 2 away, that of the first and the last 3
-    assert out_of_reach(every, line, 3) == {(i, j) for i, j in every if j - i > 6 or (j - i > 4 and i > 0 and j < 11)}
-    assert out_of_reach(every, line, 60) == set()
-    line[5] = np.nan
-    assert not any(5 in pair for pair in out_of_reach(every, line, 3))
-    line[5] = [0, 0, 1e6]  # nonsense
-    assert not any(5 in pair for pair in out_of_reach(every, line, 3))
-    assert out_of_reach(every, np.full((12, 3), np.nan), 3) == set()
 
 
 def test_next_in_order_against_a_slow_loop():

@@ -2,9 +2,8 @@
 
 Comparing the largest features of all pairs (`stages.posing.pairs`) grows with the square of the photos, so that of
 many photos only some pairs are compared: those near each other in space, where photos carry GPS positions; those next
-to each other in name, since most captures are a walk or a flight; and those that look alike, which close the loops of a
-walk and make up for positions that do not tell what a tilted camera looks at. Where GPS has two of these too far apart
-to show the same, they are left out: streets repeat.
+to each other in name, since most captures are a walk or a flight; and those that look alike, wherever they are. These
+close the loops of a walk, and make up for positions that are wrong or do not tell what a tilted camera looks at.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ from stages.posing.looks import signatures
 from stages.posing.pairs import in_order, largest_descriptors
 
 if TYPE_CHECKING:
-    from jaxtyping import Float, Int
+    from jaxtyping import Float
 
 log = logging.getLogger(__name__)
 
@@ -32,9 +31,6 @@ NEAREST = 60  # photos near one in space
 NEXT_IN_NAME = 20  # photos to each side of one in the order of names
 ALIKE = 40  # photos further away in name that look like one
 FEATURES = 1200  # of each photo, the largest, that tell what it looks like
-# Those that look alike are no further apart than so many times the way to the last of those near in space. Of a flight
-# over sixteen city blocks this leaves out two of three pairs of different places, and none with 30 % in common.
-REACH = 2.0
 ROWS_AT_ONCE = 256  # of photos compared with all
 
 
@@ -53,16 +49,17 @@ def candidate_pairs(
         ids = {image.name: image.image_id for image in opened.read_all_images()}
         names = sorted(ids)
         looks = signatures([largest_descriptors(opened, ids[name], FEATURES) for name in names], seed)
-    places = np.array([positions.get(name, np.full(3, np.nan)) for name in names])
-    near, beside = near_in_space(places, NEAREST), next_in_order(len(names), NEXT_IN_NAME)
-    alike = alike_and_apart(looks, ALIKE, NEXT_IN_NAME)
-    alike -= (apart := out_of_reach(alike, places, NEAREST))
+    placed = [rank for rank, name in enumerate(names) if name in positions]
+    near = {
+        (placed[i], placed[j])
+        for i, j in near_in_space(np.array([positions[names[rank]] for rank in placed]).reshape(-1, 3), NEAREST)
+    }
+    beside, alike = next_in_order(len(names), NEXT_IN_NAME), alike_and_apart(looks, ALIKE, NEXT_IN_NAME)
     pairs = near | beside | alike
     log.info(
         "%d of all %d pairs of %d photos may show the same: %d near in space (%d photos carry a usable GPS position), "
-        "%d next in name, %d alike, %d more look alike but are too far apart",
-        len(pairs), len(names) * (len(names) - 1) // 2, len(names), len(near), np.isfinite(places).all(1).sum(),
-        len(beside), len(alike), len(apart),
+        "%d next in name, %d alike",
+        len(pairs), len(names) * (len(names) - 1) // 2, len(names), len(near), len(placed), len(beside), len(alike),
     )  # fmt: skip
     return sorted(in_order(ids[names[i]], ids[names[j]]) for i, j in pairs)
 
@@ -77,34 +74,14 @@ def positions_of(records: Sequence[ImageRecord]) -> dict[str, Float[np.ndarray, 
     return {record.name: own for record, own in zip(placed, metres, strict=True)}
 
 
-def near_in_space(places: Float[np.ndarray, "n 3"], count: int) -> Pairs:
-    """Pairs (i < j) of a place and those nearest to it, height counted as any other direction; NaN is no place."""
-    known, _, nearest = _nearest(places, count)
-    return {(int(known[i]), int(known[j])) for i, j in _pairs_of(nearest)}
-
-
-def out_of_reach(pairs: Pairs, places: Float[np.ndarray, "n 3"], count: int) -> Pairs:
-    """Those of two places further apart than `REACH` times the way from either to the last of its nearest ones.
-
-    A place far from all others reaches all of them: it may be wrong.
-    """
-    known, ways, _ = _nearest(places, count)
-    reach = np.full(len(places), np.inf)
-    reach[known] = REACH * ways
-    return {(i, j) for i, j in pairs if np.linalg.norm(places[i] - places[j]) > max(reach[i], reach[j])}
-
-
-def _nearest(
-    places: Float[np.ndarray, "n 3"], count: int
-) -> tuple[Int[np.ndarray, " k"], Float[np.ndarray, " k"], Int[np.ndarray, "k m"]]:
-    """Which places are known; of each of them the way to the last of those nearest to it, and all of these."""
+def near_in_space(positions: Float[np.ndarray, "n 3"], count: int) -> Pairs:
+    """Pairs (i < j) of a place and those nearest to it, height counted as any other direction."""
     from scipy.spatial import cKDTree
 
-    known = np.flatnonzero(np.isfinite(places).all(1))
-    if len(known) < 2:
-        return known, np.full(len(known), np.inf), np.zeros((len(known), 0), np.int64)
-    ways, nearest = cKDTree(places[known]).query(places[known], k=min(count + 1, len(known)))
-    return known, ways[:, -1], nearest
+    if len(positions) < 2:
+        return set()
+    _, nearest = cKDTree(positions).query(positions, k=min(count + 1, len(positions)))
+    return _pairs_of(nearest)
 
 
 def next_in_order(number: int, apart: int) -> Pairs:
