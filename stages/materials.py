@@ -79,8 +79,8 @@ def run(context: StageContext[MaterialsParams]) -> dict[str, Any]:
     texture = read_texture(context.read(BASE_COLOR))
     texels = rasterize_atlas(atlas.uvs, atlas.faces, atlas.texture_size)
     baked = texture.reshape(-1, 3)[texels.index]
-    load, others = (lambda index: photos.masked(cameras.names[index])), context.read(AROUND_MESH)
-    views = PreparedViews(atlas, len(texels), cameras, load, others)
+    others = context.read(AROUND_MESH)
+    views = PreparedViews(atlas, len(texels), cameras, lambda index: photos.masked(cameras.names[index]), others)
     chosen = np.sort(np.random.default_rng(0).permutation(len(texels))[:POINTS])
     positions, normals = surface_points(atlas, texels.face_ids[chosen], texels.corner[chosen])
     tell = context.progress

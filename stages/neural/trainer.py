@@ -255,18 +255,13 @@ class Trainer:
             torch.rand(sampling.free_points, 3, generator=self.generator, device=self.device) * 2 - 1,
         )
         self._forget_gradients()
-        # Each part goes back to the scale, and all of them together from there to what it is learned as.
-        learned = [moment.scale] if isinstance(moment.scale, Tensor) and moment.scale.requires_grad else []
-        of_parts = [scale.detach().requires_grad_() for scale in learned]
-        for scale in of_parts:
-            moment = replace(moment, scale=scale)
         rows = self.ranks.share(len(batch))
         parts = [
-            self._part(batch, slice(first, min(first + rays_at_once, rows.stop)), extra, moment, sparse_weight)
+            self._part(
+                batch, slice(first, min(first + rays_at_once, rows.stop)), extra, self._anew(moment), sparse_weight
+            )
             for first in range(rows.start, max(rows.stop, 1), rays_at_once)
         ]
-        for scale, of_part in zip(learned, of_parts, strict=True):
-            scale.backward(of_part.grad)
         numbers = {
             name: sum((part.numbers[name] for part in parts[1:]), of_first)
             for name, of_first in parts[0].numbers.items()
@@ -274,6 +269,10 @@ class Trainer:
         ray_error, squared = (torch.cat(each) for each in zip(*((p.ray_error, p.squared) for p in parts), strict=True))
         trust = torch.stack([part.trust for part in parts]).min()
         return _Share(cells, batch.masks, rows, numbers, ray_error, squared, trust)
+
+    def _anew(self, moment: Moment) -> Moment:
+        """The same, where the scale is learned with a graph of its own: each part of a step goes back through one."""
+        return moment if self.fields.log_scale is None else self.moment(moment.progress)
 
     def _update(self, own: _Share) -> dict[str, Tensor]:
         """What all processes have found, the optimiser's step with it, and the step's numbers."""
